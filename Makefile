@@ -1,0 +1,93 @@
+# `make help` lists the targets. Each sets up .venv first, once, from Python 3.12 and a C++ compiler alone.
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+INSTALLING := $(VENV)/.installing
+
+# The Python to use, instead of the one that is found: make PYTHON=/path/to/python3.12
+PYTHON ?=
+# More arguments for pytest: make test ARGS="-k tasks"
+ARGS ?=
+
+export UV_PYTHON_DOWNLOADS := never
+
+.PHONY: help install demo test test-slow lint benchmark-env
+
+help: ## List the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 22
+
+install: $(INSTALLED) ## Only set up the environment, in .venv
+
+demo: $(INSTALLED) ## Run the scripted expert, and show its episodes in outputs/demo
+	$(BIN)/python -m gym_deltaco.gallery --out outputs/demo
+
+test: $(INSTALLED) ## Run the default tests: a few minutes, no network, no GPU
+	$(BIN)/python -m pytest $(ARGS)
+
+test-slow: $(INSTALLED) ## Run the slow tests: the expert on all 300 tasks, for example
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+lint: $(INSTALLED) ## Check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+benchmark-env: $(INSTALLED) ## Measure the speed of the environment
+	$(BIN)/python benchmarks/env.py
+
+# Candidates are run, not only looked up: a shim may be on the path and still fail. Building PyBullet also needs
+# Python's headers.
+PYTHON_CANDIDATES = python3.12 python3.13 python3 python \
+	"$$(pyenv root 2>/dev/null || echo "$$HOME/.pyenv")"/versions/3.1*/bin/python \
+	"$${UV_PYTHON_INSTALL_DIR:-$${XDG_DATA_HOME:-$$HOME/.local/share}/uv/python}"/cpython-3.1*/bin/python3
+PYTHON_PROBE = import ensurepip, os, sys, sysconfig, venv; \
+	has_headers = os.path.exists(os.path.join(sysconfig.get_path('include'), 'Python.h')); \
+	sys.exit(not has_headers or sys.version_info[:2] != (3, int(sys.argv[1])))
+
+define FIND_PYTHON
+python=; \
+for minor in 12 13; do \
+	for candidate in $(if $(PYTHON),"$(PYTHON)",$(PYTHON_CANDIDATES)); do \
+		if "$$candidate" -c "$(PYTHON_PROBE)" $$minor >/dev/null 2>&1; then python=$$candidate; break 2; fi; \
+	done; \
+done; \
+if [ -z "$$python" ]; then \
+	echo "Python 3.12 with venv and headers is missing$(if $(PYTHON), at $(PYTHON)). Install it (on Debian and \
+	Ubuntu: apt install python3.12-dev python3.12-venv), or name one: make PYTHON=/path/to/python3.12" | tr -s '\t ' ' ' >&2; \
+	exit 1; \
+fi
+endef
+
+define FIND_COMPILER
+compiler=; \
+for candidate in c++ g++ clang++; do \
+	if echo 'int main() {}' | "$$candidate" -x c++ -o /dev/null - >/dev/null 2>&1; then compiler=$$candidate; break; fi; \
+done; \
+if [ -z "$$compiler" ]; then \
+	echo "A C++ compiler (c++, g++ or clang++) is missing, and PyBullet has to be compiled. Install one \
+	(on Debian and Ubuntu: apt install g++)." | tr -s '\t ' ' ' >&2; \
+	exit 1; \
+fi; \
+if [ "$$compiler" = clang++ ]; then export CC=clang CXX=clang++; fi
+endef
+
+# An installation that was interrupted leaves its mark, and is done again from an empty environment.
+$(INSTALLED): pyproject.toml Makefile
+	@set -e; $(FIND_PYTHON); $(FIND_COMPILER); \
+	if [ -e $(INSTALLING) ] || ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+		echo "Setting up $(VENV) with $$("$$python" --version) ($$python)."; \
+		"$$python" -m venv --clear $(VENV); \
+	fi; \
+	touch $(INSTALLING); \
+	rm -f $@; \
+	echo "Installing. The first time, PyBullet is compiled, which takes 4 to 9 minutes, and PyTorch downloaded."; \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'uv>=0.9'; \
+	$(BIN)/uv pip install --python $(BIN)/python -e '.[dev]'; \
+	if ! $(BIN)/python -c "import pybullet; assert pybullet.isNumpyEnabled()" >/dev/null 2>&1; then \
+		echo "PyBullet was built without NumPy, or does not load. Build it again: $(BIN)/uv cache clean pybullet; \
+		make" | tr -s '\t ' ' ' >&2; \
+		exit 1; \
+	fi; \
+	mv $(INSTALLING) $@; \
+	touch $@

@@ -1,0 +1,126 @@
+"""The WidowX 250 in the simulation: what it looks like, what it touches with, and how it follows commands."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gym_deltaco import kinematics as kin
+from gym_deltaco.simulation import Box, Contact, Link, Simulation
+from gym_deltaco.arm_meshes import BASE_MESH, LINK_MESHES
+
+POSITION_LOW = np.array([0.4, -0.2, -0.34])  # m, limits of the end effector
+POSITION_HIGH = np.array([0.8, 0.4, -0.1])  # m
+FINGER_OPEN = 0.037  # m, of each fingertip from the middle
+FINGER_CLOSED = 0.002  # m
+FINGERTIP_OFFSET = 0.05  # m, of the tips beyond the end effector
+FINGER_THICKNESS = 0.007  # m
+FINGER_WIDTH = 0.024  # m
+
+MOVE_STEPS = 10  # physics steps of a control step
+GRIP_STEPS = 75  # the same, when the gripper opens or closes
+_RAMP_STEPS = 10  # of a control step's first physics steps, over which the joints' targets are interpolated
+
+_ARM_JOINTS = list(range(6))
+_FINGER_JOINTS = [6, 7]
+_ARM_FORCES = [120.0, 120.0, 120.0, 60.0, 60.0, 60.0]  # N m
+_ARM_GAINS = [0.9] * 6
+_FINGER_FORCES = [12.0, 12.0]  # N
+_FINGER_GAINS = [0.1, 0.1]
+_FINGER_MASS = 0.02  # kg
+_SURFACE = Contact(lateral_friction=2.0, spinning_friction=0.02)
+
+
+def _finger(name: str, side: int) -> Link:
+    # The box lies outside its pad, which is at the joint's position.
+    middle = (FINGERTIP_OFFSET / 2, side * FINGER_THICKNESS / 2, 0.0)
+    half_extents = (FINGERTIP_OFFSET / 2, FINGER_THICKNESS / 2, FINGER_WIDTH / 2)
+    return Link(
+        name,
+        parent=5,
+        origin=kin.END_EFFECTOR_OFFSET,
+        axis=(0, 1, 0),
+        is_prismatic=True,
+        mass=_FINGER_MASS,
+        inertia=(1e-4, 1e-4, 1e-4),
+        mesh=LINK_MESHES[name],
+        boxes=(Box(middle, half_extents),),
+    )
+
+
+_LINKS = (
+    Link("waist", -1, kin.WAIST_ORIGIN, (0, 0, 1), 0.6, (2e-3,) * 3, LINK_MESHES["waist"]),
+    Link("shoulder", 0, kin.SHOULDER_ORIGIN, (0, 1, 0), 0.7, (2e-3,) * 3, LINK_MESHES["shoulder"]),
+    Link("elbow", 1, kin.ELBOW_ORIGIN, (0, 1, 0), 0.4, (1e-3,) * 3, LINK_MESHES["elbow"], is_rolled=True),
+    Link("forearm_roll", 2, kin.FOREARM_ROLL_ORIGIN, (1, 0, 0), 0.2, (5e-4,) * 3, LINK_MESHES["forearm_roll"]),
+    Link("wrist_angle", 3, kin.WRIST_ANGLE_ORIGIN, (0, 1, 0), 0.1, (3e-4,) * 3, LINK_MESHES["wrist_angle"]),
+    Link(
+        "wrist_rotate",
+        4,
+        kin.WRIST_ROTATE_ORIGIN,
+        (1, 0, 0),
+        0.2,
+        (3e-4,) * 3,
+        LINK_MESHES["wrist_rotate"],
+        is_rolled=True,
+        boxes=(Box((0.02, 0.0, 0.0), (0.018, 0.045, 0.012)),),
+    ),
+    _finger("left_finger", side=1),
+    _finger("right_finger", side=-1),
+)
+
+
+class Arm:
+    """The arm in one scene of a simulation, with its gripper pointing down.
+
+    Only the gripper touches things: the links above it stay clear of the table in every pose that it takes.
+    """
+
+    finger_links = (6, 7)
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self.body = simulation.add_articulated_body(BASE_MESH, _LINKS, kin.BASE_POSITION, _SURFACE)
+        self._joint_targets = kin.REST_JOINTS.copy()
+        self.is_open = True
+        simulation.set_joint_positions(self.body, [*kin.REST_JOINTS, FINGER_OPEN, -FINGER_OPEN])
+        simulation.mirror_joints(self.body, (6, 7), axis=(0, 1, 0), max_force=200.0)
+        self._drive_arm(kin.REST_JOINTS)
+        self._drive_fingers()
+        self._read()
+
+    def command(self, position: ArrayLike, is_open: bool) -> None:
+        """Moves the end effector, and opens or closes the gripper; runs the physics of one control step.
+
+        Args:
+            position: Where to, (3,), m; clipped to the limits.
+            is_open: The gripper's state to reach or keep.
+        """
+        goal = kin.inverse(np.clip(position, POSITION_LOW, POSITION_HIGH), near=self._joint_targets)
+        start, self._joint_targets = self._joint_targets, goal
+        n_steps = MOVE_STEPS if is_open == self.is_open else GRIP_STEPS
+        if is_open != self.is_open:
+            self.is_open = is_open
+            self._drive_fingers()
+        for step in range(1, n_steps + 1):
+            if step <= _RAMP_STEPS:
+                self._drive_arm(start + (goal - start) * _ramp(step / _RAMP_STEPS))
+            self._simulation.step()
+        self._read()
+
+    def _read(self) -> None:
+        """Reads where the arm is: the angles of its six joints, (6,), rad, and its end effector, (3,), m."""
+        self.joints = self._simulation.joint_positions(self.body, _ARM_JOINTS)
+        self.position = kin.forward(self.joints)[0]
+
+    def _drive_arm(self, targets: NDArray[np.float64]) -> None:
+        self._simulation.drive_joints(self.body, _ARM_JOINTS, targets.tolist(), _ARM_FORCES, _ARM_GAINS)
+
+    def _drive_fingers(self) -> None:
+        width = FINGER_OPEN if self.is_open else FINGER_CLOSED
+        self._simulation.drive_joints(self.body, _FINGER_JOINTS, [width, -width], _FINGER_FORCES, _FINGER_GAINS)
+
+
+def _ramp(share: float) -> float:
+    """From 0 to 1, at rest at both ends, with the least possible acceleration, so that held objects do not slip."""
+    return 2 * share**2 if share < 0.5 else 1 - 2 * (1 - share) ** 2

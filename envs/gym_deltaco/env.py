@@ -1,0 +1,219 @@
+"""The gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, get_args
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from gym_deltaco.layout import AMBIGUITIES, Ambiguity, sample_layout
+from gym_deltaco.scene import Scene
+from gym_deltaco.simulation import Simulation
+from gym_deltaco.tasks import Task, get_task
+
+ACTION_SCALE = 0.1  # m of the end effector's motion for an action of 1
+CONTROL_FPS = 24  # nominal: 10 physics steps of 1/240 s
+MIN_IMAGE_SIZE = 8  # px
+
+Observation = dict[str, NDArray[Any]]
+
+
+class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
+    """A WidowX 250 puts one of three objects into one of two containers, as an instruction says.
+
+    The task is one of the 300 of `gym_deltaco.tasks`. Every reset draws a new scene.
+
+    ## Observation
+
+    | key         | shape     | dtype   | what                                                        |
+    |-------------|-----------|---------|-------------------------------------------------------------|
+    | `pixels`    | (H, W, 3) | uint8   | RGB of the front camera, H = W = `image_size`               |
+    | `agent_pos` | (10,)     | float32 | 6 joint angles (rad), x, y, z of the end effector (m), gripper open 1 / closed 0 |
+
+    ## Action
+
+    | number | range   | what                                                                             |
+    |--------|---------|----------------------------------------------------------------------------------|
+    | 0..2   | -1 .. 1 | change of the end effector's position in x, y, z, in units of 0.1 m              |
+    | 3      | -1 .. 1 | the gripper: above 0 open, else closed                                           |
+
+    A step is 10 physics steps of 1/240 s, or 75 when the gripper opens or closes. An episode has 30 steps
+    and is then truncated; it never terminates. The end effector stays within x .4..0.8, y -.2..0.4, z -.34..-.1.
+
+    ## Reward and success
+
+    The reward is 1 once the task has succeeded, else 0. It succeeds at a step at which the target object, released
+    and at rest, lies in the target container: its middle within the container's half extents, low enough to stand on
+    its floor.
+
+    ## Info
+
+    Of every reset and step; objects and containers are numbered as they are in the scene, -1 is none.
+
+    | key                 | what                                                                        |
+    |---------------------|-----------------------------------------------------------------------------|
+    | `is_success`        | whether the task has succeeded in this episode                               |
+    | `task_id`           | 0..299                                                                      |
+    | `objects`           | (3,) int64: which of the 32 objects stand in the scene                       |
+    | `object_containers` | (3,) int64: the container in which each of them lies: 0 green, 1 red         |
+    | `target_object`     | number of the object that the task asks for                                  |
+    | `target_container`  | number of the container that the task asks for                               |
+    | `grasped_object`    | number of the object that the gripper has held last                          |
+    | `right_object`      | whether that one is the target                                               |
+    | `right_container`   | whether something lies in the target container, and nothing in the other one |
+
+    Args:
+        task_id: 0..299. `reset(options={"task_id": ...})` changes it from then on.
+        ambiguity: "container", the paper's scheme (i), or "object", scheme (ii).
+        image_size: Height and width of `pixels`, at least 8.
+        render_mode: "rgb_array" or None.
+        render_size: Height and width of what `render` returns, for people to look at.
+
+    Raises:
+        ValueError: An argument is out of its range; the message says what is valid.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_FPS}
+
+    def __init__(
+        self,
+        task_id: int = 0,
+        ambiguity: Ambiguity = "container",
+        image_size: int = 48,
+        render_mode: str | None = None,
+        render_size: int = 256,
+    ) -> None:
+        self.task: Task = get_task(task_id)
+        if ambiguity not in AMBIGUITIES:
+            raise ValueError(f"`ambiguity` must be one of {', '.join(get_args(Ambiguity))}. Got {ambiguity!r}.")
+        for name, size in (("image_size", image_size), ("render_size", render_size)):
+            if size < MIN_IMAGE_SIZE:
+                raise ValueError(f"`{name}` must be at least {MIN_IMAGE_SIZE}. Got {size}.")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"`render_mode` must be 'rgb_array' or None. Got {render_mode!r}.")
+        self.ambiguity: Ambiguity = ambiguity
+        self.image_size = image_size
+        self.render_mode = render_mode
+        self.render_size = render_size
+        self.observation_space = spaces.Dict(
+            {
+                "pixels": spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
+                "agent_pos": spaces.Box(-np.inf, np.inf, (10,), np.float32),
+            }
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        # The simulator is connected at the first reset, so that a worker process has its own.
+        self._simulation: Simulation | None = None
+        self._scene: Scene | None = None
+        self._is_closed = False
+        self._is_success = False
+        self._grasped_object = -1
+
+    @property
+    def task_description(self) -> str:
+        """The instruction, such as "Put blue colored object in front bin."."""
+        return self.task.instruction
+
+    @property
+    def scene(self) -> Scene:
+        """The current scene, with its privileged state.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There is none: the environment has not been reset, or is closed.
+        """
+        if self._is_closed:
+            raise gym.error.ClosedEnvironmentError("The environment is closed. Make a new one with `gymnasium.make`.")
+        if self._scene is None:
+            raise gym.error.ResetNeeded("Call `reset` before `step` or `render`.")
+        return self._scene
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Draws and builds a new scene.
+
+        Args:
+            seed: Seeds `np_random`; None goes on with the present draws.
+            options: "task_id": the task of this and the following episodes, 0..299. Others are for wrappers.
+
+        Returns:
+            The first observation and info.
+        """
+        if self._is_closed:
+            raise gym.error.ClosedEnvironmentError("The environment is closed. Make a new one with `gymnasium.make`.")
+        super().reset(seed=seed)
+        if options and "task_id" in options:
+            self.task = get_task(options["task_id"])
+        if self._simulation is None:
+            self._simulation = Simulation()
+        self._scene = Scene(self._simulation, sample_layout(self.task, self.ambiguity, self.np_random))
+        self._is_success = False
+        self._grasped_object = -1
+        return self._observation(), self._info()
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Moves the arm.
+
+        Args:
+            action: (4,) in [-1, 1]; what lies beyond is clipped.
+
+        Returns:
+            Observation, reward (1.0 once the task has succeeded), False, False (the 30 steps are counted by gymnasium's `TimeLimit`), info.
+
+        Raises:
+            ValueError: The action has another shape, or a number that is not finite. The scene is unchanged.
+        """
+        scene = self.scene
+        action = _validated(action)
+        scene.command(scene.arm.position + ACTION_SCALE * action[:3], is_open=bool(action[3] > 0))
+        for index in range(len(scene.bodies)):
+            if scene.is_grasped(index):
+                self._grasped_object = index
+        info = self._info()
+        return self._observation(), float(info["is_success"]), False, False, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The scene for people, (render_size, render_size, 3), or None without a render mode."""
+        return None if self.render_mode is None else self.scene.render(self.render_size)
+
+    def close(self) -> None:
+        """Frees the simulator. Closing twice is harmless."""
+        self._is_closed = True
+        self._scene = None
+        if self._simulation is not None:
+            self._simulation.close()
+            self._simulation = None
+
+    def _observation(self) -> Observation:
+        arm = self.scene.arm
+        state = np.concatenate([arm.joints, arm.position, [arm.is_open]])
+        return {"pixels": self.scene.render(self.image_size), "agent_pos": state.astype(np.float32)}
+
+    def _info(self) -> dict[str, Any]:
+        scene, layout = self.scene, self.scene.layout
+        containers = np.array([scene.container_of(index) for index in range(len(scene.bodies))], dtype=np.int64)
+        target_object, target_container = layout.target_object, layout.target_container
+        self._is_success |= bool(containers[target_object] == target_container)
+        return {
+            "is_success": self._is_success,
+            "task_id": self.task.index,
+            "objects": np.array([item.label.index for item in layout.objects], dtype=np.int64),
+            "object_containers": containers,
+            "target_object": target_object,
+            "target_container": target_container,
+            "grasped_object": self._grasped_object,
+            "right_object": self._grasped_object == target_object,
+            "right_container": bool((containers == target_container).any() and not (containers == 1 - target_container).any()),
+        }
+
+
+def _validated(action: NDArray[np.float32]) -> NDArray[np.float64]:
+    values = np.asarray(action, dtype=np.float64)
+    if values.shape != (4,):
+        raise ValueError(f"An action must have shape (4,): x, y, z and the gripper. Got {values.shape}.")
+    if not np.isfinite(values).all():
+        raise ValueError(f"An action must be finite. Got {values}.")
+    return np.clip(values, -1.0, 1.0)

@@ -1,0 +1,102 @@
+"""Kinematics of the WidowX 250 (6 degrees of freedom), with the gripper pointing straight down.
+
+The joints are the published ones: waist (z), shoulder (y), elbow (y), forearm roll (x), wrist angle (y) and
+wrist rotate (x), where the frames from the elbow to the wrist angle are rolled by pi. With the gripper down and its fingers
+kept parallel to the world's x axis, the forearm never rolls, the wrist undoes what the waist turns, and the
+other three joints are a triangle in a vertical plane; so the inverse is exact and needs no iteration.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+BASE_POSITION = np.array([0.6, 0.0, -0.4])  # m, of the arm's base in the world
+# Origins of the joints in their parents' frames, m.
+WAIST_ORIGIN = (0.0, 0.0, 0.0716)
+SHOULDER_ORIGIN = (0.0, 0.0, 0.03865)
+ELBOW_ORIGIN = (0.04975, 0.0, 0.25)
+FOREARM_ROLL_ORIGIN = (0.175, 0.0, 0.0)
+WRIST_ANGLE_ORIGIN = (0.075, 0.0, 0.0)
+WRIST_ROTATE_ORIGIN = (0.065, 0.0, 0.0)
+END_EFFECTOR_OFFSET = (0.043, 0.0, 0.0)  # from the wrist-rotate joint
+REST_JOINTS = np.array([1.57, -0.6, -0.6, 0.0, -1.57, 0.0])  # rad
+JOINT_LIMITS = np.deg2rad([[-180, 180], [-108, 114], [-92, 123], [-180, 180], [-123, 100], [-180, 180]])  # rad
+
+_SHOULDER = BASE_POSITION + WAIST_ORIGIN + SHOULDER_ORIGIN
+_UPPER_ARM = float(np.hypot(ELBOW_ORIGIN[0], ELBOW_ORIGIN[2]))
+_UPPER_ARM_ELEVATION = float(np.arctan2(ELBOW_ORIGIN[2], ELBOW_ORIGIN[0]))  # at shoulder angle 0
+_FOREARM = FOREARM_ROLL_ORIGIN[0] + WRIST_ANGLE_ORIGIN[0]
+_HAND = WRIST_ROTATE_ORIGIN[0] + END_EFFECTOR_OFFSET[0]
+_MAX_REACH = 0.999 * (_UPPER_ARM + _FOREARM)  # of the wrist from the shoulder; short of the singularity
+_MIN_RADIUS = 0.03  # of the end effector from the waist's axis, where the waist's angle is undefined
+
+
+def forward(joints: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pose of the end effector.
+
+    Args:
+        joints: (6,), rad.
+
+    Returns:
+        Its position in the world, (3,), m, and its rotation, (3, 3): the first column is the direction in
+        which the gripper points, the second the one along which the fingers move.
+    """
+    waist, shoulder, elbow, roll, wrist, rotate = np.asarray(joints, dtype=np.float64)
+    position, rotation = BASE_POSITION.copy(), np.eye(3)
+    flip = np.diag([1.0, -1.0, -1.0])
+    for origin, turn in (
+        (WAIST_ORIGIN, _rotation("z", waist)),
+        (SHOULDER_ORIGIN, _rotation("y", shoulder)),
+        (ELBOW_ORIGIN, flip @ _rotation("y", elbow)),
+        (FOREARM_ROLL_ORIGIN, _rotation("x", roll)),
+        (WRIST_ANGLE_ORIGIN, _rotation("y", wrist)),
+        (WRIST_ROTATE_ORIGIN, flip @ _rotation("x", rotate)),
+        (END_EFFECTOR_OFFSET, np.eye(3)),
+    ):
+        position = position + rotation @ origin
+        rotation = rotation @ turn
+    return position, rotation
+
+
+def inverse(position: ArrayLike, near: ArrayLike = REST_JOINTS) -> NDArray[np.float64]:
+    """Joints that put the end effector somewhere, gripper down and fingers along x.
+
+    A position out of reach is replaced by the nearest one towards the shoulder (or, within 3 cm of the
+    waist's axis, away from it).
+
+    Args:
+        position: (3,), m, in the world.
+        near: (6,), rad. Waist and wrist rotate are given without a jump from these.
+
+    Returns:
+        (6,), rad.
+    """
+    x, y, z = np.asarray(position, dtype=np.float64) - _SHOULDER
+    near = np.asarray(near, dtype=np.float64)
+    radius, height = max(float(np.hypot(x, y)), _MIN_RADIUS), z + _HAND
+    reach = float(np.hypot(radius, height))
+    if reach > _MAX_REACH:
+        radius, height, reach = (value * _MAX_REACH / reach for value in (radius, height, reach))
+
+    waist = np.arctan2(y, x) if x or y else near[0]
+    waist += 2 * np.pi * np.round((near[0] - waist) / (2 * np.pi))
+    # Law of cosines in the triangle of shoulder, elbow (which stays above) and wrist.
+    opening = np.arccos((_UPPER_ARM**2 + reach**2 - _FOREARM**2) / (2 * _UPPER_ARM * reach))
+    upper_arm_elevation = np.arctan2(height, radius) + opening
+    forearm_pitch = -np.arctan2(
+        height - _UPPER_ARM * np.sin(upper_arm_elevation), radius - _UPPER_ARM * np.cos(upper_arm_elevation)
+    )
+    shoulder = _UPPER_ARM_ELEVATION - upper_arm_elevation
+    elbow = shoulder - forearm_pitch
+    wrist = forearm_pitch - np.pi / 2
+    return np.array([waist, shoulder, elbow, 0.0, wrist, waist - np.pi / 2])
+
+
+def _rotation(axis: str, angle: float) -> NDArray[np.float64]:
+    c, s = np.cos(angle), np.sin(angle)
+    first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    matrix = np.eye(3)
+    matrix[first, first] = matrix[second, second] = c
+    matrix[first, second], matrix[second, first] = -s, s
+    return matrix

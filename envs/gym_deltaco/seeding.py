@@ -1,0 +1,35 @@
+"""Seeds of episodes, so that training, validation and evaluation never show the same scene."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
+
+Split = Literal["train", "validation", "evaluation"]
+_SPLITS: tuple[str, ...] = get_args(Split)
+
+
+def episode_seed(seed: int, split: Split, task_id: int, episode: int, attempt: int = 0) -> int:
+    """The seed of one episode's `reset`, a function of what the episode is for.
+
+    Args:
+        seed: The user's seed of the whole dataset or evaluation, at least 0.
+        split: What the episode is for.
+        task_id: Index of the task, 0..299.
+        episode: Number of the episode (or of the trial) of this task, from 0.
+        attempt: Number of attempts at this episode that failed before.
+
+    Returns:
+        A seed in [0, 2**63), for `env.reset(seed=...)`.
+
+    Raises:
+        ValueError: The split is unknown, or a number is negative.
+    """
+    if split not in _SPLITS:
+        raise ValueError(f"`split` must be one of {', '.join(_SPLITS)}. Got {split!r}.")
+    entropy = (seed, _SPLITS.index(split), task_id, episode, attempt)
+    if min(entropy) < 0:
+        raise ValueError(f"Seeds, tasks, episodes and attempts count from 0. Got {entropy}.")
+    state = np.random.SeedSequence(entropy).generate_state(1, np.uint64)
+    return int(state[0] >> np.uint64(1))

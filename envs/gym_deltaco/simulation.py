@@ -1,0 +1,429 @@
+"""A PyBullet client behind a small interface: the only module that imports pybullet.
+
+Bodies are made from arrays, never from asset files: pictures from triangle meshes with a color for each face,
+contacts from boxes and convex hulls. A scene is built anew for every episode, because a rebuilt world repeats
+to the last bit, and one that is restored from a saved state does not.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pybullet
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from gym_deltaco.solids import Mesh
+
+TIME_STEP = 1 / 240  # s
+GRAVITY = -10.0  # m/s²
+# Colors of meshes are looked up in one texture that holds every color of 16 levels in each channel.
+_COLOR_LEVELS = 16
+_TEXTURE_WIDTH = _TEXTURE_HEIGHT = 64
+_NO_SHAPE = -1
+_ANGULAR_DAMPING = 0.9  # of free bodies, 1/s: without it, round ones rock on their rims for seconds
+_BASE = -1
+
+
+class Box(NamedTuple):
+    """An axis-aligned box of a body's frame, for contacts."""
+
+    center: tuple[float, float, float]  # m
+    half_extents: tuple[float, float, float]  # m
+
+
+class Contact(NamedTuple):
+    """Surface properties of a body; PyBullet multiplies those of two touching bodies."""
+
+    lateral_friction: float = 1.0
+    spinning_friction: float = 0.0  # m
+    rolling_friction: float = 0.0  # m
+
+
+class Pose(NamedTuple):
+    """Position and motion of a body in the world."""
+
+    position: NDArray[np.float64]  # (3,), m
+    rotation: NDArray[np.float64]  # (3, 3)
+    linear_speed: float  # m/s
+    angular_speed: float  # rad/s
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera that looks at a point; the picture is square.
+
+    Attributes:
+        target: The point in the middle of the picture, m.
+        distance: From the target, m.
+        yaw: About the vertical, degrees; 0 looks along +y.
+        pitch: Degrees; negative looks down.
+        fov: Vertical field of view, degrees.
+        near: Distance of the near plane, m.
+        far: Distance of the far plane, m.
+    """
+
+    target: tuple[float, float, float]
+    distance: float
+    yaw: float
+    pitch: float
+    fov: float = 60.0
+    near: float = 0.1
+    far: float = 2.0
+
+    @functools.cached_property
+    def matrices(self) -> tuple[Sequence[float], Sequence[float]]:
+        """View and projection, 16 numbers each, as PyBullet takes them."""
+        view = pybullet.computeViewMatrixFromYawPitchRoll(
+            self.target, self.distance, self.yaw, self.pitch, roll=0, upAxisIndex=2
+        )
+        projection = pybullet.computeProjectionMatrixFOV(self.fov, aspect=1, nearVal=self.near, farVal=self.far)
+        return view, projection
+
+
+@dataclass(frozen=True)
+class Link:
+    """A link of an articulated body, moved by one joint at its origin.
+
+    Attributes:
+        name: Of the link.
+        parent: Index of the parent link, -1 for the base.
+        origin: Of the joint in the parent's frame, m.
+        axis: Of the joint, in the link's frame.
+        is_prismatic: Whether the joint slides (m) or turns (rad).
+        is_rolled: Whether the link's frame is rolled by pi about the parent's x axis.
+        mass: kg.
+        inertia: Diagonal of the inertia tensor, kg m².
+        mesh: What it looks like.
+        boxes: What it touches with, if anything.
+    """
+
+    name: str
+    parent: int
+    origin: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    mass: float
+    inertia: tuple[float, float, float]
+    mesh: Mesh
+    is_prismatic: bool = False
+    is_rolled: bool = False
+    boxes: tuple[Box, ...] = ()
+
+
+class Simulation:
+    """One world of PyBullet, without a window.
+
+    The client is connected when an instance is made, and holds about 48 MB until `close`.
+    """
+
+    def __init__(self) -> None:
+        self._client = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
+            raise RuntimeError(
+                "PyBullet has no free client left. Close environments that are no longer used with `env.close()`."
+            )
+        # PyBullet reads textures and unions of hulls from files only.
+        self._files = tempfile.TemporaryDirectory(prefix="gym_deltaco_")
+        self._texture_file = Path(self._files.name) / "colors.png"
+        _color_texture().save(self._texture_file)
+        self._hull_files: dict[object, str] = {}
+        self._texture = -1
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the client is still connected."""
+        return self._client >= 0
+
+    def close(self) -> None:
+        """Disconnects the client. Closing twice is harmless."""
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
+            self._files.cleanup()
+
+    def __del__(self) -> None:
+        self.close()
+
+    def reset(self) -> None:
+        """Empties the world."""
+        pybullet.resetSimulation(physicsClientId=self._client)
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=TIME_STEP,
+            # Up to 50 iterations, fewer where the contacts have converged: half the time of always 50.
+            numSolverIterations=50,
+            solverResidualThreshold=1e-4,
+            deterministicOverlappingPairs=1,
+            enableFileCaching=0,
+            physicsClientId=self._client,
+        )
+        pybullet.setGravity(0, 0, GRAVITY, physicsClientId=self._client)
+        self._texture = pybullet.loadTexture(str(self._texture_file), physicsClientId=self._client)
+
+    def step(self) -> None:
+        """Advances the world by `TIME_STEP`."""
+        pybullet.stepSimulation(physicsClientId=self._client)
+
+    # Bodies
+
+    def add_static_body(
+        self, mesh: Mesh, boxes: Sequence[Box], position: ArrayLike = (0, 0, 0), contact: Contact = Contact()
+    ) -> int:
+        """Adds a body that nothing moves. Returns its id."""
+        return self._add_body(mesh, self._boxes(boxes), position, yaw=0.0, mass=0.0, contact=contact)
+
+    def add_free_body(
+        self,
+        mesh: Mesh,
+        hulls: Sequence[NDArray[np.float64]],
+        position: ArrayLike,
+        yaw: float,
+        mass: float,
+        contact: Contact = Contact(),
+    ) -> int:
+        """Adds a body that falls, and touches with the union of convex hulls.
+
+        Args:
+            mesh: What it looks like, in the body's frame.
+            hulls: Vertices of the hulls, (P, 3) each, m, in the body's frame.
+            position: Of the body's origin and center of mass, (3,), m.
+            yaw: About the vertical, rad.
+            mass: kg.
+            contact: Properties of its surface.
+
+        Returns:
+            The body's id.
+        """
+        return self._add_body(mesh, self._hulls(mesh, hulls), position, yaw, mass, contact)
+
+    def add_articulated_body(self, base: Mesh, links: Sequence[Link], position: ArrayLike, contact: Contact) -> int:
+        """Adds a chain of links on a fixed base. Joint i moves link i. Returns its id."""
+        body = pybullet.createMultiBody(
+            baseMass=0,
+            baseVisualShapeIndex=self._visual_shape(base),
+            basePosition=position,
+            linkMasses=[link.mass for link in links],
+            linkCollisionShapeIndices=[self._boxes(link.boxes) if link.boxes else _NO_SHAPE for link in links],
+            linkVisualShapeIndices=[self._visual_shape(link.mesh) for link in links],
+            linkPositions=[link.origin for link in links],
+            linkOrientations=[(1, 0, 0, 0) if link.is_rolled else (0, 0, 0, 1) for link in links],
+            linkInertialFramePositions=[(0, 0, 0)] * len(links),
+            linkInertialFrameOrientations=[(0, 0, 0, 1)] * len(links),
+            linkParentIndices=[link.parent + 1 for link in links],
+            linkJointTypes=[
+                pybullet.JOINT_PRISMATIC if link.is_prismatic else pybullet.JOINT_REVOLUTE for link in links
+            ],
+            linkJointAxis=[link.axis for link in links],
+            physicsClientId=self._client,
+        )
+        self._paint(body, _BASE)
+        for index, link in enumerate(links):
+            self._paint(body, index)
+            pybullet.changeDynamics(
+                body,
+                index,
+                localInertiaDiagonal=link.inertia,
+                jointDamping=0,
+                linearDamping=0,
+                angularDamping=0,
+                physicsClientId=self._client,
+            )
+            self._set_contact(body, index, contact)
+        return body
+
+    def _add_body(
+        self, mesh: Mesh, shape: int, position: ArrayLike, yaw: float, mass: float, contact: Contact
+    ) -> int:
+        body = pybullet.createMultiBody(
+            baseMass=mass,
+            baseCollisionShapeIndex=shape,
+            baseVisualShapeIndex=self._visual_shape(mesh),
+            basePosition=position,
+            baseOrientation=(0, 0, np.sin(yaw / 2), np.cos(yaw / 2)),
+            physicsClientId=self._client,
+        )
+        self._paint(body, _BASE)
+        self._set_contact(body, _BASE, contact)
+        pybullet.changeDynamics(
+            body, _BASE, linearDamping=0.04, angularDamping=_ANGULAR_DAMPING, physicsClientId=self._client
+        )
+        return body
+
+    def _visual_shape(self, mesh: Mesh) -> int:
+        vertices, normals, uvs, indices = _visual_arrays(mesh)
+        return pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            vertices=vertices,
+            normals=normals,
+            uvs=uvs,
+            indices=indices,
+            rgbaColor=(1, 1, 1, 1),
+            specularColor=(0, 0, 0),
+            physicsClientId=self._client,
+        )
+
+    def _paint(self, body: int, link: int) -> None:
+        pybullet.changeVisualShape(body, link, textureUniqueId=self._texture, physicsClientId=self._client)
+
+    def _set_contact(self, body: int, link: int, contact: Contact) -> None:
+        pybullet.changeDynamics(
+            body,
+            link,
+            lateralFriction=contact.lateral_friction,
+            spinningFriction=contact.spinning_friction,
+            rollingFriction=contact.rolling_friction,
+            restitution=0.0,
+            physicsClientId=self._client,
+        )
+
+    def _boxes(self, boxes: Sequence[Box]) -> int:
+        return pybullet.createCollisionShapeArray(
+            shapeTypes=[pybullet.GEOM_BOX] * len(boxes),
+            halfExtents=[box.half_extents for box in boxes],
+            collisionFramePositions=[box.center for box in boxes],
+            physicsClientId=self._client,
+        )
+
+    def _hulls(self, key: object, hulls: Sequence[NDArray[np.float64]]) -> int:
+        if key not in self._hull_files:
+            path = Path(self._files.name) / f"hulls_{len(self._hull_files)}.obj"
+            path.write_text(_obj_text(hulls))
+            self._hull_files[key] = str(path)
+        return pybullet.createCollisionShape(
+            pybullet.GEOM_MESH, fileName=self._hull_files[key], physicsClientId=self._client
+        )
+
+    # State
+
+    def pose(self, body: int) -> Pose:
+        """Where a body is, and how it moves."""
+        position, quaternion = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+        linear, angular = pybullet.getBaseVelocity(body, physicsClientId=self._client)
+        rotation = np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+        return Pose(np.array(position), rotation, math.hypot(*linear), math.hypot(*angular))
+
+    def move(self, body: int, position: ArrayLike, yaw: float = 0.0) -> None:
+        """Puts a body somewhere, upright and without motion."""
+        quaternion = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
+        pybullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=self._client)
+
+    def touch(self, body: int, other: int, other_link: int | None = None) -> bool:
+        """Whether two bodies touch (or a body and one link of another), as of the last step."""
+        link = {} if other_link is None else {"linkIndexB": other_link}
+        return bool(pybullet.getContactPoints(body, other, **link, physicsClientId=self._client))
+
+    def joint_positions(self, body: int, joints: Sequence[int]) -> NDArray[np.float64]:
+        """Angles (rad) or distances (m) of joints, (len(joints),)."""
+        states = pybullet.getJointStates(body, joints, physicsClientId=self._client)
+        return np.array([state[0] for state in states])
+
+    def set_joint_positions(self, body: int, positions: ArrayLike) -> None:
+        """Puts all joints of a body somewhere at once, without motion."""
+        for joint, position in enumerate(np.asarray(positions)):
+            pybullet.resetJointState(body, joint, position, physicsClientId=self._client)
+
+    def drive_joints(
+        self,
+        body: int,
+        joints: Sequence[int],
+        positions: Sequence[float],
+        max_forces: Sequence[float],
+        gains: Sequence[float],
+    ) -> None:
+        """Sets what the joints' motors hold from the next step on.
+
+        Args:
+            body: Id of the articulated body.
+            joints: Their indices.
+            positions: Targets, rad or m.
+            max_forces: N m or N.
+            gains: Share of the position error that a motor corrects in one step, 0..1.
+        """
+        pybullet.setJointMotorControlArray(
+            body,
+            joints,
+            pybullet.POSITION_CONTROL,
+            targetPositions=positions,
+            forces=max_forces,
+            positionGains=gains,
+            physicsClientId=self._client,
+        )
+
+    def mirror_joints(self, body: int, joints: tuple[int, int], axis: ArrayLike, max_force: float) -> None:
+        """Couples two joints, so that both are always equally far from zero."""
+        constraint = pybullet.createConstraint(
+            body,
+            joints[0],
+            body,
+            joints[1],
+            pybullet.JOINT_GEAR,
+            axis,
+            (0, 0, 0),
+            (0, 0, 0),
+            physicsClientId=self._client,
+        )
+        pybullet.changeConstraint(
+            constraint, gearRatio=1, erp=0.5, maxForce=max_force, physicsClientId=self._client
+        )
+
+    def render(self, camera: Camera, size: int) -> NDArray[np.uint8]:
+        """A picture, (size, size, 3), by PyBullet's software renderer (the same on every machine)."""
+        view, projection = camera.matrices
+        pixels = pybullet.getCameraImage(
+            size,
+            size,
+            view,
+            projection,
+            lightDirection=(0.3, 1.0, 1.8),
+            lightColor=(1, 1, 1),
+            lightAmbientCoeff=0.6,
+            lightDiffuseCoeff=0.5,
+            lightSpecularCoeff=0.05,
+            shadow=0,
+            renderer=pybullet.ER_TINY_RENDERER,
+            flags=pybullet.ER_NO_SEGMENTATION_MASK,
+            physicsClientId=self._client,
+        )[2]
+        return np.ascontiguousarray(np.reshape(pixels, (size, size, 4))[..., :3], dtype=np.uint8)
+
+
+def _color_texture() -> Image.Image:
+    """Every color of 16 levels in each channel, 64 x 64, in the order of `_texture_coordinates`."""
+    code = np.arange(_COLOR_LEVELS**3)
+    levels = np.stack([code // _COLOR_LEVELS**2, code // _COLOR_LEVELS % _COLOR_LEVELS, code % _COLOR_LEVELS], axis=-1)
+    pixels = (levels * 255 // (_COLOR_LEVELS - 1)).astype(np.uint8)
+    return Image.fromarray(pixels.reshape(_TEXTURE_HEIGHT, _TEXTURE_WIDTH, 3))
+
+
+def _texture_coordinates(colors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where the texture has the color nearest to each of `colors`, (N, 3) in 0..1. Returns (N, 2) in 0..1."""
+    levels = np.rint(np.asarray(colors) * (_COLOR_LEVELS - 1)).astype(int)
+    code = levels @ (_COLOR_LEVELS**2, _COLOR_LEVELS, 1)
+    row, column = np.divmod(code, _TEXTURE_WIDTH)
+    return np.stack([(column + 0.5) / _TEXTURE_WIDTH, 1 - (row + 0.5) / _TEXTURE_HEIGHT], axis=-1)
+
+
+@functools.cache
+def _visual_arrays(mesh: Mesh) -> tuple[list, list, list, list]:
+    """Vertices, normals, texture coordinates and indices, each corner of a face apart, as PyBullet takes them."""
+    corners = mesh.faces.reshape(-1)
+    uvs = np.repeat(_texture_coordinates(mesh.colors), 3, axis=0)
+    return mesh.vertices[corners].tolist(), mesh.normals[corners].tolist(), uvs.tolist(), list(range(len(corners)))
+
+
+def _obj_text(hulls: Sequence[NDArray[np.float64]]) -> str:
+    """Convex hulls as groups of a Wavefront file. PyBullet takes the hull of each group; its faces only list points."""
+    lines = []
+    first = 1
+    for index, points in enumerate(hulls):
+        lines.append(f"o hull{index}")
+        lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in points]
+        lines += [f"f {first} {first + i} {first + i + 1}" for i in range(1, len(points) - 1)]
+        first += len(points)
+    return "\n".join(lines) + "\n"

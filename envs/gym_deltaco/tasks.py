@@ -1,0 +1,267 @@
+"""The 300 tasks as data: which object goes into which container, and which tasks a scenario trains and tests on.
+
+Rows of the task table are what is asked for: 32 objects by name (rows 0..31), 8 colors (32..39) and 10
+shapes (40..49). Columns are the container: green, red, front, back, left, right. The index of a task is
+`50 * column + row` (paper, appendix A). Nothing here depends on a simulator.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import Literal
+
+TaskKind = Literal["name", "color", "shape"]
+ContainerColor = Literal["green", "red"]
+ContainerWord = Literal["green", "red", "front", "back", "left", "right"]
+
+COLORS = ("black and white", "brown", "blue", "gray", "white", "red", "orange", "yellow")
+SHAPES = (
+    "vase",
+    "chalice",
+    "freeform",
+    "bottle",
+    "canoe",
+    "cup",
+    "bowl",
+    "trapezoidal prism",
+    "cylinder",
+    "round hole",
+)
+CONTAINER_COLORS: tuple[ContainerColor, ...] = ("green", "red")
+CONTAINER_WORDS: tuple[ContainerWord, ...] = ("green", "red", "front", "back", "left", "right")
+
+
+@dataclass(frozen=True)
+class ObjectLabel:
+    """What one of the 32 objects is called. Its geometry is in `gym_deltaco.objects`.
+
+    Attributes:
+        index: 0..31, the order of the paper's table; 0..23 are scenario A's training objects.
+        name: Its own name, such as "conic cup".
+        shape: One of `SHAPES`.
+        color: One of `COLORS`.
+    """
+
+    index: int
+    name: str
+    shape: str
+    color: str
+
+
+OBJECTS = tuple(
+    ObjectLabel(index, name, shape, color)
+    for index, (name, shape, color) in enumerate(
+        [
+            ("conic cup", "cup", "black and white"),
+            ("fountain vase", "vase", "brown"),
+            ("circular table", "chalice", "blue"),
+            ("hex deep bowl", "bowl", "brown"),
+            ("smushed dumbbell", "chalice", "black and white"),
+            ("square prism bin", "trapezoidal prism", "brown"),
+            ("narrow tray", "trapezoidal prism", "brown"),
+            ("colunnade top", "chalice", "gray"),
+            ("stalagcite chunk", "freeform", "white"),
+            ("bongo drum bowl", "bowl", "red"),
+            ("pacifier vase", "vase", "white"),
+            ("beehive funnel", "vase", "brown"),
+            ("crooked lid trash can", "cylinder", "gray"),
+            ("toilet bowl", "bowl", "white"),
+            ("pepsi bottle", "bottle", "red"),
+            ("tongue chair", "freeform", "red"),
+            ("modern canoe", "canoe", "orange"),
+            ("pear ringed vase", "vase", "orange"),
+            ("short handle cup", "cup", "blue"),
+            ("bullet vase", "vase", "brown"),
+            ("glass half gallon", "bottle", "gray"),
+            ("flat bottom sack vase", "vase", "brown"),
+            ("trapezoidal bin", "trapezoidal prism", "brown"),
+            ("vintage canoe", "canoe", "brown"),
+            ("bathtub", "bowl", "gray"),
+            ("flowery half donut", "round hole", "gray"),
+            ("t cup", "cup", "blue"),
+            ("cookie circular lidless tin", "bowl", "brown"),
+            ("box sofa", "trapezoidal prism", "brown"),
+            ("two layered lampshade", "round hole", "yellow"),
+            ("conic bin", "cup", "gray"),
+            ("jar", "cylinder", "blue"),
+        ]
+    )
+)
+
+N_ROWS = len(OBJECTS) + len(COLORS) + len(SHAPES)
+N_COLUMNS = len(CONTAINER_WORDS)
+N_TASKS = N_ROWS * N_COLUMNS
+_FIRST_COLOR_ROW = len(OBJECTS)
+_FIRST_SHAPE_ROW = _FIRST_COLOR_ROW + len(COLORS)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One of the 300 tasks: an object, asked for by name, color or shape, and a container.
+
+    Attributes:
+        index: 0..299, `50 * column + row`.
+    """
+
+    index: int
+
+    @property
+    def row(self) -> int:
+        """0..49: 32 names, 8 colors, 10 shapes."""
+        return self.index % N_ROWS
+
+    @property
+    def column(self) -> int:
+        """0..5, an index into `CONTAINER_WORDS`."""
+        return self.index // N_ROWS
+
+    @property
+    def kind(self) -> TaskKind:
+        """How the object is asked for."""
+        if self.row < _FIRST_COLOR_ROW:
+            return "name"
+        return "color" if self.row < _FIRST_SHAPE_ROW else "shape"
+
+    @property
+    def container(self) -> ContainerWord:
+        """The word that singles out the container."""
+        return CONTAINER_WORDS[self.column]
+
+    @property
+    def is_position_task(self) -> bool:
+        """Whether the container is asked for by its place (front, back, left, right), not by its color."""
+        return self.container not in CONTAINER_COLORS
+
+    @cached_property
+    def targets(self) -> tuple[int, ...]:
+        """Indices of the objects that the instruction describes: one for a name, all that match otherwise."""
+        return tuple(label.index for label in OBJECTS if self.describes(label))
+
+    def describes(self, label: ObjectLabel) -> bool:
+        """Whether an object is what the instruction asks for."""
+        if self.kind == "name":
+            return label.index == self.row
+        if self.kind == "color":
+            return label.color == COLORS[self.row - _FIRST_COLOR_ROW]
+        return label.shape == SHAPES[self.row - _FIRST_SHAPE_ROW]
+
+    @property
+    def object_phrase(self) -> str:
+        """The object as the instruction calls it, such as "blue colored object"."""
+        if self.kind == "name":
+            label = OBJECTS[self.row]
+            return f"{label.color} colored, {label.shape} shaped {label.name}"
+        if self.kind == "color":
+            return f"{COLORS[self.row - _FIRST_COLOR_ROW]} colored object"
+        return f"{SHAPES[self.row - _FIRST_SHAPE_ROW]} shaped object"
+
+    @property
+    def instruction(self) -> str:
+        """The sentence, such as "Put blue colored object in front bin."."""
+        return f"Put {self.object_phrase} in {self.container} bin."
+
+
+TASKS = tuple(Task(index) for index in range(N_TASKS))
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A split of the rows of the task table; every row comes with all six containers.
+
+    Attributes:
+        name: "a" or "b".
+        train_rows: Rows whose tasks are trained on.
+        test_rows: Rows whose tasks are only tested on.
+    """
+
+    name: str
+    train_rows: tuple[int, ...]
+    test_rows: tuple[int, ...]
+
+    @property
+    def train_tasks(self) -> tuple[int, ...]:
+        """Indices of the training tasks, ascending."""
+        return _tasks_of_rows(self.train_rows)
+
+    @property
+    def test_tasks(self) -> tuple[int, ...]:
+        """Indices of the test tasks, ascending."""
+        return _tasks_of_rows(self.test_rows)
+
+
+def _tasks_of_rows(rows: Iterable[int]) -> tuple[int, ...]:
+    rows = set(rows)
+    return tuple(task.index for task in TASKS if task.row in rows)
+
+
+SCENARIOS = MappingProxyType(
+    {
+        # Novel objects, colors and shapes.
+        "a": Scenario("a", train_rows=(*range(24), *range(36, 45)), test_rows=(*range(24, 36), *range(45, 50))),
+        # All objects are known by name; colors and shapes are novel.
+        "b": Scenario("b", train_rows=(*range(32), *range(36, 45)), test_rows=(*range(32, 36), *range(45, 50))),
+    }
+)
+
+TASK_SETS = MappingProxyType(
+    {
+        "all": tuple(range(N_TASKS)),
+        **{f"scenario_{name}_train": scenario.train_tasks for name, scenario in SCENARIOS.items()},
+        **{f"scenario_{name}_test": scenario.test_tasks for name, scenario in SCENARIOS.items()},
+    }
+)
+
+
+def get_task(index: int) -> Task:
+    """The task of an index.
+
+    Raises:
+        ValueError: The index is not an integer in 0..299.
+    """
+    try:
+        is_valid = int(index) == index and 0 <= index < N_TASKS
+    except (TypeError, ValueError):
+        is_valid = False
+    if not is_valid:
+        raise ValueError(f"`task_id` must be an integer from 0 to {N_TASKS - 1}. Got {index!r}.")
+    return TASKS[int(index)]
+
+
+def select_tasks(selection: str) -> tuple[int, ...]:
+    """The tasks that a selection names, in the order given, each once.
+
+    Args:
+        selection: Names of task sets, indices and ranges (both ends included), separated by commas:
+            "scenario_a_test", "4", "4,50-73", "scenario_b_test,0-9".
+
+    Returns:
+        Indices of tasks, 0..299, at least one.
+
+    Raises:
+        ValueError: Something in the selection is not a task set, an index or a range; an index is out of
+            range; or nothing is selected.
+    """
+    selected: list[int] = []
+    for term in filter(None, (part.strip() for part in selection.split(","))):
+        span = re.fullmatch(r"(\d+)(?:\s*-\s*(\d+))?", term)
+        if term in TASK_SETS:
+            selected.extend(TASK_SETS[term])
+        elif span is None:
+            raise ValueError(
+                f"Unknown task selection {term!r}. Valid are the task sets {', '.join(TASK_SETS)}, and indices and "
+                f"ranges of 0 to {N_TASKS - 1}, separated by commas, such as '4,50-73'."
+            )
+        else:
+            first, last = int(span[1]), int(span[2] or span[1])
+            if last < first:
+                raise ValueError(f"The range {term!r} is empty: its end lies before its start.")
+            selected.extend(range(get_task(first).index, get_task(last).index + 1))
+    if not selected:
+        raise ValueError(
+            f"The task selection {selection!r} is empty. Name a task set ({', '.join(TASK_SETS)}) or indices such as '4,50-73'."
+        )
+    return tuple(dict.fromkeys(selected))

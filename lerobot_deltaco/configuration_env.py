@@ -1,0 +1,102 @@
+"""`--env.type=deltaco`: the benchmark as LeRobot's training and evaluation see it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Any
+
+from gymnasium.vector import VectorEnv
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+
+from gym_deltaco import EPISODE_STEPS
+from gym_deltaco.env import CONTROL_FPS, MIN_IMAGE_SIZE
+from gym_deltaco.layout import AMBIGUITIES
+from gym_deltaco.tasks import TASKS, select_tasks
+from lerobot_deltaco.vector_env import make_task_vector_envs
+
+
+@EnvConfig.register_subclass("deltaco")
+@dataclass
+class DeltacoEnv(EnvConfig):
+    """The 300 pick-and-place tasks of DeL-TaCo.
+
+    LeRobot's evaluation reports a success rate for each kind of task: "name", "color" and "shape".
+
+    Args:
+        task: Which tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_b_test,
+            scenario_b_train, all), or indices and ranges of 0 to 299, such as 4,50-73.
+        fps: Frames per second at which films of episodes play. The simulation knows no frame rate.
+        episode_length: Number of steps after which an episode ends. The benchmark's is 30.
+        ambiguity: "container" (the paper's scheme i: the instruction is clear, a demonstration leaves open
+            which container is meant) or "object" (scheme ii: there are two of the object that the instruction
+            asks for, and only a demonstration tells which is meant).
+        image_size: Height and width of the policy's picture, in pixels. The benchmark's is 48.
+        render_size: Height and width of films. LeRobot films up to 10 episodes of every task, and a frame of
+            256 pixels takes several times as long as one of 96.
+    """
+
+    task: str = "scenario_a_test"
+    fps: int = CONTROL_FPS
+    episode_length: int = EPISODE_STEPS
+    ambiguity: str = "container"
+    image_size: int = 48
+    render_size: int = 96
+
+    def __post_init__(self):
+        select_tasks(self.task)
+        for name, minimum in (
+            ("fps", 1),
+            ("episode_length", 1),
+            ("image_size", MIN_IMAGE_SIZE),
+            ("render_size", MIN_IMAGE_SIZE),
+            ("max_parallel_tasks", 1),
+        ):
+            if getattr(self, name) < minimum:
+                raise ValueError(f"`{name}` must be at least {minimum}. Got {getattr(self, name)}.")
+        if self.ambiguity not in AMBIGUITIES:
+            raise ValueError(f"`ambiguity` must be one of {', '.join(AMBIGUITIES)}. Got {self.ambiguity!r}.")
+        # The environment's names, and what LeRobot calls them in datasets and policies.
+        self.features_map = {"pixels": OBS_IMAGE, "agent_pos": OBS_STATE, ACTION: ACTION}
+        self.features = {
+            "pixels": PolicyFeature(FeatureType.VISUAL, (self.image_size, self.image_size, 3)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (10,)),
+            ACTION: PolicyFeature(FeatureType.ACTION, (4,)),
+        }
+
+    @property
+    def gym_id(self) -> str:
+        """The environment's id, version included."""
+        return f"{self.package_name}/PickPlace-v0"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `gymnasium.make`; the task is chosen later."""
+        return {
+            "ambiguity": self.ambiguity,
+            "image_size": self.image_size,
+            "render_mode": "rgb_array",
+            "render_size": self.render_size,
+            "max_episode_steps": self.episode_length,
+        }
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
+        """Makes a vector environment for each task. None has a simulator until it is first reset.
+
+        Args:
+            n_envs: Number of environments for each task.
+            use_async_envs: Whether each environment has its own process, if there are several.
+
+        Returns:
+            {kind of task: {index of the task: vector environment}}.
+        """
+        task_ids = select_tasks(self.task)
+        envs = make_task_vector_envs(
+            self.gym_id, self.gym_kwargs, task_ids, n_envs, use_async_envs, fps=self.fps
+        )
+        groups: dict[str, dict[int, VectorEnv]] = defaultdict(dict)
+        for task_id, env in zip(task_ids, envs, strict=True):
+            groups[TASKS[task_id].kind][task_id] = env
+        return dict(groups)

@@ -1,0 +1,15 @@
+"""What LeRobot imports: it looks for a distribution, and in it a module, of this very name."""
+
+import atexit
+import sys
+
+try:
+    import lerobot_deltaco.configuration_env  # noqa: F401  (registers `--env.type=deltaco`)
+except Exception as error:
+    problem = (
+        "lerobot_policy_deltaco could not be imported, so LeRobot does not know the type 'deltaco' "
+        f"({type(error).__name__}: {error}). Install the project again, as its README says."
+    )
+    # LeRobot only logs the error, before hundreds of lines of usage. Let it also be the last thing to read.
+    atexit.register(lambda: sys.stderr.write(f"\n{problem}\n"))
+    raise ImportError(problem) from error

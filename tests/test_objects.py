@@ -1,0 +1,289 @@
+"""The 32 objects: closed, colored as they are called, of a size for the gripper, and stable on a table."""
+
+from __future__ import annotations
+
+import colorsys
+from itertools import combinations, product
+
+import numpy as np
+import pybullet
+import pytest
+
+from gym_deltaco import objects
+from gym_deltaco.objects import ObjectModel, object_model
+from gym_deltaco.solids import Loft, merged, polygon
+from gym_deltaco.tasks import OBJECTS
+
+GRIPPER_OPENING = 0.074
+GRASP_ERROR = 0.01
+COLLISION_TOLERANCE = 0.004
+PAD_REACH = 0.02
+"""Half width in y, in meters, of what may come between the fingers."""
+
+# Hue (degrees), saturation and value, each (low, high), of the mean color of what is visible.
+HSV_RANGES = {
+    "brown": ((10, 46), (0.35, 0.9), (0.25, 0.8)),
+    "blue": ((195, 245), (0.4, 1.0), (0.4, 1.0)),
+    "gray": ((-60, 300), (0.0, 0.15), (0.25, 0.72)),
+    "white": ((-60, 300), (0.0, 0.05), (0.85, 1.0)),
+    "red": ((-5, 10), (0.85, 1.0), (0.6, 1.0)),
+    "orange": ((22, 36), (0.85, 1.0), (0.85, 1.0)),
+    "yellow": ((45, 58), (0.85, 1.0), (0.75, 1.0)),
+}
+
+
+@pytest.fixture(params=range(len(OBJECTS)), ids=[label.name for label in OBJECTS])
+def model(request: pytest.FixtureRequest) -> ObjectModel:
+    return object_model(request.param)
+
+
+def test_every_label_has_a_model_and_every_model_a_label():
+    assert tuple(object_model(index).label for index in range(len(OBJECTS))) == OBJECTS
+    assert list(objects._RECIPES) == [label.name for label in OBJECTS]
+
+
+@pytest.mark.parametrize("index", [-1, 32, 1.5, "jar"])
+def test_unknown_object_is_an_error(index):
+    with pytest.raises(ValueError, match="0 to 31"):
+        object_model(index)
+
+
+def test_model_is_built_once_and_nobody_can_change_it():
+    model = object_model(4)
+    assert object_model(4) is model
+    for array in (model.mesh.vertices, model.mesh.colors, model.parts[0]):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0
+
+
+def test_mesh_is_closed_and_faces_outward(model):
+    mesh = model.mesh
+    # Hard edges have duplicate vertices: weld them by position.
+    place = np.unique(mesh.vertices.round(8), axis=0, return_inverse=True)[1].ravel()[mesh.faces]
+    edges = np.concatenate([place[:, [0, 1]], place[:, [1, 2]], place[:, [2, 0]]])
+    forth, forth_count = np.unique(edges, axis=0, return_counts=True)
+    back, back_count = np.unique(edges[:, ::-1], axis=0, return_counts=True)
+    np.testing.assert_array_equal(forth, back)
+    np.testing.assert_array_equal(forth_count, back_count)
+
+    corners = mesh.triangles
+    doubled_areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.linalg.norm(doubled_areas, axis=1).min() > 1e-8
+    assert np.einsum("fi,fi->", corners[:, 0], doubled_areas) / 6 > 1e-6  # volume, m³
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-9)
+    assert np.einsum("fi,fci->fc", doubled_areas, mesh.normals[mesh.faces]).min() > 0
+
+
+def test_mesh_is_light_enough_to_render(model):
+    assert 12 <= len(model.mesh.faces) <= 260
+    assert model.mesh.colors.shape == model.mesh.faces.shape
+    assert 0 <= model.mesh.colors.min() <= model.mesh.colors.max() <= 1
+
+
+def test_all_colors_fit_into_one_palette():
+    colors = np.concatenate([object_model(index).mesh.colors for index in range(len(OBJECTS))])
+    assert len(np.unique(colors, axis=0)) <= 200
+    np.testing.assert_allclose(15 * colors, (15 * colors).round(), atol=1e-9)  # 16 levels, drawn as they are
+
+
+def _visible_areas(model: ObjectModel) -> np.ndarray:
+    """Area of each face seen from in front and 40 degrees above, without occlusion, shape (F,)."""
+    corners = model.mesh.triangles
+    doubled_areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    towards_camera = np.array([0.0, np.cos(np.radians(40)), np.sin(np.radians(40))])
+    return np.maximum(doubled_areas @ towards_camera, 0.0) / 2.0
+
+
+def test_color_is_the_one_it_is_called_by(model):
+    areas = _visible_areas(model)
+    if model.label.color == "black and white":
+        brightness = model.mesh.colors.mean(axis=1)
+        assert areas[brightness < 0.2].sum() > 0.3 * areas.sum()
+        assert areas[brightness > 0.8].sum() > 0.3 * areas.sum()
+        return
+    hue, saturation, value = colorsys.rgb_to_hsv(*np.average(model.mesh.colors, axis=0, weights=areas))
+    ranges = HSV_RANGES[model.label.color]
+    signed_hue = (360 * hue + 60) % 360 - 60  # red lies about zero
+    for number, (low, high) in zip((signed_hue, saturation, value), ranges, strict=True):
+        assert low <= number <= high + 1e-9
+
+
+def test_origin_and_size(model):
+    low, high = model.mesh.vertices.min(axis=0), model.mesh.vertices.max(axis=0)
+    np.testing.assert_allclose(low, -high, atol=1e-9)
+    np.testing.assert_allclose(model.half_extents, high)
+    assert model.height == pytest.approx(high[2] - low[2])
+    assert 0.018 <= model.height <= 0.0751
+    assert (2 * model.half_extents[:2] <= 0.0851).all()
+    assert np.linalg.norm(model.half_extents[:2]) >= model.radius - 0.003
+    assert model.radius >= model.half_extents[:2].max() - 1e-9
+    np.testing.assert_allclose(model.footprint(0.0), np.abs(model.hull_points[:, :2]).max(axis=0))
+    np.testing.assert_allclose(model.footprint(np.pi / 2), model.footprint(0.0)[::-1])
+    assert (model.footprint(0.3) <= model.radius + 1e-9).all()
+    base = model.mesh.vertices[model.mesh.vertices[:, 2] < low[2] + 5e-4, :2]
+    assert np.ptp(base, axis=0).min() >= 0.0239 or model.height < 0.03
+
+
+def _turned(points: np.ndarray, yaw: float) -> np.ndarray:
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return points @ np.array([(cosine, sine, 0), (-sine, cosine, 0), (0, 0, 1)])
+
+
+def test_fits_between_the_open_fingers(model):
+    corners = model.mesh.triangles
+    share = np.linspace(0, 1, 25)[:, None, None, None]
+    edges = np.roll(corners, -1, axis=1) - corners
+    outline = (corners + share * edges).reshape(-1, 3)  # points along all edges
+
+    def width(yaw: float) -> float:
+        turned = _turned(outline, yaw)
+        return float(np.ptp(turned[np.abs(turned[:, 1]) <= PAD_REACH, 0]))
+
+    assert width(0.0) <= 0.0461
+    assert max(map(width, np.linspace(*model.yaw_range, 9))) <= GRIPPER_OPENING - 2 * GRASP_ERROR
+
+
+def _slice_extent(part: np.ndarray, height: float) -> tuple[float, float]:
+    """Lowest and highest x of a convex part at a height; (inf, -inf) where there is nothing of it."""
+    first, second = (part[list(index)] for index in zip(*combinations(range(len(part)), 2), strict=True))
+    rise = second[:, 2] - first[:, 2]
+    crosses = (first[:, 2] - height) * (second[:, 2] - height) <= 0
+    crosses &= rise != 0
+    if not crosses.any():
+        return np.inf, -np.inf
+    share = (height - first[crosses, 2]) / rise[crosses]
+    x = first[crosses, 0] + share * (second[crosses, 0] - first[crosses, 0])
+    return x.min(), x.max()
+
+
+def test_pads_hold_vertical_sides(model):
+    """On either side, what touches the fingers first is a vertical band within reach of the pads."""
+    assert model.grasp_height >= 0.01
+    assert model.height - model.grasp_height <= 0.037  # clear of the palm
+    lowest = model.grasp_height - 0.006  # half a pad
+    heights = np.arange(lowest, model.height, 0.0005)
+    extents = np.array([[_slice_extent(p, z - model.height / 2) for p in model.parts] for z in heights])
+    for reach in (-extents[..., 0].min(axis=1), extents[..., 1].max(axis=1)):
+        touching = heights[reach > reach.max() - 0.0008]
+        assert np.ptp(touching) >= 0.007
+    assert (extents[..., 1].max(axis=1) - extents[..., 0].min(axis=1)).max() <= 0.0475
+
+
+def _directions(count: int = 600) -> np.ndarray:
+    """Unit vectors spread over the sphere, (count, 3), with the coordinate axes among them."""
+    rng = np.random.default_rng(0)
+    vectors = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(count - 6, 3))])
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def test_collision_parts_approximate_the_mesh(model):
+    directions = _directions()
+    reach_of_mesh = (model.mesh.vertices @ directions.T).max(axis=0)
+    reach_of_parts = np.array([(part @ directions.T).max(axis=0) for part in model.parts])
+    np.testing.assert_allclose(reach_of_parts.max(axis=0), reach_of_mesh, atol=COLLISION_TOLERANCE)
+    # Every vertex lies in some part, or very close to it.
+    outside = (model.mesh.vertices @ directions.T)[:, None] - reach_of_parts  # (V, parts, directions)
+    assert outside.max(axis=2).min(axis=1).max() <= COLLISION_TOLERANCE
+
+
+def test_collision_parts_are_few_and_convex(model):
+    assert 1 <= len(model.parts) <= 4
+    for part in model.parts:
+        assert 4 <= len(part) <= 24
+        triples = part[np.array(list(combinations(range(len(part)), 3)))]
+        normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        proper = lengths[:, 0] > 1e-9
+        triples, normals = triples[proper], normals[proper] / lengths[proper]
+        triples, normals = np.concatenate([triples, triples]), np.concatenate([normals, -normals])
+        above = part @ normals.T - np.einsum("ti,ti->t", triples[:, 0], normals)  # (P, planes)
+        supports = (above <= 1e-7).all(axis=0)
+        for number in range(len(part)):
+            # The sum of the normals of the faces that meet in a corner points away from all other corners.
+            outward = normals[supports & (np.abs(above[number]) <= 1e-7)].sum(axis=0)
+            others = np.delete(part, number, axis=0)
+            assert (others @ outward).max() < part[number] @ outward - 1e-7
+
+
+@pytest.fixture(scope="module")
+def tilts(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+    """How far from upright the objects rest after a fall of 5 cm, in degrees, shape (objects, yaws)."""
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.setGravity(0, 0, -10, physicsClientId=client)
+    plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
+    pybullet.createMultiBody(0, plane, physicsClientId=client)
+    bodies = []
+    for row, model in enumerate(object_model(index) for index in range(len(OBJECTS))):
+        path = tmp_path_factory.mktemp("parts") / "parts.obj"
+        path.write_text(_obj_text(model.parts))
+        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client)
+        for column, yaw in enumerate(np.linspace(*model.yaw_range, 5)):
+            position = (0.2 * row, 0.2 * column, model.height / 2 + 0.05)
+            turn = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
+            bodies.append(pybullet.createMultiBody(0.05, shape, -1, position, turn, physicsClientId=client))
+    for _ in range(240):
+        pybullet.stepSimulation(physicsClientId=client)
+    turns = [pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[1] for body in bodies]
+    upright = np.array([pybullet.getMatrixFromQuaternion(turn)[8] for turn in turns])
+    pybullet.disconnect(client)
+    return np.degrees(np.arccos(np.clip(upright, -1, 1))).reshape(len(OBJECTS), -1)
+
+
+def _obj_text(parts: tuple[np.ndarray, ...]) -> str:
+    """A group per part, whose faces mention every corner: PyBullet makes the convex hull of each group."""
+    lines, start = [], 1
+    for part in parts:
+        lines += ["o part", *(f"v {x} {y} {z}" for x, y, z in part)]
+        lines += [f"f {corner} {corner + 1} {corner + 2}" for corner in range(start, start + len(part) - 2)]
+        start += len(part)
+    return "\n".join(lines)
+
+
+def test_stands_after_a_drop(model, tilts):
+    assert tilts[model.label.index].max() < 5
+
+
+def test_loft_of_a_square_is_a_box():
+    square = polygon(4) * np.sqrt(0.5)
+    mesh = Loft(square, [(2, 0, (1, 0, 0)), (2, 3, (0, 1, 0))], turn=45).mesh()
+    first, second, third = np.moveaxis(mesh.triangles, 1, 0)
+    assert np.einsum("fi,fi->", first, np.cross(second, third)) / 6 == pytest.approx(2 * 2 * 3)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), (2, 2, 3))
+    assert {tuple(normal) for normal in mesh.normals.round(6) + 0.0} == {
+        tuple(sign * axis + 0.0) for sign, axis in product((-1, 1), np.eye(3))
+    }
+
+
+def test_loft_shades_a_cylinder_smoothly_but_not_its_rim():
+    mesh = Loft(polygon(12), [(1, 0, (1, 1, 1)), (1, 2)]).mesh()
+    side = np.abs(mesh.normals[:, 2]) < 0.5
+    np.testing.assert_allclose(mesh.normals[side, :2], mesh.vertices[side, :2], atol=1e-6)
+    assert len(mesh.vertices) == 24 + 2 * 13  # the side's rings, and two caps with a middle
+
+
+def test_paint_alternates_around_and_stays_along_the_profile():
+    black, white = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+    mesh = Loft(polygon(4), [(1, 0, black), (1, 1, (black, white)), (1, 2)]).mesh()
+    heights = mesh.triangles[..., 2].mean(axis=1)
+    assert mesh.colors[heights == 0].max() == 0
+    assert mesh.colors[(heights > 0) & (heights < 1)].mean() == 0.5
+    assert mesh.colors[heights > 1].mean() == 0.5
+
+
+def test_closed_loft_has_a_hole():
+    ring = Loft(polygon(8), [(3, 0, (1, 1, 1)), (3, 1), (2, 1), (2, 0)], closed=True).mesh()
+    assert len(ring.faces) == 8 * 4 * 2
+    assert np.hypot(ring.vertices[:, 0], ring.vertices[:, 1]).min() == pytest.approx(2)
+
+
+def test_loft_without_paint_is_an_error():
+    with pytest.raises(ValueError, match="paint"):
+        Loft(polygon(4), [(1, 0), (1, 1)]).mesh()
+
+
+def test_merged_keeps_every_solid():
+    first = Loft(polygon(4), [(1, 0, (1, 0, 0)), (1, 1)]).mesh()
+    second = first.moved((5, 0, 0), scale=2.0)
+    both = merged([first, second])
+    np.testing.assert_array_equal(both.triangles, np.concatenate([first.triangles, second.triangles]))
+    assert both.vertices[:, 0].max() == pytest.approx(12)

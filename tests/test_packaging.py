@@ -1,0 +1,83 @@
+"""LeRobot finds the installed project, and imports within it go one way."""
+
+import ast
+import subprocess
+import sys
+from importlib.metadata import distribution
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+GYM_FILES = sorted((ROOT / "envs" / "gym_deltaco").rglob("*.py"))
+LEROBOT_FILES = [*sorted((ROOT / "lerobot_deltaco").rglob("*.py")), ROOT / "lerobot_policy_deltaco.py"]
+DISTRIBUTION = "lerobot_policy_deltaco"
+
+
+@pytest.fixture(scope="module")
+def lerobot_outputs():
+    """What LeRobot's commands print. Importing LeRobot takes 10 s, so they run at the same time."""
+    main = "from lerobot.scripts.lerobot_{0} import main; main()"
+    commands = {
+        "train --help": ["-c", main.format("train"), "--help"],
+        "eval --help": ["-c", main.format("eval"), "--help"],
+        "eval without PyBullet": [
+            "-c",
+            "import sys; sys.modules['pybullet'] = None; " + main.format("eval"),
+            "--env.type=deltaco",
+        ],
+    }
+    processes = {
+        name: subprocess.Popen(
+            [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        for name, arguments in commands.items()
+    }
+    return {name: process.communicate(timeout=180)[0] for name, process in processes.items()}
+
+
+def test_lerobot_requires_the_distribution_name_to_have_underscores():
+    assert distribution(DISTRIBUTION).metadata["Name"] == DISTRIBUTION
+
+
+@pytest.mark.parametrize("command", ["train", "eval"])
+def test_lerobot_help_lists_the_environment(lerobot_outputs, command):
+    output = lerobot_outputs[f"{command} --help"]
+    type_choices = output[output.index("--env.type") :].split("}")[0]
+    assert "deltaco" in type_choices
+
+
+def test_a_broken_import_ends_in_one_clear_sentence(lerobot_outputs):
+    last_line = lerobot_outputs["eval without PyBullet"].strip().splitlines()[-1]
+    assert "LeRobot does not know the type 'deltaco'" in last_line
+    assert "pybullet" in last_line
+    assert "README" in last_line
+
+
+def imported_modules(path):
+    """Absolute names of the modules that a file imports anywhere, `from package import module` included."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name} has a relative import"
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("path", GYM_FILES, ids=lambda path: path.name)
+def test_the_benchmark_knows_nothing_of_torch_and_lerobot(path):
+    packages = {name.split(".")[0] for name in imported_modules(path)}
+    assert packages.isdisjoint({"torch", "lerobot", "lerobot_deltaco", "lerobot_policy_deltaco"})
+
+
+def test_importing_the_benchmark_loads_neither_torch_nor_lerobot():
+    check = "import sys, gym_deltaco; print({'torch', 'lerobot', 'lerobot_deltaco'} & set(sys.modules))"
+    result = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "set()"
+
+
+@pytest.mark.parametrize("path", [*GYM_FILES, *LEROBOT_FILES], ids=lambda path: path.name)
+def test_nothing_imports_the_command_line(path):
+    command_line = {script.module for script in distribution(DISTRIBUTION).entry_points}
+    assert command_line.isdisjoint(imported_modules(path))
