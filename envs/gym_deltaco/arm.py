@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gym_deltaco import kinematics as kin
-from gym_deltaco.simulation import Box, Contact, Link, Simulation
 from gym_deltaco.arm_meshes import BASE_MESH, LINK_MESHES
+from gym_deltaco.simulation import Box, Contact, Link, Simulation
 
 POSITION_LOW = np.array([0.4, -0.2, -0.34])  # m, limits of the end effector
 POSITION_HIGH = np.array([0.8, 0.4, -0.1])  # m
@@ -52,7 +52,9 @@ _LINKS = (
     Link("waist", -1, kin.WAIST_ORIGIN, (0, 0, 1), 0.6, (2e-3,) * 3, LINK_MESHES["waist"]),
     Link("shoulder", 0, kin.SHOULDER_ORIGIN, (0, 1, 0), 0.7, (2e-3,) * 3, LINK_MESHES["shoulder"]),
     Link("elbow", 1, kin.ELBOW_ORIGIN, (0, 1, 0), 0.4, (1e-3,) * 3, LINK_MESHES["elbow"], is_rolled=True),
-    Link("forearm_roll", 2, kin.FOREARM_ROLL_ORIGIN, (1, 0, 0), 0.2, (5e-4,) * 3, LINK_MESHES["forearm_roll"]),
+    Link(
+        "forearm_roll", 2, kin.FOREARM_ROLL_ORIGIN, (1, 0, 0), 0.2, (5e-4,) * 3, LINK_MESHES["forearm_roll"]
+    ),
     Link("wrist_angle", 3, kin.WRIST_ANGLE_ORIGIN, (0, 1, 0), 0.1, (3e-4,) * 3, LINK_MESHES["wrist_angle"]),
     Link(
         "wrist_rotate",
@@ -118,9 +120,11 @@ class Arm:
 
     def _drive_fingers(self) -> None:
         width = FINGER_OPEN if self.is_open else FINGER_CLOSED
-        self._simulation.drive_joints(self.body, _FINGER_JOINTS, [width, -width], _FINGER_FORCES, _FINGER_GAINS)
+        self._simulation.drive_joints(
+            self.body, _FINGER_JOINTS, [width, -width], _FINGER_FORCES, _FINGER_GAINS
+        )
 
 
 def _ramp(share: float) -> float:
-    """From 0 to 1, at rest at both ends, with the least possible acceleration, so that held objects do not slip."""
+    """From 0 to 1, at rest at both ends, with the least acceleration: what is held shall not slip."""
     return 2 * share**2 if share < 0.5 else 1 - 2 * (1 - share) ** 2

@@ -1,4 +1,4 @@
-"""What the WidowX 250 looks like: a low-poly sketch of its links, black and matte. Each is in its link's frame."""
+"""What the WidowX 250 looks like: a low-poly sketch of its links, black and matte, each in its own frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ _BEAM = np.array([(1, -0.6), (1, 0.6), (0.6, 1), (-0.6, 1), (-1, 0.6), (-1, -0.6
 _ROUND = polygon(8)
 
 
-def _beam(half_y: float, half_z: float, start: float, end: float, color: Color, outline: np.ndarray = _BEAM) -> Mesh:
+def _beam(
+    half_y: float, half_z: float, start: float, end: float, color: Color, outline: np.ndarray = _BEAM
+) -> Mesh:
     """A bar along x, from `start` to `end` (m)."""
     rows = [((half_z, half_y), start, color), ((half_z, half_y), end)]
     return Loft(outline, rows, tilt=90).mesh()
@@ -50,7 +52,11 @@ BASE_MESH = merged(
 LINK_MESHES = {
     "waist": merged([_column(0.035, 0.035, 0.0, 0.03, _BLACK), _column(0.03, 0.04, 0.025, 0.055, _DARK)]),
     "shoulder": merged(
-        [_axle(0.027, 0.045, _BLACK), _column(0.02, 0.022, 0.0, 0.265, _DARK), _beam(0.022, 0.018, 0.0, 0.05, _DARK).moved((0, 0, 0.25))]
+        [
+            _axle(0.027, 0.045, _BLACK),
+            _column(0.02, 0.022, 0.0, 0.265, _DARK),
+            _beam(0.022, 0.018, 0.0, 0.05, _DARK).moved((0, 0, 0.25)),
+        ]
     ),
     "elbow": merged([_axle(0.025, 0.04, _BLACK), _beam(0.02, 0.018, 0.0, 0.175, _DARK)]),
     "forearm_roll": _beam(0.023, 0.02, 0.0, 0.06, _BLACK),

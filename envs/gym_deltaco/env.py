@@ -28,10 +28,10 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     ## Observation
 
-    | key         | shape     | dtype   | what                                                        |
-    |-------------|-----------|---------|-------------------------------------------------------------|
-    | `pixels`    | (H, W, 3) | uint8   | RGB of the front camera, H = W = `image_size`               |
-    | `agent_pos` | (10,)     | float32 | 6 joint angles (rad), x, y, z of the end effector (m), gripper open 1 / closed 0 |
+    | key         | shape     | dtype   | what                                                               |
+    |-------------|-----------|---------|--------------------------------------------------------------------|
+    | `pixels`    | (H, W, 3) | uint8   | RGB of the front camera, H = W = `image_size`                      |
+    | `agent_pos` | (10,)     | float32 | 6 joints (rad), end effector's x, y, z (m), gripper (1 open)       |
 
     ## Action
 
@@ -41,13 +41,14 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     | 3      | -1 .. 1 | the gripper: above 0 open, else closed                                           |
 
     A step is 10 physics steps of 1/240 s, or 75 when the gripper opens or closes. An episode has 30 steps
-    and is then truncated; it never terminates. The end effector stays within x .4..0.8, y -.2..0.4, z -.34..-.1.
+    and is then truncated; it never terminates. The end effector stays within x .4..0.8, y -.2..0.4 and
+    z -.34..-.1 m.
 
     ## Reward and success
 
-    The reward is 1 once the task has succeeded, else 0. It succeeds at a step at which the target object, released
-    and at rest, lies in the target container: its middle within the container's half extents, low enough to stand on
-    its floor.
+    The reward is 1 once the task has succeeded, else 0. It succeeds at a step at which the target object,
+    released and at rest, lies in the target container: its middle within the container's half extents, low
+    enough to stand on its floor.
 
     ## Info
 
@@ -88,7 +89,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     ) -> None:
         self.task: Task = get_task(task_id)
         if ambiguity not in AMBIGUITIES:
-            raise ValueError(f"`ambiguity` must be one of {', '.join(get_args(Ambiguity))}. Got {ambiguity!r}.")
+            raise ValueError(
+                f"`ambiguity` must be one of {', '.join(get_args(Ambiguity))}. Got {ambiguity!r}."
+            )
         for name, size in (("image_size", image_size), ("render_size", render_size)):
             if size < MIN_IMAGE_SIZE:
                 raise ValueError(f"`{name}` must be at least {MIN_IMAGE_SIZE}. Got {size}.")
@@ -125,7 +128,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             gymnasium.error.ResetNeeded: There is none: the environment has not been reset, or is closed.
         """
         if self._is_closed:
-            raise gym.error.ClosedEnvironmentError("The environment is closed. Make a new one with `gymnasium.make`.")
+            raise gym.error.ClosedEnvironmentError(
+                "The environment is closed. Make a new one with `gymnasium.make`."
+            )
         if self._scene is None:
             raise gym.error.ResetNeeded("Call `reset` before `step` or `render`.")
         return self._scene
@@ -143,7 +148,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             The first observation and info.
         """
         if self._is_closed:
-            raise gym.error.ClosedEnvironmentError("The environment is closed. Make a new one with `gymnasium.make`.")
+            raise gym.error.ClosedEnvironmentError(
+                "The environment is closed. Make a new one with `gymnasium.make`."
+            )
         super().reset(seed=seed)
         if options and "task_id" in options:
             self.task = get_task(options["task_id"])
@@ -161,7 +168,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             action: (4,) in [-1, 1]; what lies beyond is clipped.
 
         Returns:
-            Observation, reward (1.0 once the task has succeeded), False, False (the 30 steps are counted by gymnasium's `TimeLimit`), info.
+            Observation, reward (1.0 once the task has succeeded), terminated (False), truncated (False: the
+            30 steps are counted by gymnasium's `TimeLimit`), info.
 
         Raises:
             ValueError: The action has another shape, or a number that is not finite. The scene is unchanged.
@@ -194,7 +202,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     def _info(self) -> dict[str, Any]:
         scene, layout = self.scene, self.scene.layout
-        containers = np.array([scene.container_of(index) for index in range(len(scene.bodies))], dtype=np.int64)
+        containers = np.array(
+            [scene.container_of(index) for index in range(len(scene.bodies))], dtype=np.int64
+        )
         target_object, target_container = layout.target_object, layout.target_container
         self._is_success |= bool(containers[target_object] == target_container)
         return {
@@ -206,7 +216,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             "target_container": target_container,
             "grasped_object": self._grasped_object,
             "right_object": self._grasped_object == target_object,
-            "right_container": bool((containers == target_container).any() and not (containers == 1 - target_container).any()),
+            "right_container": bool(
+                (containers == target_container).any() and not (containers == 1 - target_container).any()
+            ),
         }
 
 

@@ -17,7 +17,7 @@ from gym_deltaco.workspace import CONTAINER_FLOOR, CONTAINER_HALF_EXTENTS, TRAY_
 NOISE = 0.1  # standard deviation of the noise on each of an action's three motions
 OPEN, CLOSED = 1.0, -1.0
 
-# Heights and errors in m. A height of the gripper is that of the end effector; the fingertips are 0.05 m below.
+# Heights and errors in m. The gripper's height is that of the end effector; the fingertips are 0.05 m below.
 _HOVER_Z = -0.215  # where the fingertips pass above every object
 _ALIGNED = np.array([0.013, 0.012])  # error in x and y within which the gripper comes down
 _STRADDLING = np.array([0.02, 0.03])  # the same, once it is down: its fingers slide along the object's sides
@@ -81,7 +81,7 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = NO
 
 
 class Expert:
-    """Acts in one episode of an environment, from the scene's privileged state. Make a new one after every reset.
+    """Acts in one episode of an environment, from the scene's privileged state. Each episode needs a new one.
 
     The stage is a function of the scene, so a slipped or misplaced object is simply picked again.
 
@@ -90,15 +90,24 @@ class Expert:
         rng: Source of the drop point and of the noise.
         noise: Standard deviation of the Gaussian noise on the three motions; the gripper's command, which is
             binary, has none.
+        target_object: Number of the object to pick, as in the environment's info. None: as the task says.
+        target_container: Number of the container to place it in. None: as the task says.
     """
 
-    def __init__(self, env: PickPlaceEnv, rng: np.random.Generator, noise: float = NOISE) -> None:
+    def __init__(
+        self,
+        env: PickPlaceEnv,
+        rng: np.random.Generator,
+        noise: float = NOISE,
+        target_object: int | None = None,
+        target_container: int | None = None,
+    ) -> None:
         self._scene = env.scene
         self._rng = rng
         self._noise = noise
         layout = self._scene.layout
-        self._target = layout.target_object
-        self._container = layout.target_container
+        self._target = layout.target_object if target_object is None else target_object
+        self._container = layout.target_container if target_container is None else target_container
         self._grasp_height = layout.objects[self._target].model.grasp_height
         middle = layout.containers[self._container].quadrant.container_center
         spread = _DROP_SHARE * np.array(CONTAINER_HALF_EXTENTS)
@@ -131,7 +140,10 @@ class Expert:
     def _plan_pick(self, gripper: NDArray[np.float64]) -> tuple[Stage, NDArray[np.float64], float]:
         item = self._scene.object_pose(self._target).position
         bottom, top = self._scene.object_span(self._target)
-        tip_z = max(bottom + min(self._grasp_height, top - bottom - _PAD_HEIGHT) - _PAD_HEIGHT, TRAY_FLOOR + _TIP_CLEARANCE)
+        tip_z = max(
+            bottom + min(self._grasp_height, top - bottom - _PAD_HEIGHT) - _PAD_HEIGHT,
+            TRAY_FLOOR + _TIP_CLEARANCE,
+        )
         grasp = np.array([*item[:2], max(tip_z + FINGERTIP_OFFSET, top + _PALM_CLEARANCE)])
         error = np.abs(grasp - gripper)
         if (error < _AROUND).all() and self._scene.arm.is_open:

@@ -49,7 +49,9 @@ def _open_box(
 
 # The table's body is in the world's frame, the others' origin is the middle of the tray's floor, at its top.
 TABLE_BOXES = (Box((*TRAY_CENTER, TABLE_TOP - 0.02), (0.7, 0.65, 0.02)),)
-TRAY_BOXES = _open_box(TRAY_HALF_EXTENTS, (TABLE_TOP - TRAY_FLOOR, 0.0), TRAY_WALL_HEIGHT, TRAY_WALL_THICKNESS)
+TRAY_BOXES = _open_box(
+    TRAY_HALF_EXTENTS, (TABLE_TOP - TRAY_FLOOR, 0.0), TRAY_WALL_HEIGHT, TRAY_WALL_THICKNESS
+)
 CONTAINER_BOXES = _open_box(
     CONTAINER_HALF_EXTENTS, (0.0, CONTAINER_FLOOR_THICKNESS), CONTAINER_WALL_HEIGHT, CONTAINER_WALL_THICKNESS
 )
@@ -57,7 +59,7 @@ CONTAINER_BOXES = _open_box(
 
 @functools.cache
 def table_mesh() -> Mesh:
-    """The table's top around the tray, in the world's frame. What nobody sees is left out: pixels are what it costs."""
+    """The table's top around the tray, in the world's frame. What the tray hides would only take time."""
     (x, y, _), (half_x, half_y, _) = TABLE_BOXES[0]
     hole_x, hole_y = TRAY_HALF_EXTENTS
     rows = [((half_x, half_y), TABLE_TOP, _TABLE_COLOR), ((hole_x, hole_y), TABLE_TOP)]

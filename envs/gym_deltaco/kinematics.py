@@ -1,9 +1,10 @@
 """Kinematics of the WidowX 250 (6 degrees of freedom), with the gripper pointing straight down.
 
 The joints are the published ones: waist (z), shoulder (y), elbow (y), forearm roll (x), wrist angle (y) and
-wrist rotate (x), where the frames from the elbow to the wrist angle are rolled by pi. With the gripper down and its fingers
-kept parallel to the world's x axis, the forearm never rolls, the wrist undoes what the waist turns, and the
-other three joints are a triangle in a vertical plane; so the inverse is exact and needs no iteration.
+wrist rotate (x), where the frames from the elbow to the wrist angle are rolled by pi. With the gripper down
+and its fingers kept parallel to the world's x axis, the forearm never rolls, the wrist undoes what the waist
+turns, and the other three joints form a triangle in a vertical plane: the inverse is exact and needs no
+iteration.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ WRIST_ANGLE_ORIGIN = (0.075, 0.0, 0.0)
 WRIST_ROTATE_ORIGIN = (0.065, 0.0, 0.0)
 END_EFFECTOR_OFFSET = (0.043, 0.0, 0.0)  # from the wrist-rotate joint
 REST_JOINTS = np.array([1.57, -0.6, -0.6, 0.0, -1.57, 0.0])  # rad
-JOINT_LIMITS = np.deg2rad([[-180, 180], [-108, 114], [-92, 123], [-180, 180], [-123, 100], [-180, 180]])  # rad
+JOINT_LIMITS = np.deg2rad(
+    [[-180, 180], [-108, 114], [-92, 123], [-180, 180], [-123, 100], [-180, 180]]
+)  # rad
 
 _SHOULDER = BASE_POSITION + WAIST_ORIGIN + SHOULDER_ORIGIN
 _UPPER_ARM = float(np.hypot(ELBOW_ORIGIN[0], ELBOW_ORIGIN[2]))

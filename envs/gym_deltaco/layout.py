@@ -17,7 +17,7 @@ AMBIGUITIES: tuple[str, ...] = get_args(Ambiguity)
 N_OBJECTS = 3
 ADVERSARIAL_PROBABILITY = 0.6
 MIN_OBJECT_DISTANCE = 0.065  # m
-# Half the opened gripper's extents, with the expert's noise: nothing else may stand where its fingers come down.
+# Half the opened gripper's extents, with the expert's noise: nothing else stands where its fingers come down.
 GRIPPER_CLEARANCE = (0.052, 0.018)  # m, in x and y
 _MAX_TRIES = 10_000
 _POSITION_AXES: tuple[tuple[ContainerWord, ContainerWord], ...] = (("front", "back"), ("left", "right"))
@@ -74,7 +74,10 @@ def sample_layout(task: Task, ambiguity: Ambiguity, rng: np.random.Generator) ->
         distractors = _sample_distractors(task, OBJECTS[target], rng)
         containers, object_quadrants = _sample_quadrants(task, rng)
     else:
-        distractors = (target, int(rng.choice([label.index for label in OBJECTS if not task.describes(label)])))
+        distractors = (
+            target,
+            int(rng.choice([label.index for label in OBJECTS if not task.describes(label)])),
+        )
         containers, object_quadrants = _sample_twin_quadrants(task, rng)
     models = [object_model(index) for index in (target, *distractors)]
     objects = _place_objects(models, object_quadrants, containers, ambiguity, rng)
@@ -83,12 +86,14 @@ def sample_layout(task: Task, ambiguity: Ambiguity, rng: np.random.Generator) ->
         objects=tuple(objects[index] for index in order),
         containers=containers,
         target_object=int(np.flatnonzero(order == 0)[0]),
-        target_container=next(i for i, container in enumerate(containers) if container.satisfies(task.container)),
+        target_container=next(
+            i for i, container in enumerate(containers) if container.satisfies(task.container)
+        ),
     )
 
 
 def twin_word(task: Task) -> ContainerWord:
-    """Scheme ii: on which side of the tray the target stands, with its twin on the other, fixed for each task."""
+    """Scheme ii: the side of the tray on which a task's target stands; its twin is on the other side."""
     if not task.is_position_task:
         return ("front", "back", "left", "right")[task.index % 4]
     axis = next(axis for axis in _POSITION_AXES if task.container in axis)
@@ -96,7 +101,7 @@ def twin_word(task: Task) -> ContainerWord:
 
 
 def _sample_distractors(task: Task, target: ObjectLabel, rng: np.random.Generator) -> tuple[int, int]:
-    """Two different objects that the instruction does not describe, often alike to the target in color or shape."""
+    """Two objects that the instruction does not describe, often alike to the target in color or shape."""
     others = [label for label in OBJECTS if not task.describes(label) and label is not target]
     alike = [label.index for label in others if label.color == target.color or label.shape == target.shape]
     chosen: list[int] = []
@@ -140,7 +145,10 @@ def _sample_twin_quadrants(
 
 
 def _containers(green: Quadrant, red: Quadrant) -> tuple[PlacedContainer, ...]:
-    return tuple(PlacedContainer(color, quadrant) for color, quadrant in zip(CONTAINER_COLORS, (green, red), strict=True))
+    return tuple(
+        PlacedContainer(color, quadrant)
+        for color, quadrant in zip(CONTAINER_COLORS, (green, red), strict=True)
+    )
 
 
 def _place_objects(
@@ -152,8 +160,8 @@ def _place_objects(
 ) -> list[PlacedObject]:
     """Draws where the objects stand, until all of them can be grasped.
 
-    The target comes first; in scheme ii it takes the first quadrant and its twin the second. Each quadrant holds
-    at least one object.
+    The target comes first; in scheme ii it takes the first quadrant and its twin the second. Each quadrant
+    holds at least one object.
     """
     for _ in range(_MAX_TRIES):
         homes = [0, 1, int(rng.integers(2))]
@@ -162,7 +170,9 @@ def _place_objects(
         placed = []
         for model, home in zip(models, homes, strict=True):
             region = quadrants[home].object_region
-            placed.append(PlacedObject(model, rng.uniform(region.low, region.high), rng.uniform(*model.yaw_range)))
+            placed.append(
+                PlacedObject(model, rng.uniform(region.low, region.high), rng.uniform(*model.yaw_range))
+            )
         if _is_clear(placed, containers):
             return placed
     raise RuntimeError(f"No room for {[model.label.name for model in models]} in {_MAX_TRIES} tries.")

@@ -6,7 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gym_deltaco.arm import Arm
-from gym_deltaco.fixtures import CONTAINER_BOXES, TABLE_BOXES, TRAY_BOXES, container_mesh, table_mesh, tray_mesh
+from gym_deltaco.fixtures import (
+    CONTAINER_BOXES,
+    TABLE_BOXES,
+    TRAY_BOXES,
+    container_mesh,
+    table_mesh,
+    tray_mesh,
+)
 from gym_deltaco.layout import Layout
 from gym_deltaco.simulation import Contact, Pose, Simulation
 from gym_deltaco.workspace import (
@@ -44,7 +51,12 @@ class Scene:
         self.arm = Arm(simulation)
         self.bodies = [
             simulation.add_free_body(
-                item.model.mesh, item.model.parts, (*item.xy, DROP_HEIGHT), item.yaw, OBJECT_MASS, _OBJECT_SURFACE
+                item.model.mesh,
+                item.model.parts,
+                (*item.xy, DROP_HEIGHT),
+                item.yaw,
+                OBJECT_MASS,
+                _OBJECT_SURFACE,
             )
             for item in layout.objects
         ]
@@ -68,7 +80,7 @@ class Scene:
         self._poses = [self._simulation.pose(body) for body in self.bodies]
 
     def command(self, position: NDArray[np.float64], is_open: bool) -> None:
-        """Runs one control step: the end effector moves to a position, (3,), m, and the gripper opens or closes."""
+        """Runs one control step: the end effector goes to a position, (3,), m, the gripper opens or closes."""
         self.arm.command(position, is_open)
         self._read()
 
@@ -94,7 +106,8 @@ class Scene:
     def is_grasped(self, index: int) -> bool:
         """Whether the closed gripper holds an object between its fingers."""
         return not self.arm.is_open and all(
-            self._simulation.touch(self.bodies[index], self.arm.body, finger) for finger in self.arm.finger_links
+            self._simulation.touch(self.bodies[index], self.arm.body, finger)
+            for finger in self.arm.finger_links
         )
 
     def container_around(self, index: int) -> int:

@@ -47,6 +47,9 @@ class Contact(NamedTuple):
     rolling_friction: float = 0.0  # m
 
 
+_DEFAULT_CONTACT = Contact()
+
+
 class Pose(NamedTuple):
     """Position and motion of a body in the world."""
 
@@ -84,7 +87,9 @@ class Camera:
         view = pybullet.computeViewMatrixFromYawPitchRoll(
             self.target, self.distance, self.yaw, self.pitch, roll=0, upAxisIndex=2
         )
-        projection = pybullet.computeProjectionMatrixFOV(self.fov, aspect=1, nearVal=self.near, farVal=self.far)
+        projection = pybullet.computeProjectionMatrixFOV(
+            self.fov, aspect=1, nearVal=self.near, farVal=self.far
+        )
         return view, projection
 
 
@@ -127,7 +132,7 @@ class Simulation:
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise RuntimeError(
-                "PyBullet has no free client left. Close environments that are no longer used with `env.close()`."
+                "PyBullet has no free client left. Close the environments that are no longer used."
             )
         # PyBullet reads textures and unions of hulls from files only.
         self._files = tempfile.TemporaryDirectory(prefix="gym_deltaco_")
@@ -173,7 +178,11 @@ class Simulation:
     # Bodies
 
     def add_static_body(
-        self, mesh: Mesh, boxes: Sequence[Box], position: ArrayLike = (0, 0, 0), contact: Contact = Contact()
+        self,
+        mesh: Mesh,
+        boxes: Sequence[Box],
+        position: ArrayLike = (0, 0, 0),
+        contact: Contact = _DEFAULT_CONTACT,
     ) -> int:
         """Adds a body that nothing moves. Returns its id."""
         return self._add_body(mesh, self._boxes(boxes), position, yaw=0.0, mass=0.0, contact=contact)
@@ -185,7 +194,7 @@ class Simulation:
         position: ArrayLike,
         yaw: float,
         mass: float,
-        contact: Contact = Contact(),
+        contact: Contact = _DEFAULT_CONTACT,
     ) -> int:
         """Adds a body that falls, and touches with the union of convex hulls.
 
@@ -202,14 +211,18 @@ class Simulation:
         """
         return self._add_body(mesh, self._hulls(mesh, hulls), position, yaw, mass, contact)
 
-    def add_articulated_body(self, base: Mesh, links: Sequence[Link], position: ArrayLike, contact: Contact) -> int:
+    def add_articulated_body(
+        self, base: Mesh, links: Sequence[Link], position: ArrayLike, contact: Contact
+    ) -> int:
         """Adds a chain of links on a fixed base. Joint i moves link i. Returns its id."""
         body = pybullet.createMultiBody(
             baseMass=0,
             baseVisualShapeIndex=self._visual_shape(base),
             basePosition=position,
             linkMasses=[link.mass for link in links],
-            linkCollisionShapeIndices=[self._boxes(link.boxes) if link.boxes else _NO_SHAPE for link in links],
+            linkCollisionShapeIndices=[
+                self._boxes(link.boxes) if link.boxes else _NO_SHAPE for link in links
+            ],
             linkVisualShapeIndices=[self._visual_shape(link.mesh) for link in links],
             linkPositions=[link.origin for link in links],
             linkOrientations=[(1, 0, 0, 0) if link.is_rolled else (0, 0, 0, 1) for link in links],
@@ -396,7 +409,9 @@ class Simulation:
 def _color_texture() -> Image.Image:
     """Every color of 16 levels in each channel, 64 x 64, in the order of `_texture_coordinates`."""
     code = np.arange(_COLOR_LEVELS**3)
-    levels = np.stack([code // _COLOR_LEVELS**2, code // _COLOR_LEVELS % _COLOR_LEVELS, code % _COLOR_LEVELS], axis=-1)
+    levels = np.stack(
+        [code // _COLOR_LEVELS**2, code // _COLOR_LEVELS % _COLOR_LEVELS, code % _COLOR_LEVELS], axis=-1
+    )
     pixels = (levels * 255 // (_COLOR_LEVELS - 1)).astype(np.uint8)
     return Image.fromarray(pixels.reshape(_TEXTURE_HEIGHT, _TEXTURE_WIDTH, 3))
 
@@ -411,14 +426,19 @@ def _texture_coordinates(colors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @functools.cache
 def _visual_arrays(mesh: Mesh) -> tuple[list, list, list, list]:
-    """Vertices, normals, texture coordinates and indices, each corner of a face apart, as PyBullet takes them."""
+    """Vertices, normals, texture coordinates and indices for PyBullet; no two faces share a vertex."""
     corners = mesh.faces.reshape(-1)
     uvs = np.repeat(_texture_coordinates(mesh.colors), 3, axis=0)
-    return mesh.vertices[corners].tolist(), mesh.normals[corners].tolist(), uvs.tolist(), list(range(len(corners)))
+    return (
+        mesh.vertices[corners].tolist(),
+        mesh.normals[corners].tolist(),
+        uvs.tolist(),
+        list(range(len(corners))),
+    )
 
 
 def _obj_text(hulls: Sequence[NDArray[np.float64]]) -> str:
-    """Convex hulls as groups of a Wavefront file. PyBullet takes the hull of each group; its faces only list points."""
+    """Convex hulls as groups of a Wavefront file, of whose faces PyBullet only takes the points."""
     lines = []
     first = 1
     for index, points in enumerate(hulls):

@@ -1,4 +1,4 @@
-"""The 300 tasks as data: which object goes into which container, and which tasks a scenario trains and tests on.
+"""The 300 tasks as data: which object goes into which container, and on which a scenario trains and tests.
 
 Rows of the task table are what is asked for: 32 objects by name (rows 0..31), 8 colors (32..39) and 10
 shapes (40..49). Columns are the container: green, red, front, back, left, right. The index of a task is
@@ -201,9 +201,13 @@ def _tasks_of_rows(rows: Iterable[int]) -> tuple[int, ...]:
 SCENARIOS = MappingProxyType(
     {
         # Novel objects, colors and shapes.
-        "a": Scenario("a", train_rows=(*range(24), *range(36, 45)), test_rows=(*range(24, 36), *range(45, 50))),
+        "a": Scenario(
+            "a", train_rows=(*range(24), *range(36, 45)), test_rows=(*range(24, 36), *range(45, 50))
+        ),
         # All objects are known by name; colors and shapes are novel.
-        "b": Scenario("b", train_rows=(*range(32), *range(36, 45)), test_rows=(*range(32, 36), *range(45, 50))),
+        "b": Scenario(
+            "b", train_rows=(*range(32), *range(36, 45)), test_rows=(*range(32, 36), *range(45, 50))
+        ),
     }
 )
 
@@ -252,8 +256,8 @@ def select_tasks(selection: str) -> tuple[int, ...]:
             selected.extend(TASK_SETS[term])
         elif span is None:
             raise ValueError(
-                f"Unknown task selection {term!r}. Valid are the task sets {', '.join(TASK_SETS)}, and indices and "
-                f"ranges of 0 to {N_TASKS - 1}, separated by commas, such as '4,50-73'."
+                f"Unknown task selection {term!r}. Valid are the task sets {', '.join(TASK_SETS)}, and "
+                f"indices and ranges of 0 to {N_TASKS - 1}, separated by commas, such as '4,50-73'."
             )
         else:
             first, last = int(span[1]), int(span[2] or span[1])
@@ -262,6 +266,7 @@ def select_tasks(selection: str) -> tuple[int, ...]:
             selected.extend(range(get_task(first).index, get_task(last).index + 1))
     if not selected:
         raise ValueError(
-            f"The task selection {selection!r} is empty. Name a task set ({', '.join(TASK_SETS)}) or indices such as '4,50-73'."
+            f"The task selection {selection!r} is empty. Name a task set ({', '.join(TASK_SETS)}) or indices "
+            "such as '4,50-73'."
         )
     return tuple(dict.fromkeys(selected))

@@ -1,7 +1,7 @@
 """Where things are: the table, the tray, its four quadrants, the containers and the camera.
 
 The origins of the numbers are the paper's appendix and the authors' published settings. A quadrant is a pair
-(i, j): i is 0 on the right of the picture and 1 on its left, j is 0 at the back, near the robot, and 1 in front.
+(i, j): i is 0 on the right of the picture and 1 on its left, j is 0 at the back, near the robot, 1 in front.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Quadrant(NamedTuple):
 
     @property
     def object_region(self) -> Region:
-        """Where the middle of an object may be: the quarter, inset by 38 mm where it faces the tray's middle."""
+        """Where the middle of an object may be: inset by 38 mm on the sides to the tray's middle."""
         low = np.array([0.44 + 0.15 * self.i, 0.14 + 0.12 * self.j])
         high = np.array([0.59 + 0.15 * self.i, 0.26 + 0.12 * self.j])
         inset = 0.038
