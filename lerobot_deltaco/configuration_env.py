@@ -11,7 +11,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-from gym_deltaco import EPISODE_STEPS
+from gym_deltaco import ENV_ID, EPISODE_STEPS
 from gym_deltaco.env import CONTROL_FPS, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.tasks import TASKS, select_tasks
@@ -69,7 +69,7 @@ class DeltacoEnv(EnvConfig):
     @property
     def gym_id(self) -> str:
         """The environment's id, version included."""
-        return f"{self.package_name}/PickPlace-v0"
+        return ENV_ID
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -5,8 +5,10 @@ Importing it registers `gym_deltaco/PickPlace-v0`; the simulator is loaded when 
 
 import gymnasium
 
+# The number is the benchmark's version: results of different versions are not comparable.
+ENV_ID = "gym_deltaco/PickPlace-v0"
 EPISODE_STEPS = 30
 
 gymnasium.register(
-    id="gym_deltaco/PickPlace-v0", entry_point="gym_deltaco.env:PickPlaceEnv", max_episode_steps=EPISODE_STEPS
+    id=ENV_ID, entry_point="gym_deltaco.env:PickPlaceEnv", max_episode_steps=EPISODE_STEPS
 )

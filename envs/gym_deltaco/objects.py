@@ -122,11 +122,18 @@ def _rgb(code: str) -> Color:
     return red, green, blue
 
 
-BLACK, CHARCOAL, ASH, IVORY, WHITE = _rgb("111"), _rgb("444"), _rgb("bbb"), _rgb("eee"), _rgb("fff")
+BLACK, CHARCOAL, PEWTER, ASH, IVORY, WHITE = (
+    _rgb("111"),
+    _rgb("333"),
+    _rgb("777"),
+    _rgb("bbb"),
+    _rgb("eee"),
+    _rgb("fff"),
+)
 IRON, IRON_DARK = _rgb("555"), _rgb("333")
 STEEL, STEEL_DARK = _rgb("777"), _rgb("555")
 SLATE, SLATE_DARK = _rgb("667"), _rgb("444")
-SILVER, SILVER_DARK = _rgb("aaa"), _rgb("888")
+SILVER, SILVER_DARK = _rgb("bbb"), _rgb("888")
 ZINC, ZINC_DARK = _rgb("999"), _rgb("777")
 FROST, FROST_LIGHT = _rgb("899"), _rgb("abb")
 SKY, SKY_DARK = _rgb("59f"), _rgb("37c")
@@ -136,22 +143,23 @@ AZURE, COBALT, PICKLE = _rgb("28f"), _rgb("05b"), _rgb("893")
 RED, CRIMSON = _rgb("e11"), _rgb("b11")
 SCARLET, MAROON = _rgb("d21"), _rgb("711")
 ORANGE, TANGERINE, RUST = _rgb("f80"), _rgb("f92"), _rgb("d60")
-YELLOW, GOLD, MUSTARD = _rgb("fd1"), _rgb("ec0"), _rgb("870")
-SAND, SAND_DARK = _rgb("b95"), _rgb("863")
+YELLOW, GOLD, MUSTARD = _rgb("fd1"), _rgb("db0"), _rgb("870")
+SAND, SAND_DARK = _rgb("db7"), _rgb("a74")
 PINE, PINE_LIGHT, PINE_DARK = _rgb("b84"), _rgb("c95"), _rgb("753")
 BRICK, BRICK_LIGHT, BRICK_DARK = _rgb("954"), _rgb("a65"), _rgb("532")
-OCHRE, OCHRE_DARK = _rgb("962"), _rgb("751")
+OCHRE, OCHRE_LIGHT, OCHRE_DARK = _rgb("a61"), _rgb("c83"), _rgb("530")
 HIVE, HIVE_DARK = _rgb("864"), _rgb("642")
 UMBER, UMBER_DARK = _rgb("952"), _rgb("531")
-OLIVE, OLIVE_DARK = _rgb("763"), _rgb("541")
+OLIVE, OLIVE_DARK = _rgb("861"), _rgb("430")
 FAWN, FAWN_LIGHT, FAWN_DARK = _rgb("a75"), _rgb("b86"), _rgb("743")
-BARK, BARK_LIGHT, BARK_DARK = _rgb("643"), _rgb("975"), _rgb("432")
-CREAM, CREAM_DARK = _rgb("ca6"), _rgb("974")
+BARK, BARK_LIGHT, BARK_DARK = _rgb("532"), _rgb("864"), _rgb("321")
+CREAM, CREAM_DARK = _rgb("ec8"), _rgb("a74")
 MAHOGANY, MAHOGANY_LIGHT = _rgb("532"), _rgb("743")
 
 _CIRCLE = polygon(12)
 _OCTAGON = polygon(8)
 _ROUNDED = rounded_square(0.5)
+_TRIANGLE = polygon(3)
 _SQUARE = np.array([(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)])
 _HALVED_SQUARE = np.array([(1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1)], float)
 
@@ -185,6 +193,12 @@ def _bark(shift: int) -> tuple[Color, ...]:
     return _mottled(shift, BARK, BARK_DARK, BARK, BARK_LIGHT, BARK)
 
 
+def _strut(turn: float, radii: tuple[float, float], heights: tuple[float, float], paint: Color) -> Loft:
+    """A thin bar of an openwork stand, from one distance from the axis to another; `turn` in degrees."""
+    rows = [(3, (radius, 0, height), paint) for radius, height in zip(radii, heights, strict=True)]
+    return Loft(_TRIANGLE, rows, turn=turn)
+
+
 def _thwart(y: float, half_width: float, z: float, paint: Color) -> Loft:
     """A canoe's seat."""
     return _block((-half_width, y - 3, z - 3), (half_width, y + 3, z), paint)
@@ -200,16 +214,17 @@ _SOFA = (
 
 _RECIPES: Mapping[str, _Recipe] = MappingProxyType({
     "conic cup": _Recipe(
-        [_round((16, 0, WHITE), (17, 38), (18, 48, ASH), (19.5, 57, CHARCOAL),
-                (22.5, 57, BLACK), (22.5, 67), (19, 71))],
+        [_round((16, 0, WHITE), (17, 38), (17.5, 43, ASH), (18.5, 49, PEWTER), (19.5, 58, CHARCOAL),
+                (21.5, 58, BLACK), (21.5, 67), (19, 71))],
         parts=[_round_part((19, 0), (19, 57)), _round_part((22.5, 57), (22.5, 68), (20, 71))],
         grasp=60,
     ),
     "fountain vase": _Recipe(
-        [Loft(_OCTAGON, [(15, 0, SAND_DARK), (23, 9, SAND), (23, 16), (15, 17), (13, 23), (8, 25, SAND_DARK),
-                         (7, 42, SAND), (16, 46), (16, 56), (12, 56), (7, 50, SAND_DARK)])],
-        parts=[_round_part((18, 0), (23, 8), (23, 16)), _round_part((15, 16), (9, 26)),
-               _round_part((9, 26), (9, 45)), _round_part((16, 45), (16, 56))],
+        [Loft(_OCTAGON, [(16, 0, SAND_DARK), (23, 6, SAND), (23, 12), (18, 13, SAND_DARK), (18, 20, SAND),
+                         (12, 23), (10, 34, SAND_DARK), (11, 43), (15, 47, SAND), (15, 56), (11, 56),
+                         (8, 46, SAND_DARK)])],
+        parts=[_round_part((18, 0), (23, 6), (23, 13)), _round_part((18, 13), (18, 20), (12, 25)),
+               _round_part((11, 25), (11, 45)), _round_part((16, 45), (16, 56))],
         grasp=49,
     ),
     "circular table": _Recipe(
@@ -242,7 +257,7 @@ _RECIPES: Mapping[str, _Recipe] = MappingProxyType({
         yaw=0.3,
     ),
     "narrow tray": _Recipe(
-        [Loft(_SQUARE, [((13.5, 34), 0, OCHRE), ((17.5, 42.5), 22), ((15, 39.5), 22),
+        [Loft(_SQUARE, [((13.5, 34), 0, OCHRE), ((17.5, 42.5), 22), ((14.5, 39), 22, OCHRE_LIGHT),
                         ((11, 33), 7, OCHRE_DARK)])],
         parts=[Loft(_SQUARE, [((16, 36), 0), ((17.5, 40), 9), ((17.5, 42.5), 22)])],
         grasp=13,
@@ -265,9 +280,9 @@ _RECIPES: Mapping[str, _Recipe] = MappingProxyType({
         grasp=65,
     ),
     "bongo drum bowl": _Recipe(
-        [_round((18, 0, SCARLET), (16, 8, (SCARLET, MAROON)), (14, 16, (MAROON, SCARLET)),
-                (12, 24, (SCARLET, MAROON)), (19, 35, SCARLET), (23, 45), (23, 58), (20, 58),
-                (10, 40, MAROON))],
+        [Loft(polygon(10), [(11, 23, SCARLET), (19, 35), (23, 45), (23, 58), (20, 58), (10, 38, MAROON)]),
+         Loft(_OCTAGON, [(18.5, 0, SCARLET), (17.5, 4), (14, 3)], closed=True),
+         *(_strut(turn, radii=(16.5, 10.5), heights=(2, 25), paint=SCARLET) for turn in range(18, 360, 60))],
         parts=[_round_part((18, 0), (12, 26)), _round_part((12, 26), (23, 45), (23, 58))],
         grasp=50,
     ),
@@ -369,11 +384,11 @@ _RECIPES: Mapping[str, _Recipe] = MappingProxyType({
         yaw=0.25,
     ),
     "vintage canoe": _Recipe(
-        [Loft(pointed_oval(16, lift=6), [((11, 33), 0, BARK_DARK), ((16, 40), 9, _bark(0)),
-                                         ((17, 42.5), 18, _bark(2)), ((14, 39), 18, BARK_LIGHT),
-                                         ((10, 33), 8, _bark(1))]),
-         _thwart(0, 13, 16, BARK_LIGHT)],
-        parts=[Loft(pointed_oval(8, lift=6), [((14, 33), 0), ((17, 40), 8), ((17, 42.5), 18)])],
+        [Loft(pointed_oval(16, lift=6), [((14, 33), 0, BARK_DARK), ((20, 40), 9, _bark(0)),
+                                         ((21, 42.5), 18, _bark(2)), ((17.5, 39), 18, BARK_LIGHT),
+                                         ((13, 33), 8, BARK_DARK)]),
+         _thwart(-10, 17, 16, BARK_LIGHT), _thwart(10, 17, 16, BARK_LIGHT)],
+        parts=[Loft(pointed_oval(8, lift=6), [((17.5, 33), 0), ((21, 40), 8), ((21, 42.5), 18)])],
         grasp=12,
         yaw=0.3,
     ),
@@ -408,9 +423,9 @@ _RECIPES: Mapping[str, _Recipe] = MappingProxyType({
     ),
     "box sofa": _Recipe(_SOFA, parts=_SOFA, grasp=18, yaw=0.2),
     "two layered lampshade": _Recipe(
-        [Loft(_CIRCLE, [(15.5, 0, GOLD), (15, 25), (22, 27, MUSTARD), (23, 36, YELLOW), (15.5, 60),
-                        (12.5, 60), (9, 0, MUSTARD)], closed=True)],
-        parts=[_round_part((18.5, 0), (16, 27)), _round_part((23, 27), (23, 38), (15.5, 60))],
+        [Loft(_CIRCLE, [(15.5, 0, GOLD), (15, 25), (22, 27, MUSTARD), (23, 31, YELLOW), (13.5, 60),
+                        (10.5, 60), (9, 0, MUSTARD)], closed=True)],
+        parts=[_round_part((18.5, 0), (16, 27)), _round_part((23, 27), (23, 37), (15, 60))],
         grasp=31,
     ),
     "conic bin": _Recipe(

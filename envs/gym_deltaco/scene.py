@@ -80,7 +80,7 @@ class Scene:
         self._poses = [self._simulation.pose(body) for body in self.bodies]
 
     def command(self, position: NDArray[np.float64], is_open: bool) -> None:
-        """Runs one control step: the end effector goes to a position, (3,), m, the gripper opens or closes."""
+        """Runs one control step: moves to a position, (3,), m, and opens or closes the gripper."""
         self.arm.command(position, is_open)
         self._read()
 

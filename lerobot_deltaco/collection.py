@@ -1,0 +1,495 @@
+"""Collects a dataset in several processes, so that it can be interrupted at any moment and continued.
+
+Each finished episode is stored at once, in a file of its own in the folder `.collecting`. When all episodes
+of a data file are there, a worker joins them. The dataset's own files change only at the end: first all that
+shall be done is written down, then it is done, each step of which may be repeated. So whatever happens, the
+next run with the same arguments goes on, and the result is a function of the arguments alone.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from tqdm import tqdm
+
+from gym_deltaco import ENV_ID
+from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.tasks import TASKS
+from lerobot_deltaco import dataset_files as files
+from lerobot_deltaco.collection_plan import (
+    EPISODE_LENGTH,
+    EPISODES_PER_FILE,
+    FPS,
+    ROBOT_TYPE,
+    CollectionPlan,
+    collect_episode,
+    first_numbers,
+    renderer,
+)
+from lerobot_deltaco.dataset_statistics import Statistics, merged_statistics
+
+STAGING = ".collecting"
+JOINED = "joined"
+HISTORY_FILE = Path("meta/deltaco.json")
+# LeRobot reads this as a version number, and names it in the error: that is what a user then reads.
+UNFINISHED = "this dataset is unfinished; run its `deltaco-collect` command again to go on"
+# What an episode's own file knows of it, in its table's metadata.
+_KNOWN = b"deltaco"
+# So that none waits for the main process to hear of its last one.
+_JOBS_PER_WORKER = 3
+
+
+class CollectionError(RuntimeError):
+    """The collection cannot begin or go on; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a collection came to.
+
+    Attributes:
+        episodes: Number of episodes in the dataset.
+        new_episodes: Of those, collected by this plan.
+        attempts: Episodes that were run for them.
+        success_rates: Of the expert, over those attempts, for each kind of task.
+        episodes_per_s: Of this run, which may have collected only a part; None if there was nothing to do.
+        bytes_per_episode: Size of the dataset on disk, for each episode.
+    """
+
+    episodes: int
+    new_episodes: int
+    attempts: int
+    success_rates: dict[str, float]
+    episodes_per_s: float | None
+    bytes_per_episode: float
+
+
+@dataclass(frozen=True)
+class _Base:
+    """The dataset that a collection adds to."""
+
+    tasks: list[str]
+    n_episodes: int
+    n_frames: int
+    n_files: int
+    features: dict[str, Any]
+    history: list[dict[str, Any]]
+
+    @property
+    def plans(self) -> list[CollectionPlan]:
+        return [CollectionPlan(**entry["plan"]) for entry in self.history]
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Everything that a worker needs to know of a collection."""
+
+    root: Path
+    plan: CollectionPlan
+    tasks: list[str]  # of the whole dataset
+    task_indices: dict[int, int]  # of a task in the dataset's table of tasks
+    first_numbers: dict[int, int]  # of a task's episodes
+    base_episodes: int
+    base_frames: int
+    base_files: int
+
+    @property
+    def staging(self) -> Path:
+        return self.root / STAGING
+
+    @property
+    def joined(self) -> Path:
+        """Where complete files wait; it looks like the dataset's folder."""
+        return self.staging / JOINED
+
+    def episode_file(self, index: int) -> Path:
+        """Where an episode of this collection waits until its data file is complete."""
+        return self.staging / "episodes" / f"{index:07d}.arrow"
+
+    def part_file(self, part: int) -> Path:
+        """What is known of a complete data file; it is written after the file itself."""
+        return self.staging / "parts" / f"{part:05d}.json"
+
+    def part(self, part: int) -> range:
+        """The episodes of a data file."""
+        first = part * EPISODES_PER_FILE
+        return range(first, min(first + EPISODES_PER_FILE, self.plan.n_episodes))
+
+    @property
+    def n_parts(self) -> int:
+        return -(-self.plan.n_episodes // EPISODES_PER_FILE)
+
+    def task_and_number(self, index: int) -> tuple[int, int]:
+        """Task of an episode, and its number among those of the task."""
+        position, number = divmod(index, self.plan.episodes_per_task)
+        task_id = self.plan.task_ids[position]
+        return task_id, self.first_numbers[task_id] + number
+
+
+def collect(root: Path, plan: CollectionPlan, n_workers: int = 1, append: bool = False) -> Summary:
+    """Collects a dataset, or goes on with one.
+
+    Args:
+        root: The dataset's folder: new, empty, or that of an interrupted collection with the same plan.
+        plan: What to collect.
+        n_workers: Number of processes; the dataset does not depend on it.
+        append: Whether to add to a finished dataset.
+
+    Returns:
+        What it came to. If the dataset is finished, and of this plan alone, there is nothing to do.
+
+    Raises:
+        CollectionError: The folder is in use, or has something else in it; the expert cannot do a task; a
+            process ended, or a file is damaged.
+        OSError: The folder cannot be written to, or is full. What is finished is kept.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    base = _read_base(root)
+    staging = root / STAGING
+    if base is not None and not append and not staging.exists() and base.plans == [plan]:
+        return _summary(root, episodes_per_s=None)
+    _check_may_begin(root, base, plan, append)
+    with _locked(staging):
+        files.write_json(staging / "plan.json", _identity(plan, append))
+        seconds = n_collected = 0.0
+        if not (staging / "commit.json").exists():
+            if base is None:
+                _mark_unfinished(root, plan)
+            job = _make_job(root, plan, base)
+            start = time.perf_counter()
+            n_collected = _run(job, n_workers)
+            seconds = time.perf_counter() - start
+            _prepare_commit(job, base)
+        _commit(root)
+    return _summary(root, n_collected / seconds if n_collected else None)
+
+
+# Before
+
+
+def _read_base(root: Path) -> _Base | None:
+    """The finished dataset in a folder, if there is one."""
+    info_file, history_file = root / files.INFO_FILE, root / HISTORY_FILE
+    if not info_file.exists():
+        return None
+    info = json.loads(info_file.read_text())
+    if info["codebase_version"] == UNFINISHED:
+        return None
+    if info["codebase_version"] != files.CODEBASE_VERSION or not history_file.exists():
+        raise CollectionError(
+            f"{root} holds a dataset that `deltaco-collect` did not make. Name a new folder."
+        )
+    return _Base(
+        tasks=files.read_tasks(root / files.TASKS_FILE),
+        n_episodes=info["total_episodes"],
+        n_frames=info["total_frames"],
+        n_files=len(list((root / "data").glob("*/*.parquet"))),
+        features=info["features"],
+        history=json.loads(history_file.read_text()),
+    )
+
+
+def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, append: bool) -> None:
+    """Refuses to mix the plan with what the folder has in it.
+
+    Raises:
+        CollectionError: Something else is there.
+    """
+    plan_file = root / STAGING / "plan.json"
+    if plan_file.exists():
+        begun, wanted = json.loads(plan_file.read_text()), _identity(plan, append)
+        differences = [
+            f"{name}: {begun.get(name)} there, {wanted[name]} now"
+            for name in wanted
+            if begun.get(name) != wanted[name]
+        ]
+        if differences:
+            raise CollectionError(
+                f"{root} holds an unfinished collection of other arguments ({'; '.join(differences)}). Go "
+                "on with its own arguments, or name a new folder."
+            )
+        return
+    if base is None:
+        if append:
+            raise CollectionError(f"{root} holds no finished dataset to add to. Run without --append first.")
+        others = sorted(path.name for path in root.iterdir() if path.name != STAGING)
+        if others:
+            raise CollectionError(f"{root} is not empty ({', '.join(others[:3])}). Name a new folder.")
+    elif not append:
+        raise CollectionError(
+            f"{root} holds a finished dataset of other arguments. Add to it with --append, or name a new "
+            "folder."
+        )
+    elif json.loads(json.dumps(plan.features)) != base.features:
+        raise CollectionError(
+            f"{root} holds a dataset whose pictures differ in size, ambiguity, renderer or version of the "
+            "benchmark. Name a new folder."
+        )
+
+
+def _identity(plan: CollectionPlan, append: bool) -> dict[str, Any]:
+    """What has to be the same for a collection to be continued."""
+    return {**asdict(plan), "append": append, "benchmark": ENV_ID, "renderer": renderer()}
+
+
+def _mark_unfinished(root: Path, plan: CollectionPlan) -> None:
+    info = files.dataset_info(plan.features, FPS, ROBOT_TYPE, 0, 0, 0)
+    files.write_json(root / files.INFO_FILE, {**info, "codebase_version": UNFINISHED})
+
+
+@contextmanager
+def _locked(staging: Path) -> Iterator[None]:
+    """Keeps a second collection out; the lock ends with the process, however it ends."""
+    staging.mkdir(exist_ok=True)
+    with (staging / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CollectionError(
+                f"Another process is collecting into {staging.parent}. Wait for it, or end it."
+            ) from None
+        yield
+
+
+def _make_job(root: Path, plan: CollectionPlan, base: _Base | None) -> _Job:
+    base = base or _Base([], 0, 0, 0, {}, [])
+    instructions = dict.fromkeys([*base.tasks, *(TASKS[task_id].instruction for task_id in plan.task_ids)])
+    order = {instruction: index for index, instruction in enumerate(instructions)}
+    taken = first_numbers(plan, base.plans)
+    return _Job(
+        root=root,
+        plan=plan,
+        tasks=list(instructions),
+        task_indices={task_id: order[TASKS[task_id].instruction] for task_id in plan.task_ids},
+        first_numbers={task_id: taken[task_id] for task_id in plan.task_ids},
+        base_episodes=base.n_episodes,
+        base_frames=base.n_frames,
+        base_files=base.n_files,
+    )
+
+
+# Meanwhile
+
+
+def _run(job: _Job, n_workers: int) -> int:
+    """Collects what is missing. Returns the number of episodes collected."""
+    parts = [part for part in range(job.n_parts) if not job.part_file(part).exists()]
+    missing = {part: {i for i in job.part(part) if not job.episode_file(i).exists()} for part in parts}
+    n_missing = sum(map(len, missing.values()))
+    progress = tqdm(
+        total=job.plan.n_episodes, initial=job.plan.n_episodes - n_missing, desc="Collecting", unit="episode"
+    )
+    with progress, _executor(job, n_workers) as executor:
+        waiting = ((part, index) for part in parts for index in sorted(missing[part]))
+        running: dict[Future, tuple[int, int | None]] = {
+            executor.submit(_join, part): (part, None) for part in parts if not missing[part]
+        }
+        try:
+            while True:
+                for part, index in islice(waiting, _JOBS_PER_WORKER * n_workers - len(running)):
+                    running[executor.submit(_collect, index)] = (part, index)
+                if not running:
+                    return n_missing
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    part, index = running.pop(future)
+                    future.result()
+                    if index is None:
+                        continue
+                    progress.update()
+                    missing[part].remove(index)
+                    if not missing[part]:
+                        running[executor.submit(_join, part)] = (part, None)
+        except BrokenProcessPool:
+            raise CollectionError(
+                "A worker process ended unexpectedly; the memory may be full. What is finished is kept: run "
+                "the command again, perhaps with fewer workers."
+            ) from None
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _executor(job: _Job, n_workers: int) -> Executor:
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(n_workers, mp_context=context, initializer=_start_worker, initargs=(job,))
+
+
+@dataclass
+class _Worker:
+    """What a worker process keeps from one episode to the next."""
+
+    job: _Job
+    env: PickPlaceEnv
+    schema: pa.Schema
+
+
+_worker: _Worker | None = None
+
+
+def _start_worker(job: _Job) -> None:
+    global _worker
+    # An interrupt is for the main process, which lets the episodes end that are under way.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    env = PickPlaceEnv(ambiguity=job.plan.ambiguity, image_size=job.plan.image_size)
+    _worker = _Worker(job, env, files.data_schema(job.plan.features))
+
+
+def _collect(index: int) -> None:
+    """Collects an episode and stores it."""
+    assert _worker is not None
+    job = _worker.job
+    task_id, number = job.task_and_number(index)
+    episode = collect_episode(_worker.env, job.plan, task_id, number)
+    columns = files.episode_columns(
+        episode.frames,
+        FPS,
+        episode_index=job.base_episodes + index,
+        first_index=job.base_frames + index * EPISODE_LENGTH,
+        task_index=job.task_indices[task_id],
+    )
+    statistics = files.statistics_to_json(files.episode_statistics(columns))
+    known = {"attempts": episode.attempts, "statistics": statistics}
+    table = files.episode_table(columns, _worker.schema)
+    table = table.replace_schema_metadata({**table.schema.metadata, _KNOWN: json.dumps(known)})
+    with (
+        files.new_file(job.episode_file(index)) as temporary,
+        pa.ipc.new_file(temporary, table.schema) as writer,
+    ):
+        writer.write_table(table)
+
+
+def _join(part: int) -> None:
+    """Joins the episodes of a data file, and removes their own files."""
+    assert _worker is not None
+    job, schema = _worker.job, _worker.schema
+    episodes = job.part(part)
+    known: list[dict[str, Any]] = []
+
+    def tables() -> Iterator[pa.Table]:
+        for index in episodes:
+            table = _read_episode(job.episode_file(index))
+            known.append(json.loads(table.schema.metadata[_KNOWN]))
+            yield table.replace_schema_metadata(schema.metadata)
+
+    number = job.base_files + part
+    files.write_data_file(job.joined / files.numbered(files.DATA_FILE, number), tables(), schema)
+    statistics = [files.statistics_from_json(item["statistics"]) for item in known]
+    task_ids = [job.task_and_number(index)[0] for index in episodes]
+    files.write_episodes_file(
+        job.joined / files.numbered(files.EPISODES_FILE, number),
+        file_number=number,
+        first_episode=job.base_episodes + episodes.start,
+        first_index=job.base_frames + episodes.start * EPISODE_LENGTH,
+        tasks=[TASKS[task_id].instruction for task_id in task_ids],
+        lengths=[EPISODE_LENGTH] * len(episodes),
+        statistics=statistics,
+    )
+    attempts: Counter[int] = Counter()
+    for task_id, item in zip(task_ids, known, strict=True):
+        attempts[task_id] += item["attempts"]
+    files.write_json(
+        job.part_file(part),
+        {"attempts": attempts, "statistics": files.statistics_to_json(_merged(statistics))},
+    )
+    for index in episodes:
+        job.episode_file(index).unlink()
+
+
+def _read_episode(path: Path) -> pa.Table:
+    try:
+        with pa.ipc.open_file(path) as reader:
+            return reader.read_all()
+    except (pa.ArrowInvalid, OSError) as error:
+        raise CollectionError(
+            f"The file {path} is damaged ({error}). Delete it and run the command again: its episode is then "
+            "collected anew."
+        ) from None
+
+
+def _merged(parts: Sequence[dict[str, Statistics]]) -> dict[str, Statistics]:
+    return {feature: merged_statistics([part[feature] for part in parts]) for feature in parts[0]}
+
+
+# After
+
+
+def _prepare_commit(job: _Job, base: _Base | None) -> None:
+    """Writes down the dataset's metadata as they shall be."""
+    known = [json.loads(job.part_file(part).read_text()) for part in range(job.n_parts)]
+    statistics = [files.statistics_from_json(item["statistics"]) for item in known]
+    if base is not None:
+        before = json.loads((job.root / files.STATS_FILE).read_text())
+        statistics.insert(0, files.statistics_from_json(before))
+    attempts: Counter[str] = Counter()
+    for item in known:
+        attempts.update(item["attempts"])
+    entry = {
+        "plan": asdict(job.plan),
+        "benchmark": ENV_ID,
+        "renderer": renderer(),
+        "versions": {name: version(name) for name in ("lerobot_policy_deltaco", "pybullet", "numpy")},
+        "attempts": attempts,
+    }
+    n_episodes = job.base_episodes + job.plan.n_episodes
+    n_frames = job.base_frames + job.plan.n_episodes * EPISODE_LENGTH
+    contents = {
+        "info": files.dataset_info(job.plan.features, FPS, ROBOT_TYPE, n_episodes, n_frames, len(job.tasks)),
+        "stats": files.statistics_to_json(_merged(statistics)),
+        "tasks": job.tasks,
+        "history": [*(base.history if base else []), entry],
+    }
+    files.write_json(job.staging / "commit.json", contents)
+
+
+def _commit(root: Path) -> None:
+    """Makes the dataset what was written down. Interrupted, it is simply done again."""
+    staging = root / STAGING
+    contents = json.loads((staging / "commit.json").read_text())
+    info = contents["info"]
+    files.write_json(root / files.INFO_FILE, {**info, "codebase_version": UNFINISHED})
+    for path in sorted((staging / JOINED).rglob("*.parquet")):
+        target = root / path.relative_to(staging / JOINED)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(path, target)
+    files.write_tasks(root / files.TASKS_FILE, contents["tasks"])
+    files.write_json(root / files.STATS_FILE, contents["stats"])
+    files.write_json(root / HISTORY_FILE, contents["history"])
+    files.write_json(root / files.INFO_FILE, info)
+    shutil.rmtree(staging)
+
+
+def _summary(root: Path, episodes_per_s: float | None) -> Summary:
+    info = json.loads((root / files.INFO_FILE).read_text())
+    last = json.loads((root / HISTORY_FILE).read_text())[-1]
+    per_task = last["plan"]["episodes_per_task"]
+    attempts: Counter[str] = Counter()
+    successes: Counter[str] = Counter()
+    for task_id, n_attempts in last["attempts"].items():
+        kind = TASKS[int(task_id)].kind
+        attempts[kind] += n_attempts
+        successes[kind] += per_task
+    size = sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
+    return Summary(
+        episodes=info["total_episodes"],
+        new_episodes=successes.total(),
+        attempts=attempts.total(),
+        success_rates={kind: successes[kind] / attempts[kind] for kind in attempts},
+        episodes_per_s=episodes_per_s,
+        bytes_per_episode=size / info["total_episodes"],
+    )

@@ -1,0 +1,190 @@
+"""What a collection consists of: which episodes, in which order, and what they record."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gym_deltaco import ENV_ID, EPISODE_STEPS
+from gym_deltaco.env import CONTROL_FPS, MIN_IMAGE_SIZE, PickPlaceEnv
+from gym_deltaco.expert import NOISE, expert_episode
+from gym_deltaco.layout import AMBIGUITIES, Ambiguity
+from gym_deltaco.seeding import Split, episode_seed
+from gym_deltaco.tasks import SCENARIOS, TASKS, select_tasks
+from lerobot_deltaco.dataset_files import DEFAULT_FEATURES
+
+FPS = CONTROL_FPS
+ROBOT_TYPE = "widowx_250"
+EPISODE_LENGTH = EPISODE_STEPS
+EPISODES_PER_FILE = 1000
+MAX_ATTEMPTS = 100
+COLLECTED_SPLITS: tuple[Split, ...] = ("train", "validation")
+
+_NOVEL_OBJECTS = tuple(task for task in SCENARIOS["a"].test_tasks if TASKS[task].kind == "name")
+# The authors' names of their data sets: which tasks, and what the episodes are for.
+DATA_SETS: dict[str, tuple[tuple[int, ...], Split]] = {
+    "T198": (SCENARIOS["a"].train_tasks, "train"),
+    "T48": (_NOVEL_OBJECTS, "train"),
+    "T54": (SCENARIOS["b"].test_tasks, "train"),
+    "E48": (_NOVEL_OBJECTS, "validation"),
+    "E54": (SCENARIOS["b"].test_tasks, "validation"),
+    "E102": (SCENARIOS["a"].test_tasks, "validation"),
+}
+
+
+@dataclass(frozen=True)
+class CollectionPlan:
+    """Arguments of a collection; equal plans give equal datasets.
+
+    Args:
+        tasks: A task set, a data set of the authors (T198, T48, T54, E48, E54, E102), or indices and ranges.
+        episodes_per_task: Number of successful episodes of each task, at least 1.
+        seed: Of the whole collection, at least 0.
+        split: What the episodes are for: "train" or "validation", whose scenes never coincide. None is that
+            of the data set, or "validation" for a test set and "train" for all else.
+        ambiguity: "container" or "object", the paper's schemes i and ii.
+        noise: Standard deviation of the noise on the expert's motions, at least 0.
+        image_size: Height and width of the pictures, px.
+
+    Raises:
+        ValueError: An argument is not valid; the message says what is.
+    """
+
+    tasks: str
+    episodes_per_task: int
+    seed: int = 0
+    split: Split | None = None
+    ambiguity: Ambiguity = "container"
+    noise: float = NOISE
+    image_size: int = 48
+
+    def __post_init__(self) -> None:
+        task_ids = self.task_ids
+        for name, minimum in (
+            ("episodes_per_task", 1),
+            ("seed", 0),
+            ("noise", 0),
+            ("image_size", MIN_IMAGE_SIZE),
+        ):
+            if not getattr(self, name) >= minimum:
+                raise ValueError(f"`{name}` must be at least {minimum}. Got {getattr(self, name)}.")
+        if self.ambiguity not in AMBIGUITIES:
+            raise ValueError(f"`ambiguity` must be one of {', '.join(AMBIGUITIES)}. Got {self.ambiguity!r}.")
+        if self.split is None:
+            is_test = set(task_ids) <= set(SCENARIOS["a"].test_tasks) and self.tasks.endswith("_test")
+            default = (
+                DATA_SETS[self.tasks][1] if self.tasks in DATA_SETS else "validation" if is_test else "train"
+            )
+            object.__setattr__(self, "split", default)
+        if self.split not in COLLECTED_SPLITS:
+            raise ValueError(f"`split` must be one of {', '.join(COLLECTED_SPLITS)}. Got {self.split!r}.")
+
+    @property
+    def task_ids(self) -> tuple[int, ...]:
+        """Indices of the tasks, in the order of the dataset."""
+        if self.tasks in DATA_SETS:
+            return DATA_SETS[self.tasks][0]
+        try:
+            return select_tasks(self.tasks)
+        except ValueError as error:
+            raise ValueError(f"{error} Also valid are the data sets {', '.join(DATA_SETS)}.") from None
+
+    @property
+    def n_episodes(self) -> int:
+        """Number of episodes of all tasks."""
+        return len(self.task_ids) * self.episodes_per_task
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """What a frame of the dataset has, as in LeRobot's info.json."""
+        number = {"dtype": "int64", "shape": [1], "names": None}
+        return {
+            "observation.image": {
+                "dtype": "image",
+                "shape": [self.image_size, self.image_size, 3],
+                "names": ["height", "width", "channels"],
+                # Policies do not transfer from one renderer's pictures to another's.
+                "info": {"renderer": renderer(), "benchmark": ENV_ID, "ambiguity": self.ambiguity},
+            },
+            "observation.state": {"dtype": "float32", "shape": [10], "names": STATE_NAMES},
+            "action": {"dtype": "float32", "shape": [4], "names": ACTION_NAMES},
+            "next.reward": {"dtype": "float32", "shape": [1], "names": None},
+            "next.done": {"dtype": "bool", "shape": [1], "names": None},
+            "next.success": {"dtype": "bool", "shape": [1], "names": None},
+            **dict.fromkeys(PRIVILEGED, number),
+            **DEFAULT_FEATURES,
+        }
+
+
+STATE_NAMES = [
+    *("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate"),
+    *("end_effector_x", "end_effector_y", "end_effector_z", "gripper_open"),
+]
+ACTION_NAMES = ["delta_x", "delta_y", "delta_z", "gripper"]
+# Outside `observation.`, so that no policy takes them for an input.
+PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_container", "benchmark.seed")
+
+
+def renderer() -> str:
+    """What made the pictures."""
+    return f"PyBullet {version('pybullet')}, TinyRenderer"
+
+
+class CollectedEpisode(NamedTuple):
+    """A successful episode."""
+
+    frames: dict[str, NDArray]  # of each recorded feature, (30, ...)
+    attempts: int  # how many episodes were run to have it, at least 1
+
+
+def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, number: int) -> CollectedEpisode:
+    """Runs the expert until it succeeds.
+
+    Args:
+        env: Where to run it.
+        plan: The collection.
+        task_id: Of the episode.
+        number: Of the episode among those of its task, from 0.
+
+    Raises:
+        RuntimeError: It never succeeded.
+    """
+    for attempt in range(MAX_ATTEMPTS):
+        seed = episode_seed(plan.seed, plan.split, task_id, number, attempt)
+        steps = list(expert_episode(env, task_id, seed, plan.noise))
+        if not steps[-1].info["is_success"]:
+            continue
+        n_steps = len(steps)
+        info = steps[-1].info
+        privileged = (task_id, info["objects"][info["target_object"]], info["target_container"], seed)
+        frames = {
+            "observation.image": np.stack([step.observation["pixels"] for step in steps]),
+            "observation.state": np.stack([step.observation["agent_pos"] for step in steps]),
+            "action": np.stack([step.action for step in steps]),
+            "next.reward": np.array([step.reward for step in steps], dtype=np.float32),
+            "next.done": np.arange(n_steps) == n_steps - 1,
+            "next.success": np.array([step.info["is_success"] for step in steps]),
+            **{
+                name: np.full(n_steps, value, dtype=np.int64)
+                for name, value in zip(PRIVILEGED, privileged, strict=True)
+            },
+        }
+        return CollectedEpisode(frames, attempts=attempt + 1)
+    raise RuntimeError(
+        f"The expert failed {MAX_ATTEMPTS} times in a row at task {task_id}, episode {number}. "
+        f"A noise of {plan.noise} may be too much for it."
+    )
+
+
+def first_numbers(plan: CollectionPlan, earlier: list[CollectionPlan]) -> Counter[int]:
+    """For each task, how many of its episodes are taken by earlier collections with the same seeds."""
+    taken: Counter[int] = Counter()
+    for other in earlier:
+        if (other.seed, other.split) == (plan.seed, plan.split):
+            taken.update(dict.fromkeys(other.task_ids, other.episodes_per_task))
+    return taken

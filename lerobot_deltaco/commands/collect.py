@@ -1,0 +1,97 @@
+"""`deltaco-collect`: the expert's episodes as a LeRobotDataset."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from gym_deltaco.layout import AMBIGUITIES
+from lerobot_deltaco.collection import CollectionError, Summary, collect
+from lerobot_deltaco.collection_plan import COLLECTED_SPLITS, DATA_SETS, CollectionPlan
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Collects, and shows what it came to."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.workers < 1:
+        parser.error(f"--workers must be at least 1. Got {options.workers}.")
+    try:
+        plan = CollectionPlan(
+            tasks=options.tasks,
+            episodes_per_task=options.episodes_per_task,
+            seed=options.seed,
+            split=options.split,
+            ambiguity=options.ambiguity,
+            noise=options.noise,
+            image_size=options.image_size,
+        )
+    except ValueError as error:
+        parser.error(str(error))
+    try:
+        summary = collect(options.root, plan, options.workers, options.append)
+    except (CollectionError, OSError) as error:
+        parser.exit(1, f"{parser.prog}: {error}\n")
+    except KeyboardInterrupt:
+        parser.exit(130, f"\n{parser.prog}: Interrupted. The same command goes on from here.\n")
+    sys.stdout.write(_text(summary, options.root))
+    if options.summary:
+        options.summary.write_text(json.dumps(asdict(summary), indent=2) + "\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="deltaco-collect",
+        description="Collects successful episodes of the scripted expert as a LeRobotDataset. "
+        "Interrupted, it goes on when the same command is given again.",
+    )
+    parser.add_argument(
+        "--tasks",
+        required=True,
+        help=f"a task set (scenario_a_train, ...), a data set of the paper ({', '.join(DATA_SETS)}), "
+        "or indices and ranges of 0 to 299, such as 4,50-73",
+    )
+    parser.add_argument("--episodes-per-task", type=int, required=True, metavar="N")
+    parser.add_argument("--root", type=Path, required=True, help="the dataset's folder")
+    parser.add_argument("--seed", type=int, default=0, help="of the whole dataset (%(default)s)")
+    parser.add_argument(
+        "--split",
+        choices=COLLECTED_SPLITS,
+        help="what the episodes are for; their scenes never coincide (that of the data set; else "
+        "validation for test sets, and train)",
+    )
+    parser.add_argument(
+        "--ambiguity",
+        choices=AMBIGUITIES,
+        default="container",
+        help="the paper's scheme i or ii (%(default)s)",
+    )
+    parser.add_argument("--noise", type=float, default=0.1, help="on the expert's motions (%(default)s)")
+    parser.add_argument("--image-size", type=int, default=48, metavar="PX", help="(%(default)s)")
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=os.cpu_count(),
+        help="processes; the dataset does not depend on it (%(default)s)",
+    )
+    parser.add_argument("--append", action="store_true", help="add to a finished dataset")
+    parser.add_argument("--summary", type=Path, metavar="FILE", help="also write the summary as JSON")
+    return parser
+
+
+def _text(summary: Summary, root: Path) -> str:
+    speed = "nothing to do" if summary.episodes_per_s is None else f"{summary.episodes_per_s:.1f} episodes/s"
+    rates = ", ".join(f"{kind} {rate:.1%}" for kind, rate in summary.success_rates.items())
+    return (
+        f"{root}: {summary.episodes} episodes, {summary.bytes_per_episode * summary.episodes / 1e6:.1f} MB "
+        f"({summary.bytes_per_episode / 1e3:.1f} kB each); {speed}.\n"
+        f"The expert succeeded in {summary.new_episodes} of {summary.attempts} attempts ({rates}).\n"
+    )
+
+
+if __name__ == "__main__":
+    main()
