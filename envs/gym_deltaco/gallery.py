@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.sheets import (
     ACCENT,
     GAP,
+    INK,
+    PAPER,
     across,
     caption,
     circled,
@@ -111,11 +114,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         default=DEFAULT_TASKS,
         metavar="SELECTION",
         help="tasks to show: indices and ranges of 0 to 299, such as 4,50-73, or a set, such as "
-        f"scenario_a_test. Of more than {MAX_SCENES}, so many are shown, evenly spread. Default: %(default)s",
+        f"scenario_a_test. Of more than {MAX_SCENES}, so many are drawn at random. Default: %(default)s",
     )
     options = parser.parse_args(arguments)
 
-    def fail(message: str) -> None:
+    def fail(message: str) -> NoReturn:
         parser.exit(2, f"{parser.prog}: error: {message}\n")
 
     if options.seed < 0:
@@ -124,6 +127,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         task_ids = select_tasks(options.tasks)
     except ValueError as error:
         fail(f"--tasks: {error}")
+    if options.out.exists() and not options.out.is_dir():
+        fail(f"--out must be a folder. {options.out} is a file.")
     try:
         draw_gallery(options.out, options.seed, task_ids)
     except OSError as error:
@@ -143,9 +148,11 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int]) -> None:
         OSError: The folder cannot be made or written to.
     """
     out.mkdir(parents=True, exist_ok=True)
-    write_whole(out / "index.md", lambda file: file.write_text("The pictures are being drawn.\n"))
-    shown = _spread(task_ids, MAX_SCENES)
-    n_pictures = len(OBJECTS) + len(shown) + min(N_EPISODES, len(shown)) + 2
+    with tempfile.TemporaryFile(dir=out):
+        pass  # so that a folder that cannot be written to is an error before anything is drawn
+    shown = _drawn(task_ids, MAX_SCENES, seed)
+    filmed = shown[:: max(1, len(shown) // N_EPISODES)][:N_EPISODES]
+    n_pictures = len(OBJECTS) + len(shown) + len(filmed) + 2
     progress = tqdm(total=n_pictures, desc="gallery", unit="picture")
     with progress, closing(Simulation()) as simulation:
         cells = []
@@ -156,7 +163,7 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int]) -> None:
             draw_objects(out, "shape", SHAPES, cells),
             draw_objects(out, "color", COLORS, cells),
             draw_scenes(out, seed, shown, progress.update),
-            *draw_episodes(out, seed, _spread(shown, N_EPISODES), progress.update),
+            *draw_episodes(out, seed, filmed, progress.update),
             draw_ambiguity(out, seed, progress.update),
         ]
     write_whole(out / "index.md", lambda file: file.write_text(page(figures)))
@@ -208,10 +215,9 @@ def object_cell(simulation: Simulation, model: ObjectModel) -> Image.Image:
     label = model.label
     width = close_up.width + crop.width + 4
     is_test = label.index in TEST_OBJECTS
-    color = {"color": ACCENT} if is_test else {}
-    text = caption(f"{label.index}  {label.name}", width, size=14, n_lines=1, **color)
+    text = caption(f"{label.index}  {label.name}", width, size=14, color=ACCENT if is_test else INK)
     cell = down([across([close_up, crop], gap=4, align="end"), text], gap=2)
-    return framed(cell, ACCENT, thickness=3) if is_test else framed(cell, thickness=3)
+    return framed(cell, ACCENT if is_test else PAPER, thickness=3)
 
 
 def object_views(simulation: Simulation, model: ObjectModel | None) -> tuple[Image.Image, Image.Image]:
@@ -261,9 +267,9 @@ def draw_scenes(out: Path, seed: int, task_ids: Sequence[int], tick: Callable[[]
         for task_id in task_ids:
             observation, _ = env.reset(seed=_seed(seed, task_id), options={"task_id": task_id})
             small = enlarged(observation["pixels"], _SCENE_ZOOM)
-            images = across([picture(env.render()), small], gap=4, align="end")
-            text = caption(f"{task_id}: {env.task_description}", images.width, n_lines=2)
-            cells.append(down([images, text], gap=4))
+            images = across([_view(env), small], gap=4, align="end")
+            instruction = caption(f"{task_id}: {env.task_description}", images.width, n_lines=2)
+            cells.append(down([images, instruction], gap=4))
             tick()
     save_png(framed(grid(cells, n_columns=3), thickness=GAP), out / "scenes.png")
     text = (
@@ -274,9 +280,11 @@ def draw_scenes(out: Path, seed: int, task_ids: Sequence[int], tick: Callable[[]
 
 
 def _environment(ambiguity: Ambiguity) -> PickPlaceEnv:
-    return PickPlaceEnv(
-        ambiguity=ambiguity, image_size=POLICY_SIZE, render_mode="rgb_array", render_size=PEOPLE_SIZE
-    )
+    return PickPlaceEnv(ambiguity=ambiguity, image_size=POLICY_SIZE)
+
+
+def _view(env: PickPlaceEnv) -> Image.Image:
+    return picture(env.scene.render(PEOPLE_SIZE))
 
 
 def _seed(seed: int, task_id: int, number: int = 0) -> int:
@@ -284,10 +292,11 @@ def _seed(seed: int, task_id: int, number: int = 0) -> int:
     return episode_seed(seed, "train", task_id, number)
 
 
-def _spread(items: Sequence[int], n_items: int) -> list[int]:
-    """At most so many of the items, evenly spread, the first one included."""
-    n_items = min(n_items, len(items))
-    return [items[number * len(items) // n_items] for number in range(n_items)]
+def _drawn(task_ids: Sequence[int], n_tasks: int, seed: int) -> list[int]:
+    """At most so many of the tasks, in their order."""
+    n_tasks = min(n_tasks, len(task_ids))
+    positions = np.random.default_rng(seed).choice(len(task_ids), n_tasks, replace=False)
+    return [task_ids[position] for position in sorted(positions)]
 
 
 # The expert
@@ -318,7 +327,8 @@ def draw_episodes(out: Path, seed: int, task_ids: Sequence[int], tick: Callable[
             "episode.png",
             "An episode of the expert",
             f'"{first.task.instruction}", every other step: {first.outcome}. The scripted expert knows '
-            "where everything is, and its actions are noisy on purpose, as in the paper.",
+            "where everything is. Its actions are noisy on purpose, as in the paper, and what goes wrong, it "
+            "does again.",
         ),
         Figure(
             "episode.gif",
@@ -332,10 +342,10 @@ def draw_episodes(out: Path, seed: int, task_ids: Sequence[int], tick: Callable[
 def record(env: PickPlaceEnv, task_id: int, seed: int) -> Episode:
     """Runs the expert until it has succeeded, and the gripper left, or the episode ends."""
     _, info = env.reset(seed=seed, options={"task_id": task_id})
-    frames, stages = [picture(env.render())], ["start"]
+    frames, stages = [_view(env)], ["start"]
     success_step = None
     for number, step in enumerate(expert_episode(env, task_id, seed), start=1):
-        frames.append(picture(env.render()))
+        frames.append(_view(env))
         stages.append(step.stage.value)
         info = step.info
         if info["is_success"] and success_step is None:
@@ -378,8 +388,8 @@ def draw_ambiguity(out: Path, seed: int, tick: Callable[[], object]) -> Figure:
         tick()
     save_png(framed(down(rows, gap=3 * GAP), thickness=GAP), out / "ambiguity.png")
     text = (
-        'Why a policy is given both a demonstration and an instruction. In scheme "container" (the paper\'s i), '
-        'the demonstration alone does not tell which bin is meant. In scheme "object" (ii), the instruction '
+        "Why a policy is given a demonstration and an instruction. In scheme 'container' (the paper's i), "
+        "the demonstration alone does not tell which bin is meant. In scheme 'object' (ii), the instruction "
         "alone does not tell which of two identical objects. The ring marks what is meant in the new scene."
     )
     return Figure("ambiguity.png", "The two schemes of ambiguity", text)
@@ -431,10 +441,11 @@ def _object_scheme(seed: int) -> Image.Image:
 def _demonstration(env: PickPlaceEnv, task: Task, seed: int) -> tuple[Image.Image, Image.Image, Layout]:
     """The first and the last picture of an episode in which the expert succeeds, and its scene."""
     for number in range(_TRIES):
-        episode = record(env, task.index, _seed(seed, task.index, number))
-        if episode.success_step is not None and _is_in_view(env.scene.layout):
-            break
-    return episode.frames[0], episode.frames[-1], env.scene.layout
+        if _is_in_view(_new_layout(env, task, seed, number)):
+            episode = record(env, task.index, _seed(seed, task.index, number))
+            if episode.success_step is not None:
+                return episode.frames[0], episode.frames[-1], env.scene.layout
+    raise RuntimeError(f"No demonstration of task {task.index} in {_TRIES} tries.")
 
 
 def _new_scene(
@@ -442,10 +453,15 @@ def _new_scene(
 ) -> tuple[Image.Image, Layout]:
     """A scene of the task that is as wanted, other than those tried for the demonstration."""
     for number in range(_TRIES, 2 * _TRIES):
-        env.reset(seed=_seed(seed, task.index, number), options={"task_id": task.index})
-        if is_wanted(env.scene.layout) and _is_in_view(env.scene.layout):
-            break
-    return picture(env.render()), env.scene.layout
+        layout = _new_layout(env, task, seed, number)
+        if is_wanted(layout) and _is_in_view(layout):
+            return _view(env), layout
+    raise RuntimeError(f"No scene of task {task.index} as wanted in {_TRIES} tries.")
+
+
+def _new_layout(env: PickPlaceEnv, task: Task, seed: int, number: int) -> Layout:
+    env.reset(seed=_seed(seed, task.index, number), options={"task_id": task.index})
+    return env.scene.layout
 
 
 def _is_in_view(layout: Layout) -> bool:

@@ -17,6 +17,7 @@ PAPER, INK, ACCENT = (250, 250, 248), (30, 30, 34), (196, 84, 0)
 _LINE_SPACING = 1.3
 _PALETTE_SIZE = 256
 
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 RGB = tuple[int, int, int]
 Align = Literal["start", "middle", "end"]
 
@@ -95,8 +96,10 @@ def circled(image: Image.Image, center: NDArray[np.float64], radius: float) -> I
     """A copy of a picture with a white ring, edged in black, about a point (x, y)."""
     copy = image.copy()
     draw = ImageDraw.Draw(copy)
-    for color, width in (((0, 0, 0), 5), ((255, 255, 255), 3)):
-        draw.circle(tuple(center), radius + (width - 3) / 2, outline=color, width=width)
+    x, y = center
+    for color, inset, width in (((0, 0, 0), 0, 5), ((255, 255, 255), 1, 3)):
+        reach = radius - inset
+        draw.ellipse((x - reach, y - reach, x + reach, y + reach), outline=color, width=width)
     return copy
 
 
@@ -135,11 +138,11 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 
 
 @cache
-def _font(size: int) -> ImageFont.FreeTypeFont:
+def _font(size: int) -> Font:
     return ImageFont.load_default(size)
 
 
-def _wrapped(paragraph: str, width: int, font: ImageFont.FreeTypeFont) -> list[str]:
+def _wrapped(paragraph: str, width: int, font: Font) -> list[str]:
     lines = [""]
     for word in paragraph.split():
         longer = f"{lines[-1]} {word}".strip()
