@@ -9,6 +9,4 @@ import gymnasium
 ENV_ID = "gym_deltaco/PickPlace-v0"
 EPISODE_STEPS = 30
 
-gymnasium.register(
-    id=ENV_ID, entry_point="gym_deltaco.env:PickPlaceEnv", max_episode_steps=EPISODE_STEPS
-)
+gymnasium.register(id=ENV_ID, entry_point="gym_deltaco.env:PickPlaceEnv", max_episode_steps=EPISODE_STEPS)

@@ -45,6 +45,7 @@ def _finger(name: str, side: int) -> Link:
         inertia=(1e-4, 1e-4, 1e-4),
         mesh=LINK_MESHES[name],
         boxes=(Box(middle, half_extents),),
+        limits=(0.0, FINGER_OPEN) if side > 0 else (-FINGER_OPEN, 0.0),
     )
 
 

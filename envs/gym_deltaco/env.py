@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from gym_deltaco import kinematics as kin
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity, sample_layout
 from gym_deltaco.scene import Scene
 from gym_deltaco.simulation import Simulation
@@ -17,6 +18,10 @@ from gym_deltaco.tasks import Task, get_task
 ACTION_SCALE = 0.1  # m of the end effector's motion for an action of 1
 CONTROL_FPS = 24  # nominal: 10 physics steps of 1/240 s
 MIN_IMAGE_SIZE = 8  # px
+
+# Of `agent_pos`: joints are given within half a turn of the rest position; 0.001 is for rounding.
+_STATE_LOW = np.array([*(kin.REST_JOINTS - np.pi), *(kin.SHOULDER - kin.REACH), 0.0]) - 1e-3
+_STATE_HIGH = np.array([*(kin.REST_JOINTS + np.pi), *(kin.SHOULDER + kin.REACH), 1.0]) + 1e-3
 
 Observation = dict[str, NDArray[Any]]
 
@@ -93,6 +98,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
                 f"`ambiguity` must be one of {', '.join(get_args(Ambiguity))}. Got {ambiguity!r}."
             )
         for name, size in (("image_size", image_size), ("render_size", render_size)):
+            if not isinstance(size, (int, np.integer)):
+                raise ValueError(f"`{name}` must be an integer. Got {size!r}.")
             if size < MIN_IMAGE_SIZE:
                 raise ValueError(f"`{name}` must be at least {MIN_IMAGE_SIZE}. Got {size}.")
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -104,7 +111,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.observation_space = spaces.Dict(
             {
                 "pixels": spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
-                "agent_pos": spaces.Box(-np.inf, np.inf, (10,), np.float32),
+                "agent_pos": spaces.Box(
+                    _STATE_LOW.astype(np.float32), _STATE_HIGH.astype(np.float32), dtype=np.float32
+                ),
             }
         )
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
@@ -125,7 +134,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         """The current scene, with its privileged state.
 
         Raises:
-            gymnasium.error.ResetNeeded: There is none: the environment has not been reset, or is closed.
+            gymnasium.error.ResetNeeded: There is none yet.
+            gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """
         if self._is_closed:
             raise gym.error.ClosedEnvironmentError(
@@ -151,9 +161,10 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             raise gym.error.ClosedEnvironmentError(
                 "The environment is closed. Make a new one with `gymnasium.make`."
             )
+        task = get_task((options or {}).get("task_id", self.task.index))
         super().reset(seed=seed)
-        if options and "task_id" in options:
-            self.task = get_task(options["task_id"])
+        # An interrupted reset leaves no scene, rather than half of one.
+        self.task, self._scene = task, None
         if self._simulation is None:
             self._simulation = Simulation()
         self._scene = Scene(self._simulation, sample_layout(self.task, self.ambiguity, self.np_random))
@@ -197,7 +208,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     def _observation(self) -> Observation:
         arm = self.scene.arm
-        state = np.concatenate([arm.joints, arm.position, [arm.is_open]])
+        # The waist may turn around the base again and again, and the wrist with it.
+        joints = (arm.joints - kin.REST_JOINTS + np.pi) % (2 * np.pi) - np.pi + kin.REST_JOINTS
+        state = np.concatenate([joints, arm.position, [arm.is_open]])
         return {"pixels": self.scene.render(self.image_size), "agent_pos": state.astype(np.float32)}
 
     def _info(self) -> dict[str, Any]:

@@ -26,11 +26,12 @@ JOINT_LIMITS = np.deg2rad(
     [[-180, 180], [-108, 114], [-92, 123], [-180, 180], [-123, 100], [-180, 180]]
 )  # rad
 
-_SHOULDER = BASE_POSITION + WAIST_ORIGIN + SHOULDER_ORIGIN
+SHOULDER = BASE_POSITION + WAIST_ORIGIN + SHOULDER_ORIGIN  # m, in the world
 _UPPER_ARM = float(np.hypot(ELBOW_ORIGIN[0], ELBOW_ORIGIN[2]))
 _UPPER_ARM_ELEVATION = float(np.arctan2(ELBOW_ORIGIN[2], ELBOW_ORIGIN[0]))  # at shoulder angle 0
 _FOREARM = FOREARM_ROLL_ORIGIN[0] + WRIST_ANGLE_ORIGIN[0]
 _HAND = WRIST_ROTATE_ORIGIN[0] + END_EFFECTOR_OFFSET[0]
+REACH = _UPPER_ARM + _FOREARM + _HAND  # m, of the end effector from the shoulder, stretched
 _MAX_REACH = 0.999 * (_UPPER_ARM + _FOREARM)  # of the wrist from the shoulder; short of the singularity
 _MIN_RADIUS = 0.03  # of the end effector from the waist's axis, where the waist's angle is undefined
 
@@ -75,7 +76,7 @@ def inverse(position: ArrayLike, near: ArrayLike = REST_JOINTS) -> NDArray[np.fl
     Returns:
         (6,), rad.
     """
-    x, y, z = np.asarray(position, dtype=np.float64) - _SHOULDER
+    x, y, z = np.asarray(position, dtype=np.float64) - SHOULDER
     near = np.asarray(near, dtype=np.float64)
     radius, height = max(float(np.hypot(x, y)), _MIN_RADIUS), z + _HAND
     reach = float(np.hypot(radius, height))

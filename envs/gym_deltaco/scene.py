@@ -104,9 +104,9 @@ class Scene:
         return float(heights.min()), float(heights.max())
 
     def is_grasped(self, index: int) -> bool:
-        """Whether the closed gripper holds an object between its fingers."""
+        """Whether the closed gripper holds an object between its fingers, which close along x."""
         return not self.arm.is_open and all(
-            self._simulation.touch(self.bodies[index], self.arm.body, finger)
+            self._simulation.presses(self.bodies[index], self.arm.body, finger, axis=0)
             for finger in self.arm.finger_links
         )
 

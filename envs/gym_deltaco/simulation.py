@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import functools
 import math
+import os
+import shutil
 import tempfile
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 import pybullet
@@ -30,6 +33,7 @@ _TEXTURE_WIDTH = _TEXTURE_HEIGHT = 64
 _NO_SHAPE = -1
 _ANGULAR_DAMPING = 0.9  # of free bodies, 1/s: without it, round ones rock on their rims for seconds
 _BASE = -1
+_CONTACT_NORMAL = 7  # field of a contact point
 
 
 class Box(NamedTuple):
@@ -108,6 +112,7 @@ class Link:
         inertia: Diagonal of the inertia tensor, kg m².
         mesh: What it looks like.
         boxes: What it touches with, if anything.
+        limits: Of the joint, m or rad; None is no limit.
     """
 
     name: str
@@ -120,6 +125,7 @@ class Link:
     is_prismatic: bool = False
     is_rolled: bool = False
     boxes: tuple[Box, ...] = ()
+    limits: tuple[float, float] | None = None
 
 
 class Simulation:
@@ -135,8 +141,9 @@ class Simulation:
                 "PyBullet has no free client left. Close the environments that are no longer used."
             )
         # PyBullet reads textures and unions of hulls from files only.
-        self._files = tempfile.TemporaryDirectory(prefix="gym_deltaco_")
-        self._texture_file = Path(self._files.name) / "colors.png"
+        self._files = Path(tempfile.mkdtemp(prefix="gym_deltaco_"))
+        self._release = weakref.finalize(self, _release, self._client, self._files, os.getpid())
+        self._texture_file = self._files / "colors.png"
         _color_texture().save(self._texture_file)
         self._hull_files: dict[object, str] = {}
         self._texture = -1
@@ -144,17 +151,14 @@ class Simulation:
     @property
     def is_open(self) -> bool:
         """Whether the client is still connected."""
-        return self._client >= 0
+        return self._release.alive
 
     def close(self) -> None:
         """Disconnects the client. Closing twice is harmless."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
-            self._files.cleanup()
+        self._release()
 
-    def __del__(self) -> None:
-        self.close()
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("A simulation cannot be copied or pickled: there is one client behind it.")
 
     def reset(self) -> None:
         """Empties the world."""
@@ -238,6 +242,9 @@ class Simulation:
         self._paint(body, _BASE)
         for index, link in enumerate(links):
             self._paint(body, index)
+            limits = {}
+            if link.limits is not None:
+                limits = dict(zip(("jointLowerLimit", "jointUpperLimit"), link.limits, strict=True))
             pybullet.changeDynamics(
                 body,
                 index,
@@ -245,6 +252,7 @@ class Simulation:
                 jointDamping=0,
                 linearDamping=0,
                 angularDamping=0,
+                **limits,
                 physicsClientId=self._client,
             )
             self._set_contact(body, index, contact)
@@ -305,7 +313,7 @@ class Simulation:
 
     def _hulls(self, key: object, hulls: Sequence[NDArray[np.float64]]) -> int:
         if key not in self._hull_files:
-            path = Path(self._files.name) / f"hulls_{len(self._hull_files)}.obj"
+            path = self._files / f"hulls_{len(self._hull_files)}.obj"
             path.write_text(_obj_text(hulls))
             self._hull_files[key] = str(path)
         return pybullet.createCollisionShape(
@@ -326,10 +334,14 @@ class Simulation:
         quaternion = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
         pybullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=self._client)
 
-    def touch(self, body: int, other: int, other_link: int | None = None) -> bool:
-        """Whether two bodies touch (or a body and one link of another), as of the last step."""
-        link = {} if other_link is None else {"linkIndexB": other_link}
-        return bool(pybullet.getContactPoints(body, other, **link, physicsClientId=self._client))
+    def touch(self, body: int, other: int) -> bool:
+        """Whether two bodies touch, as of the last step."""
+        return bool(pybullet.getContactPoints(body, other, physicsClientId=self._client))
+
+    def presses(self, body: int, other: int, other_link: int, axis: int) -> bool:
+        """Whether a body and a link of another press on each other, mostly along an axis of the world."""
+        contacts = pybullet.getContactPoints(body, other, linkIndexB=other_link, physicsClientId=self._client)
+        return any(abs(contact[_CONTACT_NORMAL][axis]) > math.sqrt(0.5) for contact in contacts)
 
     def joint_positions(self, body: int, joints: Sequence[int]) -> NDArray[np.float64]:
         """Angles (rad) or distances (m) of joints, (len(joints),)."""
@@ -404,6 +416,14 @@ class Simulation:
             physicsClientId=self._client,
         )[2]
         return np.ascontiguousarray(np.reshape(pixels, (size, size, 4))[..., :3], dtype=np.uint8)
+
+
+def _release(client: int, files: Path, process: int) -> None:
+    """Frees what a simulation holds, when it is closed, forgotten, or the interpreter ends."""
+    # A forked process has a copy of the client, but not of the files.
+    if os.getpid() == process:
+        shutil.rmtree(files, ignore_errors=True)
+    pybullet.disconnect(physicsClientId=client)
 
 
 def _color_texture() -> Image.Image:

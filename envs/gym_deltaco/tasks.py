@@ -228,7 +228,7 @@ def get_task(index: int) -> Task:
     """
     try:
         is_valid = int(index) == index and 0 <= index < N_TASKS
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         is_valid = False
     if not is_valid:
         raise ValueError(f"`task_id` must be an integer from 0 to {N_TASKS - 1}. Got {index!r}.")
