@@ -4,7 +4,10 @@ import atexit
 import sys
 
 try:
-    import lerobot_deltaco.configuration_env  # noqa: F401  (registers `--env.type=deltaco`)
+    # These register `--env.type=deltaco` and `--policy.type=deltaco`, and the steps of its processors.
+    import lerobot_deltaco.configuration_deltaco
+    import lerobot_deltaco.configuration_env
+    import lerobot_deltaco.processor_deltaco  # noqa: F401
 except Exception as error:
     problem = (
         "lerobot_policy_deltaco could not be imported, so LeRobot does not know the type 'deltaco' "

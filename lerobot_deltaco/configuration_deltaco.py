@@ -1,0 +1,274 @@
+"""`--policy.type=deltaco`: every method, baseline and ablation of the paper as a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import NamedTuple
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamConfig
+
+from lerobot_deltaco.collection_plan import ACTION_NAMES
+from lerobot_deltaco.language import LANGUAGE_ENCODERS
+
+
+class Conditioning(NamedTuple):
+    """How a method tells the policy its task."""
+
+    film: str  # what goes through FiLM
+    concat: str  # what is concatenated to the feature points
+    encoder_loss: str  # what aligns demonstrations with instructions
+
+
+# Rows of the paper's tables 1 to 3.
+METHODS = MappingProxyType(
+    {
+        "deltaco": Conditioning("demo", "language", "contrastive"),
+        "language_only": Conditioning("language", "none", "none"),
+        "demo_only": Conditioning("demo", "none", "contrastive"),
+        "one_hot": Conditioning("one_hot", "none", "none"),
+        "bc_z": Conditioning("demo", "none", "cosine"),
+        # The mean of two imitation losses: of the language (through a projection) and of the demonstration.
+        "mcil": Conditioning("language_or_demo", "none", "none"),
+    }
+)
+INPUTS = ("none", "demo", "language", "demo+language")
+ENCODER_LOSSES = ("contrastive", "cosine", "none")
+# Strides of the eight residual blocks.
+BACKBONES = MappingProxyType({"paper": (1, 1, 1, 1, 1, 1, 1, 1), "strided": (1, 1, 1, 1, 2, 1, 2, 1)})
+DEMO_ENCODERS = ("cnn",)
+DTYPES = ("float32", "bfloat16")
+
+
+@PreTrainedConfig.register_subclass("deltaco")
+@dataclass
+class DeltacoConfig(PreTrainedConfig):
+    """DeL-TaCo (Yu & Mooney, ICLR 2023): a policy told its task by a demonstration and an instruction.
+
+    The defaults are the paper's (appendix B), for pictures of 48 x 48 pixels. On a small machine, choose
+    `backbone=strided`: the same network, whose maps are halved before the blocks of 64 and of 128 channels.
+
+    Args:
+        method: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
+        film: Ablation: what goes through FiLM instead of the method's: none, demo, language or demo+language.
+        concat: Ablation: what is concatenated to the feature points instead of the method's; the same names.
+        encoder_loss: Ablation: contrastive, cosine or none, instead of the method's.
+        language_encoder: A frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'),
+            all-distilroberta-v1, distilbert-base-uncased, or all-MiniLM-L6-v2, which the extra `offline`
+            brings along.
+        demo_encoder: cnn.
+        demo_rows: m, rows of the array of a demonstration's frames.
+        demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
+        image_size: Height and width to which pictures are scaled, if they differ.
+        backbone: paper or strided.
+        gripper: Which dimension of the action is the gripper: an index, "auto" (the last one whose name
+            contains "gripper", if any) or "none".
+        gripper_weight: Of the gripper's squared error in the imitation loss.
+        encoder_loss_weight: Of the encoder's loss, lambda in the paper's equation 4.
+        temperature: Of the contrastive loss.
+        crop_padding: Pixels by which pictures are shifted at random in training, 0 for none.
+        demo_repo_id: Dataset that shows the tasks at evaluation; at least one episode of each.
+        demo_root: Its folder, if it is not in LeRobot's cache.
+        demo_episode: Its one episode that shows the task whatever the instruction; for paraphrases and for
+            sentences of one's own.
+        demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default those
+            that are trained on.
+        seed: Of the draws of demonstrations and crops, which are a function of it and the step.
+        dtype: float32 or bfloat16, of the networks' arithmetic.
+        optimizer_lr: Learning rate of Adam.
+        grad_clip_norm: Greatest norm of the gradient, 0 for no limit.
+    """
+
+    method: str = "deltaco"
+    film: str | None = None
+    concat: str | None = None
+    encoder_loss: str | None = None
+    language_encoder: str = "paraphrase-MiniLM-L3-v2"
+    demo_encoder: str = "cnn"
+    demo_rows: int = 1
+    demo_columns: int = 2
+    image_size: int = 48
+    backbone: str = "paper"
+    gripper: str = "auto"
+    gripper_weight: float = 30.0
+    encoder_loss_weight: float = 10.0
+    temperature: float = 0.1
+    crop_padding: int = 4
+    demo_repo_id: str | None = None
+    demo_root: str | None = None
+    demo_episode: int | None = None
+    demo_episodes: list[int] | None = None
+    seed: int = 0
+    dtype: str = "float32"
+    optimizer_lr: float = 3e-4
+    grad_clip_norm: float = 0.0
+    push_to_hub: bool = False
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.MIN_MAX,
+        }
+    )
+    # Found out from the datasets, and saved with the checkpoint.
+    one_hot_tasks: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_choice("method", METHODS)
+        for name in ("film", "concat"):
+            if getattr(self, name) is not None:
+                self._check_choice(name, INPUTS)
+        if self.encoder_loss is not None:
+            self._check_choice("encoder_loss", ENCODER_LOSSES)
+        self._check_choice("language_encoder", LANGUAGE_ENCODERS)
+        self._check_choice("demo_encoder", DEMO_ENCODERS)
+        self._check_choice("backbone", BACKBONES)
+        self._check_choice("dtype", DTYPES)
+        if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
+            raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
+        for name, minimum in (
+            ("demo_rows", 1),
+            ("demo_columns", 1),
+            ("image_size", 16),
+            ("gripper_weight", 0),
+            ("encoder_loss_weight", 0),
+            ("crop_padding", 0),
+            ("seed", 0),
+            ("grad_clip_norm", 0),
+        ):
+            if not getattr(self, name) >= minimum:
+                raise ValueError(f"`{name}` must be at least {minimum}. Got {getattr(self, name)}.")
+        for name in ("temperature", "optimizer_lr"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"`{name}` must be greater than 0. Got {getattr(self, name)}.")
+        if self.n_demo_frames < 2:
+            raise ValueError(
+                "A demonstration has its first and its last frame: `demo_rows` * `demo_columns` must be "
+                f"at least 2. Got {self.n_demo_frames}."
+            )
+        self._check_conditioning()
+
+    def _check_choice(self, name: str, valid: Collection[str]) -> None:
+        value = getattr(self, name)
+        if value not in valid:
+            raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {value!r}.")
+
+    def _check_conditioning(self) -> None:
+        overridden = [name for name in ("film", "concat", "encoder_loss") if getattr(self, name) is not None]
+        if overridden and self.method in ("one_hot", "mcil"):
+            raise ValueError(f"`{overridden[0]}` cannot be changed in the method {self.method!r}.")
+        film, concat, encoder_loss = self.conditioning
+        if film == concat == "none":
+            raise ValueError("`film` and `concat` are both 'none': the policy would not know its task.")
+        if encoder_loss != "none" and not self.uses_demo:
+            raise ValueError(
+                f"`encoder_loss` is {encoder_loss!r}, but no demonstration is used. Set it to 'none', or use "
+                "one in `film` or `concat`."
+            )
+
+    @property
+    def conditioning(self) -> Conditioning:
+        """The method's, with what an ablation changes."""
+        changed = {
+            name: getattr(self, name) for name in Conditioning._fields if getattr(self, name) is not None
+        }
+        return METHODS[self.method]._replace(**changed)
+
+    @property
+    def uses_demo(self) -> bool:
+        """Whether demonstrations are needed."""
+        return any("demo" in source for source in self.conditioning[:2])
+
+    @property
+    def uses_language(self) -> bool:
+        """Whether instructions are embedded: as an input, or for the encoder's loss."""
+        film, concat, encoder_loss = self.conditioning
+        return "language" in film or "language" in concat or encoder_loss != "none"
+
+    @property
+    def n_demo_frames(self) -> int:
+        """Frames of a demonstration."""
+        return self.demo_rows * self.demo_columns
+
+    @property
+    def embedding_dim(self) -> int:
+        """Size of a task embedding: the language encoder's."""
+        return LANGUAGE_ENCODERS[self.language_encoder].embedding_dim
+
+    @property
+    def gripper_index(self) -> int | None:
+        """Dimension of the action that is the gripper, once it is known; None is none."""
+        return int(self.gripper) if self.gripper.isdecimal() else None
+
+    def resolve(self, dataset_features: dict[str, dict] | None) -> None:
+        """Decides what the training dataset tells: which dimension is the gripper, how actions are scaled.
+
+        Args:
+            dataset_features: Of the training dataset; None at evaluation, where all is decided.
+        """
+        names = (dataset_features or {}).get("action", {}).get("names")
+        if isinstance(names, dict):
+            names = next(iter(names.values()))
+        if names and list(names) == ACTION_NAMES:
+            # The benchmark's actions are in -1..1 already.
+            self.normalization_mapping["ACTION"] = NormalizationMode.IDENTITY
+        if self.gripper == "auto":
+            found = [index for index, name in enumerate(names or ()) if "gripper" in str(name).lower()]
+            self.gripper = str(found[-1]) if found else "none"
+        self.validate_features()
+
+    def validate_features(self) -> None:
+        """Checks the inputs and outputs that were found in the dataset.
+
+        Raises:
+            ValueError: There is no camera, no action, or no such gripper.
+        """
+        if not self.image_features:
+            raise ValueError(
+                "The policy needs at least one camera. The dataset's inputs are "
+                f"{sorted(self.input_features or {})}."
+            )
+        if self.action_feature is None:
+            raise ValueError(
+                "The policy needs the feature 'action'. The outputs are "
+                f"{sorted(self.output_features or {})}."
+            )
+        shapes = {name: tuple(feature.shape) for name, feature in self.image_features.items()}
+        if any(len(shape) != 3 or shape[0] != 3 for shape in shapes.values()):
+            raise ValueError(f"Pictures must have the shape (3, height, width). Got {shapes}.")
+        (action_dim,) = self.action_feature.shape
+        if self.gripper_index is not None and not self.gripper_index < action_dim:
+            raise ValueError(
+                f"`gripper` is {self.gripper_index}, but the action has only the dimensions 0 to "
+                f"{action_dim - 1}. Name one of these, or 'none'."
+            )
+        if action_dim == 1 and self.gripper_index is not None:
+            raise ValueError(
+                "The action is nothing but a gripper. Set `gripper` to 'none' to learn it as a motion."
+            )
+
+    def get_optimizer_preset(self) -> AdamConfig:
+        """Adam without weight decay."""
+        return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0, grad_clip_norm=self.grad_clip_norm)
+
+    def get_scheduler_preset(self) -> None:
+        """The learning rate is constant."""
+        return
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """Only the present observation is used."""
+        return
+
+    @property
+    def action_delta_indices(self) -> None:
+        """Only the next action is predicted."""
+        return
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """Rewards are not used."""
+        return

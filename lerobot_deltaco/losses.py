@@ -1,0 +1,64 @@
+"""The losses of the paper (section 4.2 and appendix B), of plain tensors."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+
+
+def gaussian_negative_log_likelihood(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
+    """-log N(target; mean, std²), summed over the dimensions of an action.
+
+    Args:
+        mean: (batch, dims).
+        log_std: (dims,), the same for all samples.
+        target: (batch, dims).
+
+    Returns:
+        (batch,).
+    """
+    scaled = (target - mean) * torch.exp(-log_std)
+    return (0.5 * scaled.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(dim=-1)
+
+
+def contrastive_logits(demo: Tensor, language: Tensor, temperature: float) -> Tensor:
+    """How alike each demonstration is to each instruction: the logits of the paper's equation 3.
+
+    Args:
+        demo: Unit embeddings of the samples' demonstrations, (batch, embedding).
+        language: Unit embeddings of the distinct instructions in the batch, (tasks, embedding).
+        temperature: Divides the cosines.
+
+    Returns:
+        (batch, tasks). The paper has one demonstration for each task, which makes this square.
+    """
+    return demo @ language.T / temperature
+
+
+def contrastive_loss(logits: Tensor, task: Tensor) -> Tensor:
+    """Cross-entropy of each demonstration's own instruction among those of the batch.
+
+    Args:
+        logits: (batch, tasks).
+        task: Column of each sample's own instruction, (batch,) int64.
+
+    Returns:
+        (batch,).
+    """
+    return F.cross_entropy(logits, task, reduction="none")
+
+
+def cosine_loss(demo: Tensor, language: Tensor) -> Tensor:
+    """1 - cosine of each demonstration and its own instruction, as in BC-Z.
+
+    Args:
+        demo: Unit embeddings, (batch, embedding).
+        language: The same, of each sample's own instruction.
+
+    Returns:
+        (batch,).
+    """
+    return 1 - (demo * language).sum(dim=-1)

@@ -1,0 +1,427 @@
+"""The policy of DeL-TaCo (Yu & Mooney, ICLR 2023), and the baselines and ablations of the paper."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from huggingface_hub import hf_hub_download
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
+from lerobot_deltaco.demonstrations import DemonstrationSet, load_demonstrations
+from lerobot_deltaco.language import InstructionTable
+from lerobot_deltaco.losses import (
+    contrastive_logits,
+    contrastive_loss,
+    cosine_loss,
+    gaussian_negative_log_likelihood,
+)
+from lerobot_deltaco.networks import ConditionedPolicy, DemoEncoder, frame_array, random_crop
+from lerobot_deltaco.training_episodes import training_episodes
+
+# Beside the weights: embeddings of instructions, and the demonstrations for evaluation.
+TASKS_FILE = "tasks.safetensors"
+
+
+class _Told(NamedTuple):
+    """What the policy is told of the tasks of a batch, for as long as an episode lasts."""
+
+    tasks: tuple[str, ...]
+    film: Tensor  # (batch, film_dim)
+    concat: Tensor | None  # (batch, concatenated embeddings)
+
+
+class DeltacoPolicy(PreTrainedPolicy):
+    """A policy that is told its task by a demonstration, an instruction, or both.
+
+    In training, each sample's demonstration is another episode of its task, from the training dataset. At
+    evaluation, demonstrations come from the dataset that the configuration names, or from the checkpoint.
+    The instruction is the batch's `task`.
+
+    Args:
+        config: The configuration. Features that it lacks are filled in by LeRobot beforehand.
+        dataset_stats: Unused; normalization is the processors' business.
+        dataset_meta: Of the training dataset; None at evaluation.
+    """
+
+    config_class = DeltacoConfig
+    name = "deltaco"
+
+    def __init__(
+        self,
+        config: DeltacoConfig,
+        dataset_stats: dict[str, dict[str, Tensor]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        super().__init__(config)
+        self.config: DeltacoConfig = config
+        self._meta = dataset_meta
+        config.resolve(dataset_meta.features if dataset_meta else None)
+        self.instructions = InstructionTable(config.language_encoder)
+        self.shown: DemonstrationSet | None = None  # for evaluation
+        self.trained_on: DemonstrationSet | None = None  # for training; read when the first batch comes
+        if config.demo_repo_id is not None:
+            self.shown = self._load(config.demo_repo_id, config.demo_root, None)
+        if config.method == "one_hot" and not config.one_hot_tasks:
+            config.one_hot_tasks = self._vocabulary()
+
+        film, concat, encoder_loss = config.conditioning
+        dims = {
+            "none": 0,
+            "demo": config.embedding_dim,
+            "language": config.embedding_dim,
+            "demo+language": 2 * config.embedding_dim,
+            "language_or_demo": config.embedding_dim,
+            "one_hot": len(config.one_hot_tasks),
+        }
+        state = config.robot_state_feature
+        action_dim = config.action_feature.shape[0]
+        self.policy = ConditionedPolicy(
+            n_cameras=len(config.image_features),
+            film_dim=dims[film],
+            concat_dim=dims[concat] + (state.shape[0] if state else 0),
+            motion_dim=action_dim - (config.gripper_index is not None),
+            has_gripper=config.gripper_index is not None,
+            strides=BACKBONES[config.backbone],
+        )
+        self.demo_encoder = (
+            DemoEncoder(
+                config.demo_rows * config.image_size,
+                config.demo_columns * config.image_size,
+                config.embedding_dim,
+            )
+            if config.uses_demo
+            else None
+        )
+        # MCIL brings both modalities into one space.
+        self.project_language = (
+            nn.Linear(config.embedding_dim, config.embedding_dim) if config.method == "mcil" else None
+        )
+        # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
+        self.register_buffer("step", torch.zeros((), dtype=torch.int64))
+        self._told: dict[int, _Told] = {}
+        self._n_episodes: dict[int, int] = {}
+        self.reset()
+
+    def get_optim_params(self) -> list[nn.Parameter]:
+        """All weights; the language encoder is not among them."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    # Training
+
+    def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """The loss of a batch: L = L_pi + lambda L_demo (the paper's equation 4).
+
+        Args:
+            batch: Of the preprocessor; it is left as it is.
+                `observation.image`, or any cameras: (batch, 3, H, W) float in 0..1.
+                `observation.state`: (batch, state), normalized, if there is one.
+                `action`: (batch, action), -1..1.
+                `task`: list of instructions, (batch,).
+                `episode_index`: (batch,) int64, if demonstrations are used.
+            reduction: "mean", or "none" for the loss of each sample.
+
+        Returns:
+            The loss, () or (batch,), and what is logged.
+        """
+        tasks = list(batch["task"])
+        device = batch[ACTION].device
+        generator = self._generator()
+        images = self._images(batch)
+        if self.training and self.config.crop_padding:
+            images = random_crop(images, self.config.crop_padding, generator)
+        demo = language = None
+        if self.config.uses_demo:
+            demo = self._encode_demo(*self._draw(batch["episode_index"], generator), generator)
+        distinct = list(dict.fromkeys(tasks))
+        column = torch.tensor([distinct.index(task) for task in tasks], device=device)
+        if self.config.uses_language:
+            known = self.instructions(distinct, device)  # (distinct, embedding)
+            language = known[column]  # (batch, embedding)
+
+        if self.config.method == "mcil":
+            parts = [
+                self._imitation_loss(batch, images, film, None)
+                for film in (self.project_language(language), demo)
+            ]
+            loss = torch.stack([part[0] for part in parts]).mean(dim=0)
+            logged = {name: torch.stack([part[1][name] for part in parts]).mean() for name in parts[0][1]}
+        else:
+            film, concat = self._told_by(tasks, demo, language)
+            loss, logged = self._imitation_loss(batch, images, film, concat)
+
+        if self.config.conditioning.encoder_loss != "none":
+            logits = contrastive_logits(demo.float(), known, self.config.temperature)  # (batch, distinct)
+            if self.config.conditioning.encoder_loss == "contrastive":
+                encoder_loss = contrastive_loss(logits, column)
+            else:
+                encoder_loss = cosine_loss(demo.float(), language)
+            loss = loss + self.config.encoder_loss_weight * encoder_loss
+            logged["encoder_loss"] = encoder_loss.mean()
+            logged["demo_accuracy"] = (logits.argmax(dim=1) == column).float().mean()
+        if self.training:
+            self.step += 1
+        values = torch.stack([value.detach().float() for value in logged.values()]).tolist()
+        return loss.mean() if reduction == "mean" else loss, dict(zip(logged, values, strict=True))
+
+    def _imitation_loss(
+        self, batch: dict[str, Any], images: Tensor, film: Tensor, concat: Tensor | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """L_pi of each sample, (batch,), and its parts."""
+        mean, gripper = self.policy(images, film, self._concatenated(batch, concat))
+        action = batch[ACTION].float()
+        motion, target = self._split(action)
+        likelihood = gaussian_negative_log_likelihood(mean.float(), self.policy.log_std.float(), motion)
+        logged = {"motion_nll": likelihood.mean(), "motion_mse": (mean.float() - motion).square().mean()}
+        if gripper is None:
+            return likelihood, logged
+        error = (gripper.float() - target).square()
+        logged["gripper_mse"] = error.mean()
+        logged["gripper_accuracy"] = ((gripper > 0.5) == (target > 0.5)).float().mean()
+        return likelihood + self.config.gripper_weight * error, logged
+
+    def _draw(self, episodes: Tensor, generator: torch.Generator) -> tuple[DemonstrationSet, Tensor]:
+        """The demonstrations, and the row of each sample's."""
+        if self.trained_on is None:
+            if self._meta is None:
+                raise ValueError("Only a policy that was made with a dataset's metadata can be trained.")
+            chosen = self.config.demo_episodes or training_episodes(self._meta)
+            self.trained_on = self._load(self._meta.repo_id, self._meta.root, chosen).to(episodes.device)
+        return self.trained_on, self.trained_on.others(episodes, generator)
+
+    def _generator(self) -> torch.Generator:
+        rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
+        step = int(self.step) if self.training else 0
+        seed = torch.tensor([self.config.seed, step, rank], dtype=torch.int64)
+        # A hash, so that neighboring seeds and steps have nothing in common.
+        mixed = 0
+        for value in seed.tolist():
+            mixed = (mixed * 6364136223846793005 + value + 1442695040888963407) % 2**63
+        return torch.Generator().manual_seed(mixed)
+
+    # Evaluation
+
+    def reset(self) -> None:
+        """Begins an episode (of this thread, if several evaluate tasks at the same time)."""
+        thread = threading.get_ident()
+        self._told.pop(thread, None)
+        self._n_episodes[thread] = self._n_episodes.get(thread, -1) + 1
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """The mean action.
+
+        Args:
+            batch: As in `forward`, without actions and indices.
+
+        Returns:
+            (batch, action), as the preprocessor would have normalized it.
+
+        Raises:
+            ValueError: A task has no demonstration.
+        """
+        tasks = tuple(batch["task"])
+        images = self._images(batch)
+        with self._autocast(images.device):
+            told = self._told.get(threading.get_ident())
+            if told is None or told.tasks != tasks:
+                told = self._told[threading.get_ident()] = self._tell(tasks, images.device)
+            mean, gripper = self.policy(images, told.film, self._concatenated(batch, told.concat))
+        return self._joined(mean.float(), None if gripper is None else gripper.float())
+
+    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """The mean action as a chunk of one, (batch, 1, action)."""
+        return self.select_action(batch, **kwargs).unsqueeze(1)
+
+    def _tell(self, tasks: tuple[str, ...], device: torch.device) -> _Told:
+        """Encodes the demonstrations and instructions of tasks, once an episode."""
+        n_before = self._n_episodes[threading.get_ident()] * len(tasks)
+        demo = language = None
+        if self.config.uses_demo:
+            shown, rows = self._choose(tasks, n_before)
+            generator = torch.Generator().manual_seed(self.config.seed)
+            demo = self._encode_demo(shown, rows, generator)
+        if self.config.uses_language:
+            language = self.instructions(tasks, device)
+        if self.config.method == "mcil":
+            # The trials of a task use the language and the demonstration in turn.
+            by_language = (n_before + torch.arange(len(tasks), device=device)) % 2 == 0
+            return _Told(
+                tasks, torch.where(by_language[:, None], self.project_language(language), demo), None
+            )
+        return _Told(tasks, *self._told_by(tasks, demo, language))
+
+    def _choose(self, tasks: tuple[str, ...], n_before: int) -> tuple[DemonstrationSet, Tensor]:
+        """The demonstrations for evaluation, and the row of each task's; those of a task take turns."""
+        candidates = [shown for shown in (self.shown, self.trained_on) if shown is not None]
+        if self.config.demo_episode is not None and self.shown is not None:
+            found = (self.shown.episodes == self.config.demo_episode).nonzero().flatten()
+            if not len(found):
+                raise ValueError(
+                    f"`demo_episode` is {self.config.demo_episode}, but the demonstrations are the episodes "
+                    f"{self.shown.episodes.tolist()[:10]} ..."
+                )
+            return self.shown, found[:1].expand(len(tasks))
+        for shown in candidates:
+            if all(task in shown.rows for task in tasks):
+                rows = [
+                    shown.rows[task][(n_before + n) % len(shown.rows[task])] for n, task in enumerate(tasks)
+                ]
+                return shown, torch.tensor(rows, device=shown.frames.device)
+        there = sorted({task for shown in candidates for task in shown.rows})
+        missing = next(task for task in tasks if task not in there) if there else tasks[0]
+        raise ValueError(
+            f"There is no demonstration of the task {missing!r}. There are {len(there)} tasks"
+            f"{f', such as {there[0]!r}' if there else ''}. Name a dataset that has it with "
+            "--policy.demo_repo_id and --policy.demo_root, and, if its words are other ones, the episode "
+            "with --policy.demo_episode."
+        )
+
+    def _autocast(self, device: torch.device) -> Any:
+        if self.config.dtype == "float32":
+            return nullcontext()
+        return torch.autocast(device.type, torch.bfloat16)
+
+    # Both
+
+    def _images(self, batch: dict[str, Any]) -> Tensor:
+        """Pictures of all cameras, (batch, cameras, 3, size, size)."""
+        size = self.config.image_size
+        pictures = []
+        for name in self.config.image_features:
+            image = batch[name]  # (batch, 3, H, W)
+            if image.shape[-2:] != (size, size):
+                image = F.interpolate(image, (size, size), mode="bilinear", antialias=True)
+            pictures.append(image)
+        return torch.stack(pictures, dim=1)
+
+    def _concatenated(self, batch: dict[str, Any], embedding: Tensor | None) -> Tensor | None:
+        parts = [embedding] if embedding is not None else []
+        if self.config.robot_state_feature:
+            parts.append(batch[OBS_STATE])
+        return torch.cat(parts, dim=-1) if parts else None
+
+    def _told_by(
+        self, tasks: Sequence[str], demo: Tensor | None, language: Tensor | None
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """What goes through FiLM and what is concatenated."""
+
+        def source(name: str) -> Tensor | None:
+            if name == "none":
+                return None
+            if name == "one_hot":
+                return self._one_hot(tasks)
+            embeddings = {"demo": demo, "language": language}
+            return torch.cat([embeddings[part] for part in name.split("+")], dim=-1)
+
+        film, concat, _ = self.config.conditioning
+        return source(film), source(concat)
+
+    def _one_hot(self, tasks: Sequence[str]) -> Tensor:
+        unknown = next((task for task in tasks if task not in self.config.one_hot_tasks), None)
+        if unknown is not None:
+            raise ValueError(
+                f"The task {unknown!r} is not among the {len(self.config.one_hot_tasks)} that this one-hot "
+                "policy knows: those of its training and demonstration datasets."
+            )
+        indices = torch.tensor(
+            [self.config.one_hot_tasks.index(task) for task in tasks], device=self.step.device
+        )
+        return F.one_hot(indices, len(self.config.one_hot_tasks)).float()
+
+    def _encode_demo(self, shown: DemonstrationSet, rows: Tensor, generator: torch.Generator) -> Tensor:
+        """Unit embeddings of demonstrations, (batch, embedding)."""
+        frames = shown.pictures(rows, self.config.n_demo_frames, generator)
+        if self.training and self.config.crop_padding:
+            frames = random_crop(frames, self.config.crop_padding, generator)
+        return self.demo_encoder(frame_array(frames, self.config.demo_rows))
+
+    def _split(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
+        """An action's motion, and its gripper in 0..1."""
+        index = self.config.gripper_index
+        if index is None:
+            return action, None
+        motion = torch.cat([action[:, :index], action[:, index + 1 :]], dim=1)
+        return motion, (action[:, index] + 1) / 2
+
+    def _joined(self, motion: Tensor, gripper: Tensor | None) -> Tensor:
+        """The inverse of `_split`."""
+        index = self.config.gripper_index
+        if index is None:
+            return motion
+        return torch.cat([motion[:, :index], 2 * gripper[:, None] - 1, motion[:, index:]], dim=1)
+
+    # Datasets and checkpoints
+
+    def _load(
+        self, repo_id: str, root: str | Path | None, episodes: Sequence[int] | None
+    ) -> DemonstrationSet:
+        camera = next(iter(self.config.image_features))
+        size, n_frames = self.config.image_size, self.config.n_demo_frames
+        return load_demonstrations(repo_id, root, episodes, camera, size, n_frames)
+
+    def _vocabulary(self) -> list[str]:
+        """Tasks of the training and demonstration datasets."""
+        if self._meta is None:
+            raise ValueError("A one-hot policy is made with a dataset, whose tasks it will know.")
+        return list(dict.fromkeys([*self._meta.tasks.index, *(self.shown.rows if self.shown else ())]))
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        # What was read from the datasets is saved; the next user may name others.
+        source = self.config.demo_repo_id, self.config.demo_root
+        self.config.demo_repo_id = self.config.demo_root = None
+        try:
+            super()._save_pretrained(save_directory, state_dict)
+        finally:
+            self.config.demo_repo_id, self.config.demo_root = source
+        tensors = {"embeddings": self.instructions.embeddings.cpu().contiguous()}
+        known = {
+            "language_encoder": self.instructions.encoder_name,
+            "instructions": json.dumps(list(self.instructions.rows)),
+        }
+        if self.shown is not None:
+            tensors |= {"frames": self.shown.frames.cpu(), "episodes": self.shown.episodes.cpu()}
+            known["tasks"] = json.dumps(self.shown.tasks)
+        save_file(tensors, save_directory / TASKS_FILE, metadata=known)
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> DeltacoPolicy:
+        """Loads a policy with what it knows of tasks. See `PreTrainedPolicy.from_pretrained`."""
+        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
+        folder = Path(pretrained_name_or_path)
+        if folder.is_dir():
+            path = folder / TASKS_FILE
+        else:
+            names = ("revision", "cache_dir", "token", "local_files_only", "force_download")
+            options = {name: kwargs[name] for name in names if name in kwargs}
+            path = Path(hf_hub_download(str(pretrained_name_or_path), TASKS_FILE, **options))
+        policy._read_tasks(path)
+        return policy
+
+    def _read_tasks(self, path: Path) -> None:
+        with safe_open(path, framework="pt") as file:
+            known = file.metadata()
+            if known["language_encoder"] != self.config.language_encoder:
+                raise ValueError(
+                    f"The checkpoint was made with the language encoder {known['language_encoder']}. "
+                    f"`language_encoder` cannot be {self.config.language_encoder}."
+                )
+            names = set(file.keys())
+            self.instructions.put(json.loads(known["instructions"]), file.get_tensor("embeddings"))
+            # Demonstrations named on the command line come before those of the checkpoint.
+            if self.shown is None and "frames" in names:
+                self.shown = DemonstrationSet(
+                    file.get_tensor("frames"), json.loads(known["tasks"]), file.get_tensor("episodes")
+                ).to(self.config.device)

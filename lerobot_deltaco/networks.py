@@ -1,0 +1,276 @@
+"""The networks of the paper (figure 3, appendix B): the demonstration encoder, and the policy it conditions.
+
+    demonstration (3, m H, n W)          picture (3, H, W)
+        |                                    |
+    conv 3x3, pool   } 3 of them         conv 7x7, batch norm, pool
+        |            } 2 pools               |
+    fully connected                      residual block  <--- FiLM: gamma and beta, linear in an embedding
+        |                                    |   ... 8 of them
+    unit length                          spatial softmax
+        |                                    |
+    demonstration embedding              feature points, concatenated embeddings, proprioception
+                                             |
+                                         fully connected           |
+                                             |                     |
+                                         mean of the motion    gripper
+
+Task embedding: a unit vector that stands for a task, made from a demonstration or an instruction. What goes
+through FiLM and what is concatenated is the caller's to choose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from einops import rearrange
+from torch import Tensor, nn
+
+FILM_INITIAL_STD = 1e-3
+MIN_LOG_STD, MAX_LOG_STD = -6.0, 0.0
+INITIAL_LOG_STD = -1.0  # ours: of the order of the first errors, so that the first gradients are moderate
+
+
+class ConditionedPolicy(nn.Module):
+    """From a picture, task embeddings and proprioception to an action.
+
+    Args:
+        n_cameras: Number of pictures of an observation; their feature points are concatenated.
+        film_dim: Size of the embedding that goes through FiLM, 0 for none.
+        concat_dim: Size of what is concatenated to the feature points: embeddings and proprioception.
+        motion_dim: Size of the action without the gripper.
+        has_gripper: Whether the action has a gripper.
+        channels: Of the residual blocks, one number each.
+        strides: Of the residual blocks.
+        hidden_dims: Of the fully connected layers.
+        gripper_hidden_dim: Of the gripper's hidden layer.
+        spatial_softmax_temperature: Divides the activations.
+    """
+
+    def __init__(
+        self,
+        n_cameras: int,
+        film_dim: int,
+        concat_dim: int,
+        motion_dim: int,
+        has_gripper: bool,
+        channels: Sequence[int] = (16, 16, 32, 32, 64, 64, 128, 128),
+        strides: Sequence[int] = (1, 1, 1, 1, 1, 1, 1, 1),
+        hidden_dims: Sequence[int] = (1024, 512, 256),
+        gripper_hidden_dim: int = 32,
+        spatial_softmax_temperature: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.backbone = FilmResNet(film_dim, channels, strides)
+        self.spatial_softmax = SpatialSoftmax(spatial_softmax_temperature)
+        feature_dim = n_cameras * 2 * channels[-1] + concat_dim
+        self.motion = multilayer_perceptron([feature_dim, *hidden_dims, motion_dim])
+        # After the authors' code: independent of the observation.
+        share = (INITIAL_LOG_STD - MIN_LOG_STD) / (MAX_LOG_STD - MIN_LOG_STD)
+        self.raw_log_std = nn.Parameter(torch.full((motion_dim,), math.log(share / (1 - share))))
+        # After the authors' code: on the concatenated features (the paper's figure: after the layers above).
+        self.gripper = multilayer_perceptron([feature_dim, gripper_hidden_dim, 1]) if has_gripper else None
+
+    @property
+    def log_std(self) -> Tensor:
+        """Of the motion, (motion_dim,), strictly between -6 and 0."""
+        return MIN_LOG_STD + (MAX_LOG_STD - MIN_LOG_STD) * torch.sigmoid(self.raw_log_std)
+
+    def forward(
+        self, images: Tensor, film: Tensor | None, concat: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Predicts an action.
+
+        Args:
+            images: (batch, cameras, 3, H, W) in 0..1.
+            film: (batch, film_dim), None if it is 0.
+            concat: (batch, concat_dim), None if it is 0.
+
+        Returns:
+            Mean of the motion, (batch, motion_dim), and the gripper in 0..1, (batch,), or None.
+        """
+        n_cameras = images.shape[1]
+        if film is not None:
+            film = film.repeat_interleave(n_cameras, dim=0)  # (batch * cameras, film_dim)
+        maps = self.backbone(
+            rearrange(images, "b n c h w -> (b n) c h w"), film
+        )  # (batch * cameras, c, h, w)
+        points = rearrange(self.spatial_softmax(maps), "(b n) p -> b (n p)", n=n_cameras)
+        features = points if concat is None else torch.cat([points, concat], dim=-1)  # (batch, feature_dim)
+        gripper = None if self.gripper is None else torch.sigmoid(self.gripper(features)).squeeze(-1)
+        return self.motion(features), gripper
+
+
+class FilmResNet(nn.Module):
+    """Residual blocks behind a 7x7 convolution, each with FiLM.
+
+    Args:
+        film_dim: Size of the embedding, 0 for no FiLM.
+        channels: Of the blocks.
+        strides: Of the blocks. The paper's are all 1, so that the maps keep half the picture's size.
+    """
+
+    def __init__(self, film_dim: int, channels: Sequence[int], strides: Sequence[int]) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(
+            nn.Conv2d(3, channels[0], kernel_size=7, padding=3, bias=False),
+            nn.BatchNorm2d(channels[0]),
+            nn.ReLU(inplace=True),
+            nn.MaxPool2d(kernel_size=3, stride=2, padding=1),
+        )
+        inputs = [channels[0], *channels[:-1]]
+        self.blocks = nn.ModuleList(
+            FilmBlock(*dims, film_dim) for dims in zip(inputs, channels, strides, strict=True)
+        )
+
+    def forward(self, images: Tensor, film: Tensor | None) -> Tensor:
+        """From (batch, 3, H, W) to maps (batch, channels, h, w)."""
+        x = self.stem(images)
+        for block in self.blocks:
+            x = block(x, film)
+        return x
+
+
+class FilmBlock(nn.Module):
+    """A basic residual block, with FiLM after its second batch norm and before the sum."""
+
+    def __init__(self, in_channels: int, out_channels: int, stride: int, film_dim: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False)
+        self.norm1 = nn.BatchNorm2d(out_channels)
+        self.conv2 = nn.Conv2d(out_channels, out_channels, 3, padding=1, bias=False)
+        self.norm2 = nn.BatchNorm2d(out_channels)
+        self.film = Film(film_dim, out_channels) if film_dim else None
+        self.shortcut: nn.Module = nn.Identity()
+        if stride != 1 or in_channels != out_channels:
+            self.shortcut = nn.Sequential(
+                nn.Conv2d(in_channels, out_channels, 1, stride, bias=False), nn.BatchNorm2d(out_channels)
+            )
+
+    def forward(self, x: Tensor, film: Tensor | None) -> Tensor:
+        """From (batch, in, h, w) to (batch, out, h / stride, w / stride)."""
+        y = F.relu(self.norm1(self.conv1(x)), inplace=True)
+        y = self.norm2(self.conv2(y))
+        if self.film is not None:
+            y = self.film(y, film)
+        return F.relu(y + self.shortcut(x), inplace=True)
+
+
+class Film(nn.Module):
+    """Feature-wise linear modulation, (1 + gamma) x + beta, with gamma and beta linear in an embedding.
+
+    It begins close to the identity. (After the authors' code; the paper's figure has gamma x + beta.)
+    """
+
+    def __init__(self, embedding_dim: int, channels: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(embedding_dim, 2 * channels)
+        nn.init.normal_(self.project.weight, std=FILM_INITIAL_STD)
+        nn.init.zeros_(self.project.bias)
+
+    def forward(self, x: Tensor, embedding: Tensor) -> Tensor:
+        """From (batch, channels, h, w) and (batch, embedding_dim) to (batch, channels, h, w)."""
+        gamma, beta = self.project(embedding)[:, :, None, None].chunk(2, dim=1)  # (batch, channels, 1, 1)
+        return (1 + gamma) * x + beta
+
+
+class SpatialSoftmax(nn.Module):
+    """Where each channel is active: the mean position under a softmax over the map, -1..1 in x and y."""
+
+    def __init__(self, temperature: float = 1.0) -> None:
+        super().__init__()
+        self.temperature = temperature
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """From (batch, channels, h, w) to (batch, 2 channels): all x (to the right), then all y (down)."""
+        height, width = maps.shape[-2:]
+        weights = rearrange(maps / self.temperature, "b c h w -> b c (h w)").float().softmax(dim=-1)
+        weights = rearrange(weights, "b c (h w) -> b c h w", h=height)
+        x = torch.linspace(-1, 1, width, device=maps.device)
+        y = torch.linspace(-1, 1, height, device=maps.device)
+        return torch.cat([(weights.sum(dim=2) * x).sum(-1), (weights.sum(dim=3) * y).sum(-1)], dim=-1)
+
+
+class DemoEncoder(nn.Module):
+    """From the frames of a demonstration to a unit embedding.
+
+    Args:
+        height: Of the array of frames, px.
+        width: Of the array of frames, px.
+        embedding_dim: Size of the embedding: the language encoder's.
+        channels: Of the convolutions.
+        hidden_dims: Of the fully connected layers.
+    """
+
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        embedding_dim: int,
+        channels: int = 16,
+        hidden_dims: Sequence[int] = (1024, 512, 256),
+    ) -> None:
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(3, channels, 3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.MaxPool2d(2),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.MaxPool2d(2),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.Flatten(),
+        )
+        flat_dim = channels * (height // 4) * (width // 4)
+        self.layers = multilayer_perceptron([flat_dim, *hidden_dims, embedding_dim])
+
+    def forward(self, demonstrations: Tensor) -> Tensor:
+        """From (batch, 3, height, width) in 0..1 to unit vectors (batch, embedding_dim)."""
+        return F.normalize(self.layers(self.convolutions(demonstrations)), dim=-1)
+
+
+def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:
+    """Fully connected layers with ReLU between them; `dims` are the sizes from input to output."""
+    layers: list[nn.Module] = []
+    for in_dim, out_dim in zip(dims[:-1], dims[1:], strict=True):
+        layers += [nn.Linear(in_dim, out_dim), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers[:-1])
+
+
+def frame_array(frames: Tensor, rows: int) -> Tensor:
+    """Lays the frames of demonstrations out in raster order (appendix B).
+
+    Args:
+        frames: (batch, rows * columns, 3, H, W).
+        rows: Number of rows.
+
+    Returns:
+        (batch, 3, rows * H, columns * W).
+    """
+    return rearrange(frames, "b (r c) d h w -> b d (r h) (c w)", r=rows)
+
+
+def random_crop(images: Tensor, padding: int, generator: torch.Generator | None = None) -> Tensor:
+    """Shifts each picture at random by up to `padding` pixels; what comes in at the edges is black.
+
+    Args:
+        images: (batch, ..., H, W). All pictures of a sample are shifted alike.
+        padding: px.
+        generator: Source of the shifts, on the CPU.
+
+    Returns:
+        The same shape.
+    """
+    batch_size, (height, width) = len(images), images.shape[-2:]
+    shifts = torch.randint(0, 2 * padding + 1, (2, batch_size), generator=generator).to(images.device)
+    padded = F.pad(images, [padding] * 4)
+    rows = shifts[0, :, None] + torch.arange(height, device=images.device)  # (batch, H)
+    columns = shifts[1, :, None] + torch.arange(width, device=images.device)  # (batch, W)
+    sample = torch.arange(batch_size, device=images.device)
+    flat = padded.flatten(1, -3) if padded.ndim > 4 else padded  # (batch, channels, H + 2p, W + 2p)
+    # Advanced indices on both sides of a slice put the batch, rows and columns first.
+    cropped = flat[sample[:, None, None], :, rows[:, :, None], columns[:, None, :]]  # (batch, H, W, channels)
+    return rearrange(cropped, "b h w c -> b c h w").reshape(images.shape)

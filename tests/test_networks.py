@@ -1,0 +1,176 @@
+"""Losses against examples by hand; networks by their properties."""
+
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F  # noqa: N812
+
+from lerobot_deltaco.configuration_deltaco import BACKBONES
+from lerobot_deltaco.losses import (
+    contrastive_logits,
+    contrastive_loss,
+    cosine_loss,
+    gaussian_negative_log_likelihood,
+)
+from lerobot_deltaco.networks import (
+    INITIAL_LOG_STD,
+    ConditionedPolicy,
+    DemoEncoder,
+    Film,
+    FilmBlock,
+    SpatialSoftmax,
+    frame_array,
+    random_crop,
+)
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
+# Losses
+
+
+def test_the_likelihood_is_that_of_torchs_normal_distribution():
+    mean, target = torch.randn(5, 3), torch.randn(5, 3)
+    log_std = torch.tensor([-1.0, -0.3, -4.0])
+    expected = -torch.distributions.Normal(mean, log_std.exp()).log_prob(target).sum(dim=-1)
+    torch.testing.assert_close(gaussian_negative_log_likelihood(mean, log_std, target), expected)
+
+
+def test_the_contrastive_loss_of_repeated_tasks_by_hand():
+    # Two tasks, three samples; the first two share a task.
+    demo = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    language = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    logits = contrastive_logits(demo, language, temperature=0.5)
+    torch.testing.assert_close(logits, torch.tensor([[2.0, 0.0], [0.0, 2.0], [0.0, 2.0]]))
+    right, wrong = math.log(1 + math.exp(-2)), math.log(1 + math.exp(2))
+    loss = contrastive_loss(logits, torch.tensor([0, 0, 1]))
+    torch.testing.assert_close(loss, torch.tensor([right, wrong, right]))
+
+
+def test_the_contrastive_loss_of_one_sample_per_task_is_the_papers_square_one():
+    demo, language = (F.normalize(torch.randn(6, 8), dim=-1) for _ in range(2))
+    loss = contrastive_loss(contrastive_logits(demo, language, 0.1), torch.arange(6))
+    expected = -torch.diag((demo @ language.T / 0.1).log_softmax(dim=1))
+    torch.testing.assert_close(loss, expected)
+
+
+def test_the_cosine_loss_by_hand():
+    demo = torch.tensor([[1.0, 0.0], [0.6, 0.8], [0.0, -1.0]])
+    language = torch.tensor([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    torch.testing.assert_close(cosine_loss(demo, language), torch.tensor([0.0, 0.4, 2.0]))
+
+
+# Networks
+
+
+def test_film_begins_close_to_the_identity_and_then_modulates():
+    film, x = Film(32, 8), torch.randn(4, 8, 5, 5)
+    embedding = F.normalize(torch.randn(4, 32), dim=-1)
+    torch.testing.assert_close(film(x, embedding), x, atol=0.02, rtol=0)
+    with torch.no_grad():
+        film.project.weight.zero_()
+        film.project.bias.copy_(torch.cat([torch.full((8,), 2.0), torch.full((8,), 0.5)]))
+    torch.testing.assert_close(film(x, embedding), 3 * x + 0.5)
+
+
+def test_film_comes_after_the_second_norm_and_before_the_sum():
+    block, x = FilmBlock(4, 4, stride=1, film_dim=3).eval(), torch.randn(2, 4, 6, 6)
+    with torch.no_grad():
+        # gamma = -1 and beta = 0 silence the branch: only the shortcut is left.
+        block.film.project.weight.zero_()
+        block.film.project.bias.copy_(torch.cat([torch.full((4,), -1.0), torch.zeros(4)]))
+        torch.testing.assert_close(block(x, torch.randn(2, 3)), x.relu())
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "x", "y"), [(0, 0, -1, -1), (0, 6, 1, -1), (4, 3, 0, 1), (2, 3, 0, 0)]
+)
+def test_the_spatial_softmax_finds_the_only_active_place(row, column, x, y):
+    maps = torch.full((1, 2, 5, 7), -100.0)
+    maps[0, 0, row, column] = maps[0, 1, 2, 3] = 100.0
+    torch.testing.assert_close(SpatialSoftmax()(maps), torch.tensor([[x, 0.0, y, 0.0]]).float())
+
+
+def test_the_spatial_softmax_of_an_even_map_is_its_middle():
+    torch.testing.assert_close(SpatialSoftmax()(torch.ones(1, 1, 8, 6)), torch.zeros(1, 2), atol=1e-6, rtol=0)
+
+
+def test_the_papers_networks_have_the_papers_shapes():
+    policy = ConditionedPolicy(n_cameras=1, film_dim=384, concat_dim=394, motion_dim=3, has_gripper=True)
+    maps = policy.backbone(torch.rand(2, 3, 48, 48), torch.randn(2, 384))
+    assert maps.shape == (2, 128, 24, 24)
+    assert [layer.out_features for layer in policy.motion if isinstance(layer, torch.nn.Linear)] == [
+        1024,
+        512,
+        256,
+        3,
+    ]
+    assert policy.motion[0].in_features == 256 + 394
+    mean, gripper = policy(torch.rand(2, 1, 3, 48, 48), torch.randn(2, 384), torch.randn(2, 394))
+    assert mean.shape == (2, 3)
+    assert gripper.shape == (2,)
+    assert ((gripper > 0) & (gripper < 1)).all()
+    encoder = DemoEncoder(48, 96, 384)
+    assert encoder.layers[0].in_features == 4608
+    embedding = encoder(torch.rand(5, 3, 48, 96))
+    torch.testing.assert_close(embedding.norm(dim=-1), torch.ones(5))
+
+
+def test_the_log_standard_deviation_stays_within_its_limits():
+    policy = ConditionedPolicy(1, 0, 0, 3, False)
+    torch.testing.assert_close(policy.log_std, torch.full((3,), INITIAL_LOG_STD))
+    with torch.no_grad():
+        policy.raw_log_std.copy_(torch.tensor([-50.0, 0.0, 50.0]))
+    torch.testing.assert_close(policy.log_std, torch.tensor([-6.0, -3.0, 0.0]))
+
+
+def test_cameras_are_seen_apart():
+    policy = ConditionedPolicy(2, 4, 0, 3, False, channels=(8,) * 8).eval()
+    images, film = torch.rand(3, 2, 3, 24, 24), torch.randn(3, 4)
+    assert not torch.allclose(policy(images, film, None)[0], policy(images.flip(1), film, None)[0])
+
+
+def test_the_strided_backbone_has_the_same_weights_but_for_shortcuts():
+    strides = BACKBONES["strided"]
+    paper, strided = (ConditionedPolicy(1, 8, 8, 3, True, strides=s) for s in ((1,) * 8, strides))
+    assert {n: p.shape for n, p in paper.named_parameters()} == {
+        n: p.shape for n, p in strided.named_parameters()
+    }
+    assert strided.backbone(torch.rand(1, 3, 48, 48), torch.rand(1, 8)).shape == (1, 128, 6, 6)
+
+
+# Pictures
+
+
+def test_frames_are_laid_out_in_raster_order():
+    frames = torch.arange(4.0)[None, :, None, None, None].expand(1, 4, 3, 2, 2)
+    array = frame_array(frames, rows=2)
+    assert array.shape == (1, 3, 4, 4)
+    assert array[0, 0, ::2, ::2].tolist() == [[0, 1], [2, 3]]
+    assert frame_array(frames[:, :2], rows=1)[0, 0, 0].tolist() == [0, 0, 1, 1]
+
+
+def test_crops_are_shifts_by_at_most_the_padding():
+    images = torch.rand(64, 3, 9, 9)
+    cropped = random_crop(images, 4, torch.Generator().manual_seed(0))
+    padded = F.pad(images, [4] * 4)
+    found = []
+    for image, big in zip(cropped, padded, strict=True):
+        shifts = [
+            (i, j) for i in range(9) for j in range(9) if torch.equal(image, big[:, i : i + 9, j : j + 9])
+        ]
+        assert len(shifts) == 1
+        found += shifts
+    assert {i for i, _ in found} == {j for _, j in found} == set(range(9))
+
+
+def test_all_pictures_of_a_sample_are_shifted_alike_and_by_the_generator_alone():
+    images = torch.rand(4, 1, 3, 8, 8).expand(4, 2, 3, 8, 8)
+    first = random_crop(images, 3, torch.Generator().manual_seed(1))
+    torch.testing.assert_close(first[:, 0], first[:, 1])
+    torch.testing.assert_close(first, random_crop(images, 3, torch.Generator().manual_seed(1)))
+    assert not torch.equal(first, random_crop(images, 3, torch.Generator().manual_seed(2)))

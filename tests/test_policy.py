@@ -1,0 +1,422 @@
+"""The policy on a small dataset unlike the benchmark's: two cameras, a gripper in the middle."""
+
+import copy
+import hashlib
+import threading
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import NormalizationMode
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+from torch.utils.data import default_collate
+
+from lerobot_deltaco import language
+from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.training_episodes import training_episodes
+
+TASKS = ["stack the cups", "pour the tea", "wave"]
+EPISODES_PER_TASK = {"stack the cups": 3, "pour the tea": 2, "wave": 1}
+LENGTH = 5
+ACTION_NAMES = ["left.pos", "left_gripper.pos", "right.pos"]
+
+
+def fake_encoder(name):
+    """Unit vectors that depend on nothing but the sentence."""
+    dim = language.LANGUAGE_ENCODERS[name].embedding_dim
+
+    def encode(sentences):
+        fake_encoder.calls.append(list(sentences))
+        seeds = [int.from_bytes(hashlib.sha256(text.encode()).digest()[:4]) for text in sentences]
+        vectors = np.stack([np.random.default_rng(seed).normal(size=dim) for seed in seeds])
+        return torch.nn.functional.normalize(torch.tensor(vectors, dtype=torch.float32), dim=-1)
+
+    return encode
+
+
+@pytest.fixture(autouse=True)
+def _language(monkeypatch):
+    fake_encoder.calls = []
+    monkeypatch.setattr(language, "load_language_encoder", fake_encoder)
+    torch.manual_seed(0)
+
+
+def write_dataset(root, episodes):
+    """A dataset with an episode for each task named; frames of an episode share its number as a shade."""
+    features = {
+        "observation.images.top": {
+            "dtype": "image",
+            "shape": (20, 28, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "observation.images.wrist": {
+            "dtype": "image",
+            "shape": (24, 24, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "observation.state": {"dtype": "float32", "shape": (2,), "names": ["a", "b"]},
+        "action": {"dtype": "float32", "shape": (3,), "names": ACTION_NAMES},
+    }
+    dataset = LeRobotDataset.create("test/foreign", 10, features, root=root, use_videos=False)
+    rng = np.random.default_rng(0)
+    for number, task in enumerate(episodes):
+        for step in range(LENGTH):
+            dataset.add_frame(
+                {
+                    "observation.images.top": np.full((20, 28, 3), 10 * number + step, np.uint8),
+                    "observation.images.wrist": rng.integers(0, 255, (24, 24, 3), dtype=np.uint8),
+                    "observation.state": rng.normal(size=2).astype(np.float32),
+                    "action": np.array([rng.uniform(-5, 5), step % 2, rng.uniform(100, 200)], np.float32),
+                    "task": task,
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDataset("test/foreign", root=root)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    episodes = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
+    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
+
+
+@pytest.fixture
+def make(dataset):
+    """Makes a small policy and its processors as LeRobot's training does."""
+
+    def make(**options):
+        config = make_policy_config(
+            "deltaco", **{"device": "cpu", "image_size": 16, "backbone": "strided", **options}
+        )
+        policy = make_policy(config, ds_meta=dataset.meta)
+        before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+        return policy.train(), before, after
+
+    return make
+
+
+def batch_of(dataset, indices):
+    return default_collate([dataset[index] for index in indices])
+
+
+# Configuration
+
+
+def test_the_defaults_are_the_papers():
+    config = DeltacoConfig(device="cpu")
+    assert config.conditioning == ("demo", "language", "contrastive")
+    assert (config.language_encoder, config.embedding_dim) == ("paraphrase-MiniLM-L3-v2", 384)
+    assert (config.demo_encoder, config.demo_rows, config.demo_columns) == ("cnn", 1, 2)
+    assert (config.image_size, config.crop_padding, config.backbone) == (48, 4, "paper")
+    assert (config.gripper_weight, config.encoder_loss_weight, config.temperature) == (30, 10, 0.1)
+    optimizer = config.get_optimizer_preset()
+    assert (optimizer.type, optimizer.lr, optimizer.weight_decay, optimizer.grad_clip_norm) == (
+        "adam",
+        3e-4,
+        0,
+        0,
+    )
+    assert config.get_scheduler_preset() is None
+    assert config.normalization_mapping == {
+        "VISUAL": NormalizationMode.IDENTITY,
+        "STATE": NormalizationMode.MEAN_STD,
+        "ACTION": NormalizationMode.MIN_MAX,
+    }
+    assert (config.push_to_hub, config.dtype) == (False, "float32")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "best"}, "`method` must be one of deltaco, language_only"),
+        ({"film": "demonstration"}, "`film` must be one of none, demo"),
+        ({"encoder_loss": "triplet"}, "`encoder_loss` must be one of contrastive"),
+        ({"language_encoder": "clip"}, "`language_encoder` must be one of paraphrase-MiniLM-L3-v2"),
+        ({"backbone": "vit"}, "`backbone` must be one of paper, strided"),
+        ({"dtype": "int8"}, "`dtype` must be one of float32, bfloat16"),
+        ({"demo_columns": 1}, "at least 2. Got 1"),
+        ({"temperature": 0.0}, "`temperature` must be greater than 0"),
+        ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
+        ({"film": "none", "concat": "none"}, "would not know its task"),
+        ({"method": "language_only", "encoder_loss": "contrastive"}, "no demonstration is used"),
+        ({"method": "mcil", "film": "demo"}, "`film` cannot be changed"),
+    ],
+)
+def test_impossible_configurations_say_what_is_valid(options, message):
+    with pytest.raises(ValueError, match=message):
+        DeltacoConfig(device="cpu", **options)
+
+
+@pytest.mark.parametrize(
+    ("gripper", "index"), [("auto", 1), ("2", 2), ("none", None)], ids=["by name", "by index", "none"]
+)
+def test_the_gripper_is_found_or_given(make, gripper, index):
+    assert make(gripper=gripper)[0].config.gripper_index == index
+
+
+def test_a_gripper_that_is_not_there_is_refused(make):
+    with pytest.raises(ValueError, match="only the dimensions 0 to 2"):
+        make(gripper="3")
+
+
+# Training
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"method": method} for method in METHODS),
+        {"film": "demo+language", "concat": "none"},
+        {"film": "none", "concat": "demo+language"},
+        {"film": "language", "concat": "demo"},
+        {"encoder_loss": "cosine"},
+        {"encoder_loss": "none"},
+        {"demo_rows": 2},
+        {"gripper": "none"},
+        {"language_encoder": "all-distilroberta-v1"},
+    ],
+    ids=str,
+)
+def test_every_method_trains_and_acts_and_leaves_the_batch_alone(make, dataset, options):
+    policy, before, _ = make(**options)
+    batch = before(batch_of(dataset, [0, 7, 12, 20, 29]))
+    kept = copy.deepcopy(batch)
+    loss, logged = policy(batch)
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert {"motion_nll", "motion_mse"} <= set(logged)
+    assert ("gripper_accuracy" in logged) == (policy.config.gripper_index is not None)
+    assert ("demo_accuracy" in logged) == (policy.config.conditioning.encoder_loss != "none")
+    without = [name for name, parameter in policy.named_parameters() if parameter.grad is None]
+    assert without == []
+    policy.eval()
+    assert policy.select_action(batch).shape == (5, 3)
+    for key, value in kept.items():
+        assert torch.equal(batch[key], value) if isinstance(value, torch.Tensor) else batch[key] == value
+
+
+def test_the_loss_is_the_papers_sum(make, dataset):
+    policy, before, _ = make()
+    loss, logged = policy(before(batch_of(dataset, [0, 7, 20])))
+    expected = logged["motion_nll"] + 30 * logged["gripper_mse"] + 10 * logged["encoder_loss"]
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_one_batch_can_be_learned_by_heart(make, dataset):
+    policy, before, _ = make(crop_padding=0)
+    batch = before(batch_of(dataset, [1, 6, 11, 16, 21, 26]))
+    optimizer = torch.optim.Adam(policy.get_optim_params(), lr=1e-3)
+    first = policy(batch)[1]
+    for _ in range(150):
+        loss, logged = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert logged["motion_mse"] < 0.1 * first["motion_mse"]
+    assert logged["gripper_accuracy"] == 1
+
+
+def test_a_demonstration_is_another_episode_of_the_task(make, dataset):
+    policy, before, _ = make()
+    policy(before(batch_of(dataset, [0])))
+    shown, generator = policy.trained_on, torch.Generator().manual_seed(0)
+    drawn = {}
+    for episode in range(6):
+        rows = shown.others(torch.full((200,), episode), generator)
+        drawn[episode] = set(shown.episodes[rows].tolist())
+    # Episodes 0 to 2 stack, 3 and 4 pour; the only one that waves demonstrates itself.
+    assert drawn == {0: {1, 2}, 1: {0, 2}, 2: {0, 1}, 3: {4}, 4: {3}, 5: {5}}
+
+
+def test_demonstrations_are_the_first_and_the_last_frame(make, dataset):
+    policy, before, _ = make()
+    policy(before(batch_of(dataset, [0])))
+    pictures = policy.trained_on.pictures(torch.arange(6), 2, torch.Generator())
+    shades = (pictures[:, :, 0, 0, 0] * 255).round().int().tolist()
+    assert shades == [[10 * episode, 10 * episode + LENGTH - 1] for episode in range(6)]
+
+
+def test_draws_are_a_function_of_the_seed_and_the_step(make, dataset):
+    policy, before, _ = make(method="demo_only")
+    batch = before(batch_of(dataset, list(range(15))))
+    twin = copy.deepcopy(policy)
+    losses = [policy(batch)[0].item() for _ in range(3)]
+    torch.manual_seed(99)
+    twin.load_state_dict(twin.state_dict())
+    assert [twin(batch)[0].item() for _ in range(3)] == losses
+    assert len(set(losses)) == 3
+    assert int(policy.step) == 3
+
+
+def test_evaluation_losses_do_not_advance_the_draws(make, dataset):
+    policy, before, _ = make()
+    batch = before(batch_of(dataset, [0, 7]))
+    policy(batch)
+    policy.eval()
+    assert policy(batch)[0].item() == policy(batch)[0].item()
+    assert int(policy.step) == 1
+
+
+def test_only_the_episodes_that_are_trained_on_demonstrate(dataset, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["lerobot-train"])
+    assert training_episodes(dataset.meta) == [0, 1, 2, 3, 4, 5]
+    monkeypatch.setattr(
+        "sys.argv", ["lerobot-train", "--dataset.episodes=[0,1,2,3]", "--dataset.eval_split=0.3"]
+    )
+    assert training_episodes(dataset.meta) == [0, 1]
+
+
+def test_instructions_are_embedded_once(make, dataset):
+    policy, before, _ = make()
+    for _ in range(2):
+        policy(before(batch_of(dataset, [0, 3, 7, 20])))
+    assert fake_encoder.calls == [["stack the cups", "pour the tea"]]
+    assert not any("instruction" in name for name, _ in policy.named_parameters())
+
+
+def test_bfloat16_trains(make, dataset):
+    policy, before, _ = make(dtype="bfloat16")
+    batch = before(batch_of(dataset, [0, 7]))
+    with torch.autocast("cpu", torch.bfloat16):
+        policy(batch)[0].backward()
+    assert policy.eval().select_action(batch).dtype == torch.float32
+
+
+# Evaluation
+
+
+@pytest.fixture
+def shown(tmp_path):
+    """One demonstration of each task, and of one that is not trained on."""
+    return write_dataset(tmp_path / "shown", [*TASKS, "juggle"])
+
+
+def observation(dataset, tasks):
+    batch = batch_of(dataset, [0] * len(tasks))
+    kept = {key: value for key, value in batch.items() if key.startswith("observation.")}
+    return {**kept, "task": list(tasks)}
+
+
+def test_a_novel_task_is_served_by_its_demonstration(make, dataset, shown):
+    policy, before, after = make(demo_repo_id="test/foreign", demo_root=str(shown.root))
+    policy.eval()
+    action = after(policy.select_action(before(observation(dataset, ["juggle", "wave"]))))
+    assert action.shape == (2, 3)
+    low, high = (torch.as_tensor(dataset.meta.stats["action"][name]) for name in ("min", "max"))
+    assert (action[:, 1] >= low[1]).all()
+    assert (action[:, 1] <= high[1]).all()
+
+
+def test_a_task_without_a_demonstration_is_named(make, dataset, shown):
+    policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(shown.root))
+    policy.eval()
+    with pytest.raises(ValueError, match="no demonstration of the task 'sing'.*4 tasks.*demo_episode"):
+        policy.select_action(before(observation(dataset, ["sing"])))
+
+
+def test_a_named_episode_serves_any_words(make, dataset, shown):
+    options = {"demo_repo_id": "test/foreign", "demo_root": str(shown.root), "method": "demo_only"}
+    policy, before, _ = make(**options)
+    policy.eval()
+    expected = policy.select_action(before(observation(dataset, ["juggle"])))
+    policy.config.demo_episode = 3
+    policy.reset()
+    torch.testing.assert_close(policy.select_action(before(observation(dataset, ["keep them up"]))), expected)
+
+
+def test_both_encoders_run_once_an_episode(make, dataset, monkeypatch):
+    policy, before, _ = make()
+    batch = before(batch_of(dataset, [0, 20]))
+    policy(batch)
+    policy.eval()
+    calls = []
+    forward = policy.demo_encoder.forward
+    monkeypatch.setattr(policy.demo_encoder, "forward", lambda x: calls.append(1) or forward(x))
+    for n_episodes in (1, 2):
+        policy.reset()
+        for _ in range(4):
+            policy.select_action(batch)
+        assert len(calls) == n_episodes
+
+
+def test_threads_do_not_mix_their_tasks_up(make, dataset):
+    policy, before, _ = make()
+    policy(before(batch_of(dataset, [0])))
+    policy.eval()
+    expected, observed = {}, {}
+    for task in TASKS[:2]:
+        policy.reset()
+        expected[task] = policy.select_action(before(observation(dataset, [task])))
+    barrier = threading.Barrier(2)
+
+    def act(task):
+        policy.reset()
+        for _ in range(5):
+            barrier.wait()
+            observed.setdefault(task, []).append(policy.select_action(before(observation(dataset, [task]))))
+
+    threads = [threading.Thread(target=act, args=(task,)) for task in TASKS[:2]]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert set(observed) == set(expected)
+    # The tasks' demonstrations take turns; the one of the first episode is among them.
+    for actions in observed.values():
+        assert all(torch.equal(action, actions[0]) for action in actions)
+    assert not torch.equal(observed[TASKS[0]][0], observed[TASKS[1]][0])
+
+
+def test_mcils_trials_use_language_and_demonstration_in_turn(make, dataset):
+    policy, before, _ = make(method="mcil")
+    policy(before(batch_of(dataset, [20])))
+    policy.eval()
+    actions = policy.select_action(before(observation(dataset, ["pour the tea"] * 4)))
+    assert not torch.allclose(actions[0], actions[1], atol=1e-6)
+    torch.testing.assert_close(actions[0], actions[2])
+
+
+# Checkpoints
+
+
+def test_a_checkpoint_is_complete_and_equal_to_the_bit(make, dataset, shown, tmp_path):
+    policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(shown.root))
+    policy(before(batch_of(dataset, [0, 7])))
+    policy.eval()
+    batch = before(observation(dataset, ["juggle", "wave"]))
+    expected = policy.select_action(batch)
+    policy.save_pretrained(tmp_path / "policy")
+    assert {path.suffix for path in (tmp_path / "policy").iterdir()} == {".json", ".safetensors"}
+    assert str(shown.root) not in (tmp_path / "policy" / "config.json").read_text()
+
+    fake_encoder.calls = []
+    loaded = DeltacoPolicy.from_pretrained(tmp_path / "policy")
+    assert torch.equal(loaded.select_action(batch), expected)
+    assert fake_encoder.calls == []
+    assert int(loaded.step) == 1
+    for (name, value), (other, twin) in zip(
+        policy.state_dict().items(), loaded.state_dict().items(), strict=True
+    ):
+        assert name == other
+        assert torch.equal(value, twin)
+
+
+def test_another_language_encoder_is_refused_at_evaluation(make, tmp_path):
+    policy, _, _ = make()
+    policy.save_pretrained(tmp_path)
+    config = copy.deepcopy(policy.config)
+    config.language_encoder = "all-MiniLM-L6-v2"
+    with pytest.raises(ValueError, match="made with the language encoder paraphrase-MiniLM-L3-v2"):
+        DeltacoPolicy.from_pretrained(tmp_path, config=config)
+
+
+def test_a_one_hot_policy_remembers_its_vocabulary(make, dataset, tmp_path):
+    policy, before, _ = make(method="one_hot")
+    policy.save_pretrained(tmp_path)
+    loaded = DeltacoPolicy.from_pretrained(tmp_path)
+    assert loaded.config.one_hot_tasks == sorted(TASKS, key=TASKS.index)
+    with pytest.raises(ValueError, match="'juggle' is not among the 3"):
+        loaded.select_action(before(observation(dataset, ["juggle"])))
