@@ -19,8 +19,9 @@ help: ## List the targets
 
 install: $(INSTALLED) ## Only set up the environment, in .venv
 
-demo: $(INSTALLED) ## Run the scripted expert, and show its episodes in outputs/demo
-	$(BIN)/python -m gym_deltaco.gallery --out outputs/demo
+demo: $(INSTALLED) ## Collect a few episodes of the scripted expert, and show them in outputs/demo
+	$(BIN)/deltaco-collect --tasks 4,64,231 --episodes-per-task 4 --root outputs/demo/dataset
+	$(BIN)/deltaco-gallery --out outputs/demo
 
 test: $(INSTALLED) ## Run the default tests: a few minutes, no network, no GPU
 	$(BIN)/python -m pytest $(ARGS)
