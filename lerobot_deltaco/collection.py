@@ -14,9 +14,10 @@ import multiprocessing
 import os
 import shutil
 import signal
+import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 from tqdm import tqdm
 
 from gym_deltaco import ENV_ID
@@ -38,6 +40,7 @@ from lerobot_deltaco.collection_plan import (
     EPISODES_PER_FILE,
     FPS,
     ROBOT_TYPE,
+    CollectionError,
     CollectionPlan,
     collect_episode,
     first_numbers,
@@ -46,7 +49,11 @@ from lerobot_deltaco.collection_plan import (
 from lerobot_deltaco.dataset_statistics import Statistics, merged_statistics
 
 STAGING = ".collecting"
+# The same folder once all is done; it is renamed before it is removed, so that it never counts half-removed.
+FINISHED_STAGING = ".collecting.finished"
 JOINED = "joined"
+# Each worker holds it as long as it lives.
+WORKERS_LOCK = "workers"
 HISTORY_FILE = Path("meta/deltaco.json")
 # LeRobot reads this as a version number, and names it in the error: that is what a user then reads.
 UNFINISHED = "this dataset is unfinished; run its `deltaco-collect` command again to go on"
@@ -54,10 +61,6 @@ UNFINISHED = "this dataset is unfinished; run its `deltaco-collect` command agai
 _KNOWN = b"deltaco"
 # So that none waits for the main process to hear of its last one.
 _JOBS_PER_WORKER = 3
-
-
-class CollectionError(RuntimeError):
-    """The collection cannot begin or go on; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,7 @@ class _Job:
     base_episodes: int
     base_frames: int
     base_files: int
+    episodes_per_file: int
 
     @property
     def staging(self) -> Path:
@@ -129,12 +133,12 @@ class _Job:
 
     def part(self, part: int) -> range:
         """The episodes of a data file."""
-        first = part * EPISODES_PER_FILE
-        return range(first, min(first + EPISODES_PER_FILE, self.plan.n_episodes))
+        first = part * self.episodes_per_file
+        return range(first, min(first + self.episodes_per_file, self.plan.n_episodes))
 
     @property
     def n_parts(self) -> int:
-        return -(-self.plan.n_episodes // EPISODES_PER_FILE)
+        return -(-self.plan.n_episodes // self.episodes_per_file)
 
     def task_and_number(self, index: int) -> tuple[int, int]:
         """Task of an episode, and its number among those of the task."""
@@ -163,10 +167,18 @@ def collect(root: Path, plan: CollectionPlan, n_workers: int = 1, append: bool =
     root.mkdir(parents=True, exist_ok=True)
     base = _read_base(root)
     staging = root / STAGING
-    if base is not None and not append and not staging.exists() and base.plans == [plan]:
-        return _summary(root, episodes_per_s=None)
+    if base is not None:
+        shutil.rmtree(root / FINISHED_STAGING, ignore_errors=True)
+        if not append and base.plans == [plan] and not (staging / "plan.json").exists():
+            return _summary(root, episodes_per_s=None)
     _check_may_begin(root, base, plan, append)
     with _locked(staging):
+        # Both again: only now can no other process come between.
+        if _read_base(root) != base:
+            raise CollectionError(
+                f"Another process has just finished collecting into {root}. Look at it first."
+            )
+        _check_may_begin(root, base, plan, append)
         files.write_json(staging / "plan.json", _identity(plan, append))
         seconds = n_collected = 0.0
         if not (staging / "commit.json").exists():
@@ -189,21 +201,39 @@ def _read_base(root: Path) -> _Base | None:
     info_file, history_file = root / files.INFO_FILE, root / HISTORY_FILE
     if not info_file.exists():
         return None
-    info = json.loads(info_file.read_text())
-    if info["codebase_version"] == UNFINISHED:
+    info = _read(info_file)
+    codebase_version = info.get("codebase_version")
+    if codebase_version == UNFINISHED:
         return None
-    if info["codebase_version"] != files.CODEBASE_VERSION or not history_file.exists():
+    if codebase_version != files.CODEBASE_VERSION or not history_file.exists():
         raise CollectionError(
             f"{root} holds a dataset that `deltaco-collect` did not make. Name a new folder."
+        )
+    data_files = sorted((root / "data").glob("*/*.parquet"))
+    n_frames = sum(_read(path).num_rows for path in data_files)
+    if n_frames != info["total_frames"]:
+        raise CollectionError(
+            f"The files in {root / 'data'} have {n_frames} frames instead of {info['total_frames']}: some are "
+            "missing, or too many. Collect the dataset again, in a new folder."
         )
     return _Base(
         tasks=files.read_tasks(root / files.TASKS_FILE),
         n_episodes=info["total_episodes"],
-        n_frames=info["total_frames"],
-        n_files=len(list((root / "data").glob("*/*.parquet"))),
+        n_frames=n_frames,
+        n_files=len(data_files),
         features=info["features"],
-        history=json.loads(history_file.read_text()),
+        history=_read(history_file),
     )
+
+
+def _read(path: Path) -> Any:
+    """Contents of a JSON file, or a Parquet file's own description of them."""
+    try:
+        return pq.read_metadata(path) if path.suffix == ".parquet" else json.loads(path.read_text())
+    except (ValueError, OSError) as error:  # PyArrow's errors are ValueErrors
+        raise CollectionError(
+            f"The file {path} is damaged or missing ({error}). Collect the dataset again, in a new folder."
+        ) from None
 
 
 def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, append: bool) -> None:
@@ -214,7 +244,7 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
     """
     plan_file = root / STAGING / "plan.json"
     if plan_file.exists():
-        begun, wanted = json.loads(plan_file.read_text()), _identity(plan, append)
+        begun, wanted = _read(plan_file), _identity(plan, append)
         differences = [
             f"{name}: {begun.get(name)} there, {wanted[name]} now"
             for name in wanted
@@ -246,7 +276,13 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
 
 def _identity(plan: CollectionPlan, append: bool) -> dict[str, Any]:
     """What has to be the same for a collection to be continued."""
-    return {**asdict(plan), "append": append, "benchmark": ENV_ID, "renderer": renderer()}
+    return {
+        **asdict(plan),
+        "append": append,
+        "benchmark": ENV_ID,
+        "renderer": renderer(),
+        "episodes_per_file": EPISODES_PER_FILE,
+    }
 
 
 def _mark_unfinished(root: Path, plan: CollectionPlan) -> None:
@@ -258,13 +294,16 @@ def _mark_unfinished(root: Path, plan: CollectionPlan) -> None:
 def _locked(staging: Path) -> Iterator[None]:
     """Keeps a second collection out; the lock ends with the process, however it ends."""
     staging.mkdir(exist_ok=True)
-    with (staging / "lock").open("w") as lock:
+    with (staging / "lock").open("w") as lock, (staging / WORKERS_LOCK).open("w") as workers_lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise CollectionError(
                 f"Another process is collecting into {staging.parent}. Wait for it, or end it."
             ) from None
+        # If a former main process was killed, its workers end by themselves, but may need a moment.
+        fcntl.flock(workers_lock, fcntl.LOCK_EX)
+        fcntl.flock(workers_lock, fcntl.LOCK_UN)
         yield
 
 
@@ -282,6 +321,7 @@ def _make_job(root: Path, plan: CollectionPlan, base: _Base | None) -> _Job:
         base_episodes=base.n_episodes,
         base_frames=base.n_frames,
         base_files=base.n_files,
+        episodes_per_file=EPISODES_PER_FILE,
     )
 
 
@@ -298,13 +338,14 @@ def _run(job: _Job, n_workers: int) -> int:
     )
     with progress, _executor(job, n_workers) as executor:
         waiting = ((part, index) for part in parts for index in sorted(missing[part]))
-        running: dict[Future, tuple[int, int | None]] = {
-            executor.submit(_join, part): (part, None) for part in parts if not missing[part]
-        }
+        running: dict[Future, tuple[int, int | None]] = {}
         try:
+            for part in parts:
+                if not missing[part]:
+                    running[_submit(executor, _join, part)] = (part, None)
             while True:
-                for part, index in islice(waiting, _JOBS_PER_WORKER * n_workers - len(running)):
-                    running[executor.submit(_collect, index)] = (part, index)
+                for part, index in islice(waiting, max(0, _JOBS_PER_WORKER * n_workers - len(running))):
+                    running[_submit(executor, _collect, index)] = (part, index)
                 if not running:
                     return n_missing
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -315,7 +356,7 @@ def _run(job: _Job, n_workers: int) -> int:
                     progress.update()
                     missing[part].remove(index)
                     if not missing[part]:
-                        running[executor.submit(_join, part)] = (part, None)
+                        running[_submit(executor, _join, part)] = (part, None)
         except BrokenProcessPool:
             raise CollectionError(
                 "A worker process ended unexpectedly; the memory may be full. What is finished is kept: run "
@@ -328,6 +369,16 @@ def _run(job: _Job, n_workers: int) -> int:
 def _executor(job: _Job, n_workers: int) -> Executor:
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(n_workers, mp_context=context, initializer=_start_worker, initargs=(job,))
+
+
+def _submit(executor: Executor, function: Callable[[int], None], number: int) -> Future:
+    # This may start a process. An interrupt is for the main process, which lets the episodes end that are
+    # under way; a process keeps what was blocked when it was started.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return executor.submit(function, number)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 @dataclass
@@ -344,10 +395,26 @@ _worker: _Worker | None = None
 
 def _start_worker(job: _Job) -> None:
     global _worker
-    # An interrupt is for the main process, which lets the episodes end that are under way.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with_main_process(job.staging / WORKERS_LOCK)
     env = PickPlaceEnv(ambiguity=job.plan.ambiguity, image_size=job.plan.image_size)
     _worker = _Worker(job, env, files.data_schema(job.plan.features))
+
+
+def _end_with_main_process(lock_file: Path) -> None:
+    """Lets this process end when the main one is killed, and the next run wait for that.
+
+    Else it would wait for work forever, or interfere with what the next run does.
+    """
+    main = multiprocessing.parent_process()
+    assert main is not None
+    lock = os.open(lock_file, os.O_RDWR)  # closed when the process ends
+    fcntl.flock(lock, fcntl.LOCK_SH)
+
+    def watch() -> None:
+        main.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _collect(index: int) -> None:
@@ -415,7 +482,7 @@ def _read_episode(path: Path) -> pa.Table:
     try:
         with pa.ipc.open_file(path) as reader:
             return reader.read_all()
-    except (pa.ArrowInvalid, OSError) as error:
+    except (pa.ArrowException, OSError) as error:
         raise CollectionError(
             f"The file {path} is damaged ({error}). Delete it and run the command again: its episode is then "
             "collected anew."
@@ -431,10 +498,10 @@ def _merged(parts: Sequence[dict[str, Statistics]]) -> dict[str, Statistics]:
 
 def _prepare_commit(job: _Job, base: _Base | None) -> None:
     """Writes down the dataset's metadata as they shall be."""
-    known = [json.loads(job.part_file(part).read_text()) for part in range(job.n_parts)]
+    known = [_read(job.part_file(part)) for part in range(job.n_parts)]
     statistics = [files.statistics_from_json(item["statistics"]) for item in known]
     if base is not None:
-        before = json.loads((job.root / files.STATS_FILE).read_text())
+        before = _read(job.root / files.STATS_FILE)
         statistics.insert(0, files.statistics_from_json(before))
     attempts: Counter[str] = Counter()
     for item in known:
@@ -460,7 +527,7 @@ def _prepare_commit(job: _Job, base: _Base | None) -> None:
 def _commit(root: Path) -> None:
     """Makes the dataset what was written down. Interrupted, it is simply done again."""
     staging = root / STAGING
-    contents = json.loads((staging / "commit.json").read_text())
+    contents = _read(staging / "commit.json")
     info = contents["info"]
     files.write_json(root / files.INFO_FILE, {**info, "codebase_version": UNFINISHED})
     for path in sorted((staging / JOINED).rglob("*.parquet")):
@@ -471,7 +538,8 @@ def _commit(root: Path) -> None:
     files.write_json(root / files.STATS_FILE, contents["stats"])
     files.write_json(root / HISTORY_FILE, contents["history"])
     files.write_json(root / files.INFO_FILE, info)
-    shutil.rmtree(staging)
+    os.replace(staging, root / FINISHED_STAGING)
+    shutil.rmtree(root / FINISHED_STAGING)
 
 
 def _summary(root: Path, episodes_per_s: float | None) -> Summary:
@@ -484,7 +552,8 @@ def _summary(root: Path, episodes_per_s: float | None) -> Summary:
         kind = TASKS[int(task_id)].kind
         attempts[kind] += n_attempts
         successes[kind] += per_task
-    size = sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
+    files_of_it = (path for folder in ("data", "meta") for path in (root / folder).rglob("*"))
+    size = sum(path.stat().st_size for path in files_of_it if path.is_file())
     return Summary(
         episodes=info["total_episodes"],
         new_episodes=successes.total(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -35,6 +36,10 @@ DATA_SETS: dict[str, tuple[tuple[int, ...], Split]] = {
     "E54": (SCENARIOS["b"].test_tasks, "validation"),
     "E102": (SCENARIOS["a"].test_tasks, "validation"),
 }
+
+
+class CollectionError(RuntimeError):
+    """The collection cannot begin or go on; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,8 @@ class CollectionPlan:
         ):
             if not getattr(self, name) >= minimum:
                 raise ValueError(f"`{name}` must be at least {minimum}. Got {getattr(self, name)}.")
+        if not math.isfinite(self.noise):
+            raise ValueError(f"`noise` must be finite. Got {self.noise}.")
         if self.ambiguity not in AMBIGUITIES:
             raise ValueError(f"`ambiguity` must be one of {', '.join(AMBIGUITIES)}. Got {self.ambiguity!r}.")
         if self.split is None:
@@ -152,7 +159,7 @@ def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, numbe
         number: Of the episode among those of its task, from 0.
 
     Raises:
-        RuntimeError: It never succeeded.
+        CollectionError: It never succeeded.
     """
     for attempt in range(MAX_ATTEMPTS):
         seed = episode_seed(plan.seed, plan.split, task_id, number, attempt)
@@ -175,7 +182,7 @@ def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, numbe
             },
         }
         return CollectedEpisode(frames, attempts=attempt + 1)
-    raise RuntimeError(
+    raise CollectionError(
         f"The expert failed {MAX_ATTEMPTS} times in a row at task {task_id}, episode {number}. "
         f"A noise of {plan.noise} may be too much for it."
     )

@@ -229,11 +229,15 @@ def write_json(path: Path, contents: Any) -> None:
 
 
 class new_file:  # noqa: N801  (used like a function)
-    """A temporary name, which becomes the file's when the block ends well: no file is ever half-written."""
+    """A temporary name, which becomes the file's when the block ends well: no file is ever half-written.
+
+    The name is always the same, so that what a killed process leaves is overwritten when the file is written
+    again.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+        self._temporary = path.with_name(f".{path.name}.part")
 
     def __enter__(self) -> Path:
         self._path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,8 @@
 """Statistics of a LeRobotDataset: of an episode from its frames, of many episodes from theirs.
 
-They mean what LeRobot's mean: population standard deviation, pictures in 0..1 and by channel. The quantiles
-of an episode are exact; those of several are, as LeRobot has it, the mean of theirs, weighted by count.
+They mean what LeRobot's mean: population standard deviation, pictures in 0..1 and by channel. A quantile of
+an episode is the smallest of its values which a sufficient share does not exceed (LeRobot estimates it from
+bins); that of several episodes is, as LeRobot has it, the mean of theirs, weighted by count.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def feature_statistics(values: NDArray) -> Statistics:
     if values.ndim == 4:
         return _picture_statistics(values)
     numbers = values.astype(np.float64).reshape(len(values), -1)
-    quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=0)
+    quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=0, method="inverted_cdf")
     return {
         "min": numbers.min(axis=0),
         "max": numbers.max(axis=0),

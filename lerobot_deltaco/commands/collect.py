@@ -32,6 +32,7 @@ def main(arguments: list[str] | None = None) -> None:
         )
     except ValueError as error:
         parser.error(str(error))
+    _check_sharing(parser, options)
     try:
         summary = collect(options.root, plan, options.workers, options.append)
     except (CollectionError, OSError) as error:
@@ -41,6 +42,42 @@ def main(arguments: list[str] | None = None) -> None:
     sys.stdout.write(_text(summary, options.root))
     if options.summary:
         options.summary.write_text(json.dumps(asdict(summary), indent=2) + "\n")
+    _share(parser, options)
+
+
+def _check_sharing(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Ends the command if it could not push what it is about to collect, perhaps for hours."""
+    if options.push_to_hub and options.repo_id is None:
+        parser.error("--push-to-hub needs --repo-id USER/NAME.")
+    if options.repo_id is None:
+        return
+    # Here and below, so that the worker processes, which import this module, start quickly.
+    from lerobot_deltaco.hub import HubError, check_credentials, check_repo_id
+
+    try:
+        check_repo_id(options.repo_id)
+    except HubError as error:
+        parser.error(str(error))
+    try:
+        if options.push_to_hub:
+            check_credentials()
+    except HubError as error:
+        parser.exit(1, f"{parser.prog}: {error}\n")
+
+
+def _share(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Writes the card of the finished dataset, and pushes it if that is wanted."""
+    from lerobot_deltaco.dataset_card import has_current_card, write_card
+    from lerobot_deltaco.hub import HubError, push_dataset
+
+    try:
+        if not has_current_card(options.root):
+            write_card(options.root, repo_id=options.repo_id if options.push_to_hub else None)
+        if options.push_to_hub:
+            sys.stdout.write(f"It is now at {push_dataset(options.root, options.repo_id)}.\n")
+    except (HubError, OSError, KeyboardInterrupt) as error:
+        reason = str(error) or "Interrupted."
+        parser.exit(1, f"{parser.prog}: {reason} The dataset itself is finished; `deltaco-push` shares it.\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -77,6 +114,12 @@ def _parser() -> argparse.ArgumentParser:
         type=int,
         default=os.cpu_count(),
         help="processes; the dataset does not depend on it (%(default)s)",
+    )
+    parser.add_argument("--repo-id", metavar="USER/NAME", help="the dataset's name on the Hugging Face Hub")
+    parser.add_argument(
+        "--push-to-hub",
+        action="store_true",
+        help="then push it there, as deltaco-push does; that needs HF_TOKEN or `hf auth login`",
     )
     parser.add_argument("--append", action="store_true", help="add to a finished dataset")
     parser.add_argument("--summary", type=Path, metavar="FILE", help="also write the summary as JSON")

@@ -1,0 +1,874 @@
+"""A collection is a function of its arguments, whatever happens to it on the way."""
+
+import errno
+import fcntl
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import psutil
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets import LeRobotDataset
+from PIL import Image
+
+from gym_deltaco import EPISODE_STEPS
+from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.expert import NOISE, expert_episode
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.tasks import SCENARIOS, TASKS
+from lerobot_deltaco import collection, collection_plan
+from lerobot_deltaco import dataset_files as files
+from lerobot_deltaco.collection import HISTORY_FILE, STAGING, CollectionError, collect
+from lerobot_deltaco.collection_plan import DATA_SETS, CollectionPlan, collect_episode
+from lerobot_deltaco.commands.collect import main
+
+# Two tasks of different kinds, not in the benchmark's order, in files that end where no task does.
+PLAN = CollectionPlan("90,4", 3)
+EPISODES_PER_FILE = 4
+# Small, for what is done over and over; two files.
+SMALL_PLAN = CollectionPlan("90,4", 2)
+SMALL_FILES = 3
+ARGUMENTS = ["--tasks", "90,4", "--episodes-per-task", "3"]
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = PickPlaceEnv()
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def remembered(env):
+    """`collect_episode`, which simulates each episode only once in this module."""
+    episodes = {}
+
+    def collect_remembered(_, plan, task_id, number):
+        key = plan.seed, plan.split, plan.noise, task_id, number
+        if key not in episodes:
+            episodes[key] = collect_episode(env, plan, task_id, number)
+        return episodes[key]
+
+    return collect_remembered
+
+
+class InProcess(Executor):
+    """Does the workers' jobs at once, in this process."""
+
+    def submit(self, function, /, *arguments):
+        future = Future()
+        try:
+            future.set_result(function(*arguments))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@pytest.fixture
+def in_process(monkeypatch, remembered):
+    """Lets collections run in this process, so that faults can be injected into every part of them.
+
+    Returns:
+        The episodes that were collected: (task, number).
+    """
+    collected = []
+
+    def collect_and_count(env, plan, task_id, number):
+        collected.append((task_id, number))
+        return remembered(env, plan, task_id, number)
+
+    def executor(job, n_workers):
+        worker = collection._Worker(job, None, files.data_schema(job.plan.features))
+        monkeypatch.setattr(collection, "_worker", worker)
+        return InProcess()
+
+    monkeypatch.setattr(collection, "collect_episode", collect_and_count)
+    monkeypatch.setattr(collection, "_executor", executor)
+    monkeypatch.setattr(collection, "EPISODES_PER_FILE", EPISODES_PER_FILE)
+    return collected
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The dataset of `PLAN`, by one worker process."""
+    root = tmp_path_factory.mktemp("finished") / "dataset"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(collection, "EPISODES_PER_FILE", EPISODES_PER_FILE)
+        collect(root, PLAN, n_workers=1)
+    return root
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    return shutil.copytree(finished, tmp_path / "copy")
+
+
+def contents(root):
+    """The bytes of all files of a dataset, hidden ones included; not those that describe it to people."""
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and path.name != "README.md" and "assets" not in path.parts
+    }
+
+
+def read_frames(root):
+    return pd.concat(
+        [pd.read_parquet(path) for path in sorted((root / "data").glob("*/*.parquet"))], ignore_index=True
+    )
+
+
+def picture(cell):
+    import io
+
+    return np.asarray(Image.open(io.BytesIO(cell["bytes"])))
+
+
+def history(root):
+    return json.loads((root / HISTORY_FILE).read_text())
+
+
+# Contents
+
+
+@pytest.mark.parametrize("n_workers", [2, 3])
+def test_the_dataset_does_not_depend_on_the_number_of_workers(finished, tmp_path, monkeypatch, n_workers):
+    monkeypatch.setattr(collection, "EPISODES_PER_FILE", EPISODES_PER_FILE)
+    collect(tmp_path, PLAN, n_workers)
+    assert contents(tmp_path) == contents(finished)
+
+
+def test_the_tests_own_executor_makes_the_same_dataset(finished, tmp_path, in_process):
+    collect(tmp_path, PLAN)
+    assert contents(tmp_path) == contents(finished)
+
+
+def test_another_seed_gives_other_episodes(finished, tmp_path, in_process):
+    collect(tmp_path, replace(PLAN, seed=1))
+    seeds, other_seeds = (set(read_frames(root)["benchmark.seed"]) for root in (finished, tmp_path))
+    assert len(seeds) == len(other_seeds) == PLAN.n_episodes
+    assert not seeds & other_seeds
+
+
+def test_episodes_replayed_from_their_seeds_are_the_same_to_the_bit(finished):
+    env = PickPlaceEnv()
+    for _, episode in read_frames(finished).groupby("episode_index"):
+        first = episode.iloc[0]
+        observation, info = env.reset(
+            seed=int(first["benchmark.seed"]), options={"task_id": first["benchmark.task_id"]}
+        )
+        assert info["objects"][info["target_object"]] == first["benchmark.target_object"]
+        assert info["target_container"] == first["benchmark.target_container"]
+        assert len(episode) == EPISODE_STEPS
+        for _, frame in episode.iterrows():
+            np.testing.assert_array_equal(picture(frame["observation.image"]), observation["pixels"])
+            np.testing.assert_array_equal(frame["observation.state"], observation["agent_pos"])
+            observation, reward, _, _, info = env.step(frame["action"])
+            assert frame["next.reward"] == reward
+            assert frame["next.success"] == info["is_success"]
+        assert info["is_success"]
+    env.close()
+
+
+def test_every_episode_succeeds_and_ends_once(finished):
+    frames = read_frames(finished)
+    last = frames["frame_index"] == EPISODE_STEPS - 1
+    assert frames.loc[last, "next.success"].all()
+    np.testing.assert_array_equal(frames["next.done"], last)
+    np.testing.assert_array_equal(frames["next.reward"], frames["next.success"].astype(float))
+
+
+def test_tasks_come_in_the_order_of_the_selection(finished):
+    frames = read_frames(finished)
+    assert frames["benchmark.task_id"].tolist() == np.repeat([90, 4], 3 * EPISODE_STEPS).tolist()
+    assert frames["task_index"].tolist() == np.repeat([0, 1], 3 * EPISODE_STEPS).tolist()
+    tasks = files.read_tasks(finished / files.TASKS_FILE)
+    assert tasks == [TASKS[90].instruction, TASKS[4].instruction]
+
+
+def test_seeds_are_those_of_the_first_attempts_that_succeed(tmp_path, env, in_process):
+    plan = CollectionPlan("4,32", 3, noise=0.6)
+    summary = collect(tmp_path, plan)
+    seeds, attempts = [], Counter()
+    for task_id in (4, 32):
+        for number in range(3):
+            for attempt in range(100):
+                attempts[str(task_id)] += 1
+                seed = episode_seed(0, "train", task_id, number, attempt)
+                *_, last = expert_episode(env, task_id, seed, noise=0.6)
+                if last.info["is_success"]:
+                    seeds.append(seed)
+                    break
+    assert attempts.total() > plan.n_episodes  # else this would test nothing
+    frames = read_frames(tmp_path)
+    assert frames["benchmark.seed"][::EPISODE_STEPS].tolist() == seeds
+    assert history(tmp_path)[-1]["attempts"] == attempts
+    assert summary.attempts == attempts.total()
+    kinds = {TASKS[int(task_id)].kind: 3 / n for task_id, n in attempts.items()}
+    assert summary.success_rates == kinds
+
+
+def test_an_expert_that_never_succeeds_ends_the_collection(tmp_path, env, monkeypatch, capsys, in_process):
+    monkeypatch.setattr(collection_plan, "MAX_ATTEMPTS", 2)
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--tasks", "4", "--episodes-per-task", "1", "--noise", "1e6", "--root", str(tmp_path)])
+    assert exit_info.value.code == 1
+    assert "failed 2 times in a row at task 4, episode 0" in capsys.readouterr().err
+
+
+# Selections
+
+
+@pytest.mark.parametrize(
+    ("name", "n_tasks", "split"),
+    [
+        ("T198", 198, "train"),
+        ("T48", 48, "train"),
+        ("T54", 54, "train"),
+        ("E48", 48, "validation"),
+        ("E54", 54, "validation"),
+        ("E102", 102, "validation"),
+    ],
+)
+def test_data_sets_of_the_paper_have_their_tasks_and_splits(name, n_tasks, split):
+    plan = CollectionPlan(name, 1)
+    assert len(set(plan.task_ids)) == len(plan.task_ids) == n_tasks
+    assert plan.split == split
+
+
+def test_data_sets_of_the_paper_fit_together():
+    tasks = {name: set(task_ids) for name, (task_ids, _) in DATA_SETS.items()}
+    assert tasks["T198"] == set(SCENARIOS["a"].train_tasks)
+    assert tasks["E102"] == set(range(300)) - tasks["T198"]
+    assert not tasks["E48"] & tasks["E54"]
+    assert tasks["E48"] | tasks["E54"] == tasks["E102"]
+    assert {TASKS[task_id].kind for task_id in tasks["T48"]} == {"name"}
+    assert {TASKS[task_id].kind for task_id in tasks["T54"]} == {"color", "shape"}
+    assert tasks["T48"] == tasks["E48"] <= set(SCENARIOS["b"].train_tasks)
+    assert tasks["T54"] == tasks["E54"] == set(SCENARIOS["b"].test_tasks)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "split"),
+    [
+        ("scenario_a_test", "validation"),
+        ("scenario_b_test", "validation"),
+        ("scenario_a_train", "train"),
+        ("all", "train"),
+        ("4,50-53", "train"),
+    ],
+)
+def test_test_sets_are_for_validation_and_all_else_for_training(tasks, split):
+    assert CollectionPlan(tasks, 1).split == split
+    assert CollectionPlan(tasks, 1, split="train").split == "train"
+    assert CollectionPlan(tasks, 1, split="validation").split == "validation"
+
+
+def test_training_and_validation_never_show_the_same_scene(finished, tmp_path, in_process):
+    collect(tmp_path, replace(PLAN, split="validation"))
+    training, validation = (set(read_frames(root)["benchmark.seed"]) for root in (finished, tmp_path))
+    assert not training & validation
+    assert all(episode_seed(0, "validation", 90, number) in validation for number in range(3))
+
+
+# Adding to a dataset
+
+
+def test_more_episodes_of_the_same_tasks_continue_their_seeds(finished, copy, tmp_path, in_process):
+    before = contents(copy)
+    collect(copy, replace(PLAN, episodes_per_task=2), append=True)
+    after = contents(copy)
+    for path, old in before.items():
+        if path.startswith(("data/", "meta/episodes/")):
+            assert after[path] == old
+    assert in_process == [(90, 3), (90, 4), (4, 3), (4, 4)]
+    # The episodes are those of a longer collection, in another order.
+    collect(tmp_path / "longer", replace(PLAN, episodes_per_task=5))
+    frames, longer = (read_frames(root) for root in (copy, tmp_path / "longer"))
+    assert frames["index"].tolist() == list(range(10 * EPISODE_STEPS))
+    assert frames["episode_index"].tolist() == np.repeat(range(10), EPISODE_STEPS).tolist()
+    assert sorted(frames["benchmark.seed"]) == sorted(longer["benchmark.seed"])
+    assert len(set(frames["benchmark.seed"])) == 10
+    assert len(files.read_tasks(copy / files.TASKS_FILE)) == 2
+    # Statistics are those of all episodes, in whatever order.
+    stats, longer_stats = (
+        json.loads((root / files.STATS_FILE).read_text()) for root in (copy, tmp_path / "longer")
+    )
+    for feature in ("observation.image", "observation.state", "action", "benchmark.seed"):
+        for name in ("min", "max", "mean", "std", "count", "q50"):
+            np.testing.assert_allclose(stats[feature][name], longer_stats[feature][name], rtol=1e-6)
+
+
+def test_other_seeds_and_splits_begin_anew_when_they_are_added(copy, in_process):
+    collect(copy, CollectionPlan("4", 1, seed=1), append=True)
+    collect(copy, CollectionPlan("4", 1, split="validation"), append=True)
+    collect(copy, CollectionPlan("4", 1), append=True)
+    collect(copy, CollectionPlan("4", 1), append=True)
+    assert in_process == [(4, 0), (4, 0), (4, 3), (4, 4)]
+    assert len(set(read_frames(copy)["benchmark.seed"])) == PLAN.n_episodes + 4
+
+
+def test_more_tasks_go_to_the_end(copy, in_process):
+    summary = collect(copy, CollectionPlan("32,4", 1), append=True)
+    assert files.read_tasks(copy / files.TASKS_FILE) == [TASKS[i].instruction for i in (90, 4, 32)]
+    frames = read_frames(copy)
+    assert frames["task_index"][-2 * EPISODE_STEPS :].tolist() == np.repeat([2, 1], EPISODE_STEPS).tolist()
+    assert [entry["plan"]["tasks"] for entry in history(copy)] == ["90,4", "32,4"]
+    assert summary.episodes == PLAN.n_episodes + 2
+    assert summary.new_episodes == 2
+    dataset = LeRobotDataset("user/deltaco", root=copy)
+    assert dataset.num_episodes == PLAN.n_episodes + 2
+    assert dataset[len(dataset) - EPISODE_STEPS - 1]["task"] == TASKS[32].instruction
+
+
+def test_an_interrupted_addition_leaves_the_old_dataset_readable(copy, tmp_path, in_process, monkeypatch):
+    added = CollectionPlan("32", 2)
+    expected = shutil.copytree(copy, tmp_path / "expected")
+    collect(expected, added, append=True)
+
+    before = contents(copy)
+    monkeypatch.setattr(collection, "_join", fail_with(OSError("The disk is full.")))
+    with pytest.raises(OSError, match="full"):
+        collect(copy, added, append=True)
+    assert before.items() <= contents(copy).items()
+    assert LeRobotDataset("user/deltaco", root=copy).num_episodes == PLAN.n_episodes
+    for arguments in [(added, False), (replace(added, episodes_per_task=3), True), (PLAN, False)]:
+        with pytest.raises(CollectionError, match="unfinished collection of other arguments"):
+            collect(copy, arguments[0], append=arguments[1])
+
+    monkeypatch.undo()
+    monkeypatch.setattr(collection, "EPISODES_PER_FILE", EPISODES_PER_FILE)
+    collect(copy, added, append=True)
+    assert contents(copy) == contents(expected)
+
+
+@pytest.mark.parametrize("change", [{"image_size": 32}, {"ambiguity": "object"}])
+def test_other_pictures_are_not_added(copy, change, in_process):
+    with pytest.raises(CollectionError, match="pictures differ in size, ambiguity, renderer"):
+        collect(copy, replace(PLAN, **change), append=True)
+    assert not in_process
+
+
+def test_there_must_be_something_to_add_to(tmp_path, in_process):
+    with pytest.raises(CollectionError, match="no finished dataset to add to"):
+        collect(tmp_path, PLAN, append=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+# Interruptions
+
+
+def fail_with(error):
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+class KilledError(BaseException):
+    """Stands for the end of the process."""
+
+
+@contextmanager
+def failing_step(number, is_fatal):
+    """Lets a step that changes the disk fail; if that is fatal, then nothing is changed after it either.
+
+    Yields:
+        A list of the steps that were tried.
+    """
+    steps = []
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("mkdir", "replace", "unlink", "rmdir"):
+
+            def step(*arguments, original=getattr(os, name), name=name, **options):
+                steps.append((name, arguments))
+                if is_fatal and len(steps) >= number:
+                    raise KilledError
+                if len(steps) == number:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                return original(*arguments, **options)
+
+            patch.setattr(os, name, step)
+        yield steps
+
+
+@pytest.mark.parametrize("is_fatal", [False, True], ids=["full disk", "killed"])
+@pytest.mark.parametrize("append", [False, True], ids=["new", "added"])
+def test_whatever_step_fails_the_next_run_completes_the_same_dataset(
+    tmp_path, monkeypatch, in_process, append, is_fatal
+):
+    monkeypatch.setattr(collection, "EPISODES_PER_FILE", SMALL_FILES)
+    first = tmp_path / "first"
+    if append:
+        collect(first, CollectionPlan("4,32", 1))
+    expected = shutil.copytree(first, tmp_path / "expected") if append else tmp_path / "expected"
+    with failing_step(10**9, is_fatal) as steps:
+        collect(expected, SMALL_PLAN, append=append)
+    expected = contents(expected)
+    n_steps = len(steps)
+    assert n_steps > 30
+    for number in range(1, n_steps + 1):
+        root = tmp_path / str(number)
+        if append:
+            shutil.copytree(first, root)
+        in_process.clear()
+        with (
+            failing_step(number, is_fatal) as steps,
+            pytest.raises(KilledError if is_fatal else OSError),
+        ):
+            collect(root, SMALL_PLAN, append=append)
+        is_done = history(root)[-1]["plan"]["tasks"] == SMALL_PLAN.tasks if is_finished(root) else False
+        is_removing = is_done and not (root / STAGING / "plan.json").exists()
+        # Only for an addition is this another command: its arguments were already followed.
+        if not (append and is_removing):
+            collect(root, SMALL_PLAN, append=append)
+        else:
+            with pytest.raises(CollectionError, match="finished dataset of other arguments"):
+                collect(root, CollectionPlan("5", 1))
+        assert contents(root) == expected, steps[number - 1]
+        # No finished episode was lost, and at most the one that failed was run again.
+        counts = Counter(in_process)
+        assert len(counts) == SMALL_PLAN.n_episodes
+        assert counts.total() <= SMALL_PLAN.n_episodes + 1
+        shutil.rmtree(root)
+
+
+def is_finished(root):
+    path = root / files.INFO_FILE
+    return path.exists() and json.loads(path.read_text())["codebase_version"] == files.CODEBASE_VERSION
+
+
+def test_many_complete_files_may_wait_to_be_joined(tmp_path, monkeypatch, in_process):
+    """More of them than there are jobs for the workers at a time."""
+    monkeypatch.setattr(collection, "EPISODES_PER_FILE", 1)
+    plan = CollectionPlan("4,90,32", 3)
+    expected = tmp_path / "expected"
+    collect(expected, plan)
+    join = collection._join
+    monkeypatch.setattr(collection, "_join", lambda part: None)
+    with pytest.raises(CollectionError, match="missing"):
+        collect(tmp_path / "root", plan)
+    monkeypatch.setattr(collection, "_join", join)
+    collect(tmp_path / "root", plan)
+    assert contents(tmp_path / "root") == contents(expected)
+
+
+COMMAND = """
+import resource, signal, sys
+from lerobot_deltaco import collection
+from lerobot_deltaco.commands import collect
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
+    collect._share = lambda *_: None  # the card takes longer than the episodes
+    collection.EPISODES_PER_FILE = int(sys.argv[1])
+    if sys.argv[2] != "-":
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
+    collect.main(sys.argv[3:])
+"""
+
+
+def start(root, *arguments, episodes_per_file=EPISODES_PER_FILE, max_file_size="-"):
+    """Starts the command in a process group of its own."""
+    return subprocess.Popen(
+        [
+            *(sys.executable, "-c", COMMAND, str(episodes_per_file), str(max_file_size)),
+            *("--root", str(root), *(arguments or ARGUMENTS), "--workers", "2"),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0,
+    )
+
+
+def wait_until(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "It did not come to it."
+        time.sleep(0.01)
+
+
+def n_waiting(root):
+    """Number of episodes that wait for their data file."""
+    return len(list((root / STAGING / "episodes").glob("*.arrow")))
+
+
+def test_an_interrupt_ends_with_a_message_and_the_next_run_goes_on(finished, tmp_path):
+    process = start(tmp_path)
+    wait_until(lambda: n_waiting(tmp_path) > 0)
+    # Meanwhile, no other process may collect there.
+    with pytest.raises(CollectionError, match="Another process is collecting into"):
+        collect(tmp_path, PLAN)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes of the command
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130, error
+    assert "Interrupted. The same command goes on from here." in error
+    assert "Traceback" not in error
+    with pytest.raises(ValueError, match="unfinished; run its `deltaco-collect` command again to go on"):
+        LeRobotDataset("user/deltaco", root=tmp_path)
+    process = start(tmp_path)
+    output, error = process.communicate(timeout=60)
+    assert process.returncode == 0, error
+    assert f"{PLAN.n_episodes} episodes" in output
+    assert contents(tmp_path) == contents(finished)
+
+
+def test_an_interrupt_while_the_workers_start_is_no_worse(tmp_path):
+    process = start(tmp_path)
+    wait_until(lambda: psutil.Process(process.pid).children() or process.poll() is not None)
+    time.sleep(0.3)
+    os.killpg(process.pid, signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130, error
+    assert "Traceback" not in error
+
+
+def kill_until_finished(root, rng, n_kills, arguments, episodes_per_file):
+    """Runs the command, and kills it at random moments, at most so many times. Returns how many it were."""
+    for n_killed in range(n_kills + 1):
+        process = start(root, *arguments, episodes_per_file=episodes_per_file)
+        children = []
+        if n_killed < n_kills:
+            wait_until(lambda p=process: psutil.Process(p.pid).children() or p.poll() is not None)
+            time.sleep(rng.uniform(0, 2.5))
+            children = psutil.Process(process.pid).children() if process.poll() is None else []
+            process.kill()
+        _, error = process.communicate(timeout=120)
+        # Its workers do not outlive it.
+        assert not psutil.wait_procs(children, timeout=20)[1]
+        if process.returncode != -signal.SIGKILL:
+            assert process.returncode == 0, error
+            return n_killed
+    raise AssertionError("It never ended.")
+
+
+def test_killed_at_random_moments_it_completes_the_same_dataset(finished, tmp_path):
+    n_killed = kill_until_finished(tmp_path, random.Random(0), 3, ARGUMENTS, EPISODES_PER_FILE)
+    assert n_killed > 0
+    assert contents(tmp_path) == contents(finished)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_killed_many_times_it_completes_the_same_dataset(tmp_path, monkeypatch, seed):
+    monkeypatch.setattr(collection, "EPISODES_PER_FILE", 7)
+    plan = CollectionPlan("90,4,32", 15)
+    collect(tmp_path / "expected", plan, n_workers=2)
+    arguments = ["--tasks", plan.tasks, "--episodes-per-task", str(plan.episodes_per_task)]
+    n_killed = kill_until_finished(tmp_path / "root", random.Random(seed), 100, arguments, 7)
+    assert n_killed > 2
+    assert contents(tmp_path / "root") == contents(tmp_path / "expected")
+
+
+@pytest.mark.parametrize("max_file_size", [20_000, 100_000], ids=["an episode", "a data file"])
+def test_a_write_that_fails_ends_with_a_message_and_the_next_run_goes_on(finished, tmp_path, max_file_size):
+    """A limit on the size of files stands for a full disk."""
+    process = start(tmp_path, max_file_size=max_file_size)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 1, error
+    assert "Traceback" not in error
+    assert os.strerror(errno.EFBIG) in error
+    assert not is_finished(tmp_path)
+    n_kept = n_waiting(tmp_path)
+    assert n_kept == 0 if max_file_size == 20_000 else n_kept >= EPISODES_PER_FILE
+    assert not list(tmp_path.rglob("*.part"))
+    process = start(tmp_path)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 0, error
+    assert contents(tmp_path) == contents(finished)
+
+
+def test_a_worker_that_is_killed_is_reported_and_the_next_run_goes_on(finished, tmp_path):
+    process = start(tmp_path)
+    wait_until(lambda: n_waiting(tmp_path) > 0)
+    workers = [
+        child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())
+    ]
+    workers[0].kill()
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 1, error
+    assert "A worker process ended unexpectedly" in error
+    assert "Traceback" not in error
+    assert start(tmp_path).wait(timeout=60) == 0
+    assert contents(tmp_path) == contents(finished)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_a_read_only_folder_is_reported(tmp_path, capsys):
+    tmp_path.chmod(0o555)
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--root", str(tmp_path / "new"), *ARGUMENTS])
+    assert exit_info.value.code == 1
+    assert "Permission denied" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["mkdir", "replace", "open"])
+def test_an_error_of_the_disk_is_a_message(tmp_path, monkeypatch, capsys, in_process, name):
+    error = PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / "x"))
+    if name == "open":
+        monkeypatch.setattr(Path, "open", fail_with(error))
+    else:
+        monkeypatch.setattr(os, name, fail_with(error))
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--root", str(tmp_path / "new"), *ARGUMENTS])
+    assert exit_info.value.code == 1
+    message = capsys.readouterr().err
+    assert "deltaco-collect: [Errno 13] Permission denied" in message
+    assert str(tmp_path) in message
+
+
+# Refusals
+
+
+def test_the_same_arguments_again_have_nothing_to_do(copy, capsys, in_process):
+    before = {path: path.stat().st_mtime_ns for path in copy.rglob("*")}
+    summary = collect(copy, PLAN)
+    assert summary.episodes == summary.new_episodes == PLAN.n_episodes
+    assert summary.episodes_per_s is None
+    assert {path: path.stat().st_mtime_ns for path in copy.rglob("*")} == before
+    main(["--root", str(copy), *ARGUMENTS])
+    assert "nothing to do" in capsys.readouterr().out
+    assert not in_process
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"tasks": "4,90"},
+        {"episodes_per_task": 4},
+        {"seed": 1},
+        {"split": "validation"},
+        {"noise": 0.2},
+        {"ambiguity": "object"},
+        {"image_size": 32},
+    ],
+    ids=str,
+)
+def test_other_arguments_are_refused(copy, tmp_path, monkeypatch, in_process, change):
+    other = replace(PLAN, **change)
+    before = contents(copy)
+    with pytest.raises(CollectionError, match="finished dataset of other arguments"):
+        collect(copy, other)
+    assert contents(copy) == before
+
+    unfinished = tmp_path / "unfinished"
+    monkeypatch.setattr(collection, "_join", fail_with(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        collect(unfinished, PLAN)
+    before = contents(unfinished)
+    ((name, value),) = change.items()
+    with pytest.raises(CollectionError) as error:
+        collect(unfinished, other)
+    assert f"{name}: {getattr(PLAN, name)} there, {value} now" in str(error.value)
+    assert contents(unfinished) == before
+
+
+def test_a_folder_with_something_else_is_refused(tmp_path, in_process):
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(CollectionError, match=r"not empty \(thesis.tex\)"):
+        collect(tmp_path, PLAN)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("codebase_version", ["v3.0", "v2.1"])
+def test_a_dataset_of_another_origin_is_refused(tmp_path, in_process, codebase_version):
+    (tmp_path / "meta").mkdir()
+    (tmp_path / files.INFO_FILE).write_text(json.dumps({"codebase_version": codebase_version}))
+    for append in (False, True):
+        with pytest.raises(CollectionError, match="`deltaco-collect` did not make"):
+            collect(tmp_path, PLAN, append=append)
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--root", str(tmp_path / "file"), *ARGUMENTS])
+    assert exit_info.value.code == 1
+    assert str(tmp_path / "file") in capsys.readouterr().err
+
+
+def test_a_dataset_that_another_process_has_finished_meanwhile_is_not_touched(copy, monkeypatch, in_process):
+    """That is, between the first look at the folder and the lock."""
+    bases = iter([None, collection._read_base(copy)])
+    monkeypatch.setattr(collection, "_read_base", lambda root: next(bases))
+    monkeypatch.setattr(collection, "_check_may_begin", lambda *_: None)
+    before = contents(copy)
+    with pytest.raises(CollectionError, match="just finished"):
+        collect(copy, PLAN)
+    assert before.items() <= contents(copy).items()
+    assert not in_process
+
+
+def test_workers_of_a_killed_run_are_waited_for(tmp_path, in_process):
+    """They end by themselves, but not in the same instant."""
+    (tmp_path / STAGING).mkdir()
+    with (tmp_path / STAGING / collection.WORKERS_LOCK).open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        process = start(tmp_path)
+        wait_until(lambda: (tmp_path / STAGING / "lock").exists())
+        time.sleep(0.5)
+        assert not (tmp_path / STAGING / "plan.json").exists()
+    assert process.wait(timeout=60) == 0
+
+
+# Damaged files
+
+
+def test_a_damaged_episode_is_named_and_can_be_collected_anew(finished, tmp_path, monkeypatch, in_process):
+    join = collection._join
+    monkeypatch.setattr(collection, "_join", fail_with(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        collect(tmp_path, PLAN)
+    monkeypatch.setattr(collection, "_join", join)
+    for damage in (lambda old: old[: len(old) // 2], lambda old: b"", lambda old: old[:-10] + bytes(10)):
+        damaged = tmp_path / STAGING / "episodes" / "0000002.arrow"
+        old = damaged.read_bytes()
+        damaged.write_bytes(damage(old))
+        with pytest.raises(CollectionError, match="damaged.*Delete it and run the command again") as error:
+            collect(tmp_path, PLAN)
+        assert str(damaged) in str(error.value)
+        damaged.write_bytes(old)
+    damaged.unlink()
+    in_process.clear()
+    collect(tmp_path, PLAN)
+    assert in_process.count((90, 2)) == 1
+    assert contents(tmp_path) == contents(finished)
+
+
+@pytest.mark.parametrize(
+    "file",
+    ["data/chunk-000/file-001.parquet", str(HISTORY_FILE), str(files.INFO_FILE), str(files.TASKS_FILE)],
+)
+@pytest.mark.parametrize("append", [False, True])
+def test_a_damaged_file_of_the_dataset_is_named(copy, in_process, file, append):
+    os.truncate(copy / file, (copy / file).stat().st_size // 2)
+    with pytest.raises(CollectionError, match="damaged") as error:
+        collect(copy, PLAN, append=append)
+    assert str(copy / file) in str(error.value)
+
+
+def test_a_missing_data_file_is_reported(copy, in_process):
+    (copy / "data/chunk-000/file-000.parquet").unlink()
+    n_left = (PLAN.n_episodes - EPISODES_PER_FILE) * EPISODE_STEPS
+    with pytest.raises(CollectionError, match=f"{n_left} frames instead of {PLAN.n_episodes * 30}"):
+        collect(copy, PLAN, append=True)
+
+
+# The command
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (["--tasks", "T99"], "Unknown task selection 'T99'"),
+        (["--tasks", "T99"], "E102"),
+        (["--tasks", "300"], "0 to 299"),
+        (["--tasks", "9-4"], "The range '9-4' is empty"),
+        (["--tasks", ""], "is empty"),
+        (["--episodes-per-task", "0"], "`episodes_per_task` must be at least 1. Got 0."),
+        (["--episodes-per-task", "many"], "invalid int value: 'many'"),
+        (["--seed", "-1"], "`seed` must be at least 0. Got -1."),
+        (["--noise", "-0.1"], "`noise` must be at least 0. Got -0.1."),
+        (["--noise", "nan"], "`noise` must be at least 0. Got nan."),
+        (["--noise", "inf"], "`noise` must be finite. Got inf."),
+        (["--image-size", "7"], "`image_size` must be at least 8. Got 7."),
+        (["--split", "evaluation"], "invalid choice: 'evaluation'"),
+        (["--ambiguity", "both"], "invalid choice: 'both'"),
+        (["--workers", "0"], "--workers must be at least 1. Got 0."),
+        (["--push-to-hub"], "--push-to-hub needs --repo-id"),
+        (["--nosuch"], "unrecognized arguments: --nosuch"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_wrong_arguments_are_explained_in_one_line(tmp_path, capsys, changes, message):
+    root = tmp_path / "new"
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--root", str(root), *ARGUMENTS, *changes])
+    assert exit_info.value.code == 2
+    *usage, line = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert usage[0].startswith("usage: deltaco-collect")
+    assert not root.exists()
+
+
+@pytest.mark.parametrize("missing", ["--tasks", "--episodes-per-task", "--root"])
+def test_necessary_arguments_are_named(tmp_path, capsys, missing):
+    arguments = {"--tasks": "4", "--episodes-per-task": "1", "--root": str(tmp_path)}
+    del arguments[missing]
+    with pytest.raises(SystemExit) as exit_info:
+        main([word for option in arguments.items() for word in option])
+    assert exit_info.value.code == 2
+    assert f"required: {missing}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("change", [{"split": "evaluation"}, {"ambiguity": "both"}, {"seed": -1}])
+def test_a_plan_checks_its_arguments(change):
+    ((name, value),) = change.items()
+    with pytest.raises(ValueError, match=rf"`{name}` must be .*Got {value!r}"):
+        replace(PLAN, **change)
+
+
+def test_the_default_noise_is_that_of_the_expert(tmp_path, in_process):
+    main(["--root", str(tmp_path / "x"), "--tasks", "4", "--episodes-per-task", "1"])
+    assert history(tmp_path / "x")[0]["plan"]["noise"] == NOISE == CollectionPlan("4", 1).noise
+
+
+def test_the_summary_has_what_was_done(tmp_path, capsys, in_process):
+    root, summary_file = tmp_path / "dataset", tmp_path / "summary.json"
+    start = time.perf_counter()
+    main(["--root", str(root), *ARGUMENTS, "--summary", str(summary_file)])
+    seconds = time.perf_counter() - start
+    summary = json.loads(summary_file.read_text())
+    assert summary["episodes"] == summary["new_episodes"] == PLAN.n_episodes
+    assert summary["attempts"] == sum(history(root)[0]["attempts"].values())
+    assert set(summary["success_rates"]) == {"name", "shape"}
+    assert summary["episodes_per_s"] > PLAN.n_episodes / seconds
+    assert summary["bytes_per_episode"] == pytest.approx(
+        sum(map(len, contents(root).values())) / PLAN.n_episodes
+    )
+    output = capsys.readouterr()
+    assert f"{PLAN.n_episodes} episodes" in output.out
+    assert f"{PLAN.n_episodes}/{PLAN.n_episodes}" in output.err  # the progress bar
+
+
+def test_the_dataset_records_how_it_was_made(finished):
+    (entry,) = history(finished)
+    assert CollectionPlan(**entry["plan"]) == PLAN
+    assert set(entry["versions"]) == {"lerobot_policy_deltaco", "pybullet", "numpy"}
+    info = json.loads((finished / files.INFO_FILE).read_text())
+    assert info["features"]["observation.image"]["info"]["renderer"] == entry["renderer"]
+    assert "TinyRenderer" in entry["renderer"]
+    assert info["robot_type"] == "widowx_250"
+
+
+def test_a_finished_dataset_has_no_other_files(finished):
+    assert {path for path in contents(finished) if not path.startswith(("data/", "meta/episodes/"))} == {
+        str(file) for file in (files.INFO_FILE, files.STATS_FILE, files.TASKS_FILE, HISTORY_FILE)
+    }
+    assert sorted(path.name for path in finished.iterdir()) == ["data", "meta"]
+    n_rows = [pq.read_metadata(path).num_rows for path in sorted((finished / "data").rglob("*.parquet"))]
+    assert n_rows == [
+        EPISODES_PER_FILE * EPISODE_STEPS,
+        (PLAN.n_episodes - EPISODES_PER_FILE) * EPISODE_STEPS,
+    ]
+
+
+def test_worker_processes_load_neither_torch_nor_lerobot():
+    """They import the command's module; those packages would take 10 s in each."""
+    code = "import sys, lerobot_deltaco.commands.collect; sys.exit(bool({'torch', 'lerobot'} & set(sys.modules)))"
+    subprocess.run([sys.executable, "-c", code], check=True)
