@@ -38,24 +38,29 @@ def measure(ambiguity, task_ids, n_seeds):
         return dict(pool.imap_unordered(success_steps, jobs))
 
 
-def check_thresholds(results, per_task):
+def check_thresholds(results, per_task, share_by_step_22):
     steps = np.concatenate(list(results.values()))
     assert np.isfinite(steps).mean() >= 0.95
     assert np.median(steps) <= 15
-    assert np.percentile(steps, 95) <= 22
+    assert (steps <= 22).mean() >= share_by_step_22
     rates = {task_id: np.isfinite(task_steps).mean() for task_id, task_steps in results.items()}
     assert {task_id: rate for task_id, rate in rates.items() if rate < per_task} == {}
 
 
 @pytest.mark.parametrize("ambiguity", AMBIGUITIES)
 def test_the_expert_succeeds_in_a_sample_of_tasks(ambiguity):
-    check_thresholds(measure(ambiguity, SAMPLE, SAMPLE_SEEDS), per_task=1 / SAMPLE_SEEDS)
+    # 95 % are released by step 22, as the slow test holds; so few episodes show it less closely.
+    check_thresholds(
+        measure(ambiguity, SAMPLE, SAMPLE_SEEDS), per_task=1 / SAMPLE_SEEDS, share_by_step_22=0.9
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ambiguity", AMBIGUITIES)
 def test_the_expert_succeeds_in_every_task(ambiguity):
-    check_thresholds(measure(ambiguity, range(N_TASKS), ALL_TASKS_SEEDS), per_task=0.85)
+    check_thresholds(
+        measure(ambiguity, range(N_TASKS), ALL_TASKS_SEEDS), per_task=0.85, share_by_step_22=0.95
+    )
 
 
 def test_the_stages_come_in_order_and_command_the_gripper():
