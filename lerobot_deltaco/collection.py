@@ -213,9 +213,11 @@ def _read_base(root: Path) -> _Base | None:
     n_frames = sum(_read(path).num_rows for path in data_files)
     if n_frames != info["total_frames"]:
         raise CollectionError(
-            f"The files in {root / 'data'} have {n_frames} frames instead of {info['total_frames']}: some are "
-            "missing, or too many. Collect the dataset again, in a new folder."
+            f"The files in {root / 'data'} have {n_frames} frames instead of {info['total_frames']}: some "
+            "are missing, or too many. Collect the dataset again, in a new folder."
         )
+    for file in (files.STATS_FILE, files.TASKS_FILE):
+        _read(root / file)
     return _Base(
         tasks=files.read_tasks(root / files.TASKS_FILE),
         n_episodes=info["total_episodes"],
@@ -374,11 +376,11 @@ def _executor(job: _Job, n_workers: int) -> Executor:
 def _submit(executor: Executor, function: Callable[[int], None], number: int) -> Future:
     # This may start a process. An interrupt is for the main process, which lets the episodes end that are
     # under way; a process keeps what was blocked when it was started.
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         return executor.submit(function, number)
     finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 @dataclass
