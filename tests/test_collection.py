@@ -424,10 +424,13 @@ def test_whatever_step_fails_the_next_run_completes_the_same_dataset(
     first = tmp_path / "first"
     if append:
         collect(first, CollectionPlan("4,32", 1))
-    expected = shutil.copytree(first, tmp_path / "expected") if append else tmp_path / "expected"
-    with failing_step(10**9, is_fatal) as steps:
-        collect(expected, SMALL_PLAN, append=append)
-    expected = contents(expected)
+    # Twice, because the simulator has files of its own when it starts.
+    for root in (tmp_path / "warm", tmp_path / "expected"):
+        if append:
+            shutil.copytree(first, root)
+        with failing_step(10**9, is_fatal) as steps:
+            collect(root, SMALL_PLAN, append=append)
+    expected = contents(root)
     n_steps = len(steps)
     assert n_steps > 25
     for number in range(1, n_steps + 1):
@@ -560,7 +563,7 @@ def kill_until_finished(root, rng, n_kills, arguments, episodes_per_file):
                     p.poll() is not None or (stored(root) - b if late else psutil.Process(p.pid).children())
                 )
             )
-            time.sleep(rng.uniform(0, 0.7))
+            time.sleep(rng.uniform(0, 1))
             workers = psutil.Process(process.pid).children() if process.poll() is None else []
             process.kill()
         _, error = process.communicate(timeout=120)
@@ -584,13 +587,12 @@ def test_killed_at_random_moments_it_completes_the_same_dataset(finished, tmp_pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_killed_many_times_it_completes_the_same_dataset(tmp_path, monkeypatch, seed):
-    monkeypatch.setattr(collection, "EPISODES_PER_FILE", 7)
-    plan = CollectionPlan("90,4,32", 15)
+def test_killed_many_times_it_completes_the_same_dataset(tmp_path, monkeypatch):
+    monkeypatch.setattr(collection, "EPISODES_PER_FILE", 5)
+    plan = CollectionPlan("90,4,32", 9)
     collect(tmp_path / "expected", plan, n_workers=2)
     arguments = ["--tasks", plan.tasks, "--episodes-per-task", str(plan.episodes_per_task)]
-    n_killed = kill_until_finished(tmp_path / "root", random.Random(seed), 100, arguments, 7)
+    n_killed = kill_until_finished(tmp_path / "root", random.Random(1), 50, arguments, 5)
     assert n_killed > 2
     assert contents(tmp_path / "root") == contents(tmp_path / "expected")
 
