@@ -416,6 +416,9 @@ def _end_with_main_process(lock_file: Path) -> None:
         main.join()
         os._exit(1)
 
+    # Had it ended before this process had the lock, then the next run might not have waited for it.
+    if not main.is_alive():
+        os._exit(1)
     threading.Thread(target=watch, daemon=True).start()
 
 
