@@ -24,9 +24,9 @@ from unittest import mock
 
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.tasks import N_TASKS
-from lerobot_deltaco import collection
-from lerobot_deltaco import dataset_files as files
-from lerobot_deltaco.collection_plan import CollectionPlan
+from lerobot_deltaco.data import collection
+from lerobot_deltaco.data import dataset_files as files
+from lerobot_deltaco.data.collection_plan import CollectionPlan
 
 # Of all kinds.
 TASKS = range(0, N_TASKS, 15)

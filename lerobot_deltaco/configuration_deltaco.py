@@ -10,8 +10,8 @@ from typing import NamedTuple
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamConfig
 
-from lerobot_deltaco.collection_plan import ACTION_NAMES
-from lerobot_deltaco.language import LANGUAGE_ENCODERS
+from lerobot_deltaco.data.feature_names import ACTION_NAMES
+from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
 
 
 class Conditioning(NamedTuple):

@@ -20,16 +20,16 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
-from lerobot_deltaco.demonstrations import DemonstrationSet, load_demonstrations
-from lerobot_deltaco.language import InstructionTable
-from lerobot_deltaco.losses import (
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
+from lerobot_deltaco.policy.language import InstructionTable
+from lerobot_deltaco.policy.losses import (
     contrastive_logits,
     contrastive_loss,
     cosine_loss,
     gaussian_negative_log_likelihood,
 )
-from lerobot_deltaco.networks import ConditionedPolicy, DemoEncoder, frame_array, random_crop
-from lerobot_deltaco.training_episodes import training_episodes
+from lerobot_deltaco.policy.networks import ConditionedPolicy, DemoEncoder, frame_array, random_crop
+from lerobot_deltaco.policy.training_episodes import training_episodes
 
 # Beside the weights: embeddings of instructions, and the demonstrations for evaluation.
 TASKS_FILE = "tasks.safetensors"

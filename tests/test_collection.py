@@ -31,11 +31,11 @@ from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import NOISE, expert_episode
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASKS
-from lerobot_deltaco import collection, collection_plan
-from lerobot_deltaco import dataset_files as files
-from lerobot_deltaco.collection import HISTORY_FILE, STAGING, CollectionError, collect
-from lerobot_deltaco.collection_plan import DATA_SETS, CollectionPlan, collect_episode
 from lerobot_deltaco.commands.collect import main
+from lerobot_deltaco.data import collection, collection_plan
+from lerobot_deltaco.data import dataset_files as files
+from lerobot_deltaco.data.collection import HISTORY_FILE, STAGING, CollectionError, collect
+from lerobot_deltaco.data.collection_plan import DATA_SETS, CollectionPlan, collect_episode
 
 # Two tasks of different kinds, not in the benchmark's order, in files that end where no task does.
 PLAN = CollectionPlan("90,4", 3)
@@ -481,7 +481,7 @@ def test_many_complete_files_may_wait_to_be_joined(tmp_path, monkeypatch, in_pro
 
 COMMAND = """
 import resource, signal, sys
-from lerobot_deltaco import collection
+from lerobot_deltaco.data import collection
 from lerobot_deltaco.commands import collect
 
 if __name__ == "__main__":

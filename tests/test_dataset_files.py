@@ -20,11 +20,11 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from PIL import Image
 
 from gym_deltaco.tasks import TASKS
-from lerobot_deltaco import collection
-from lerobot_deltaco import dataset_files as files
-from lerobot_deltaco.collection import collect
-from lerobot_deltaco.collection_plan import FPS, ROBOT_TYPE, CollectionPlan
-from lerobot_deltaco.dataset_statistics import STATISTICS, feature_statistics, merged_statistics
+from lerobot_deltaco.data import collection
+from lerobot_deltaco.data import dataset_files as files
+from lerobot_deltaco.data.collection import collect
+from lerobot_deltaco.data.collection_plan import FPS, ROBOT_TYPE, CollectionPlan
+from lerobot_deltaco.data.dataset_statistics import STATISTICS, feature_statistics, merged_statistics
 
 REPO_ID = "user/deltaco"
 TASK_IDS = (90, 4)  # not in the order of the benchmark

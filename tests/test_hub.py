@@ -16,11 +16,11 @@ from huggingface_hub import DatasetCard, constants
 from PIL import Image
 
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, TASKS
-from lerobot_deltaco.collection import HISTORY_FILE, UNFINISHED, CollectionError, collect
-from lerobot_deltaco.collection_plan import CollectionPlan
 from lerobot_deltaco.commands import collect as collect_command
 from lerobot_deltaco.commands import push as push_command
-from lerobot_deltaco.dataset_card import (
+from lerobot_deltaco.data.collection import HISTORY_FILE, UNFINISHED, CollectionError, collect
+from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.data.dataset_card import (
     CARD_FILE,
     CARD_FILES,
     DESCRIPTIONS,
@@ -30,8 +30,8 @@ from lerobot_deltaco.dataset_card import (
     has_current_card,
     write_card,
 )
-from lerobot_deltaco.dataset_files import INFO_FILE
-from lerobot_deltaco.hub import HubError, check_credentials, check_dataset, check_repo_id
+from lerobot_deltaco.data.dataset_files import INFO_FILE
+from lerobot_deltaco.data.hub import HubError, check_credentials, check_dataset, check_repo_id
 
 REPO_ID = f"{USER}/three.tasks"
 KEY = "dataset", REPO_ID
@@ -321,7 +321,7 @@ def test_the_hub_is_needed(monkeypatch):
     with pytest.raises(HubError, match="HF_HUB_OFFLINE or TRANSFORMERS_OFFLINE is set"):
         check_credentials()  # the tests are offline
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
-    monkeypatch.setattr("lerobot_deltaco.hub.get_token", lambda: None)
+    monkeypatch.setattr("lerobot_deltaco.data.hub.get_token", lambda: None)
     with pytest.raises(HubError, match="Set HF_TOKEN to a token that may write"):
         check_credentials()
 

@@ -7,13 +7,13 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 
 from lerobot_deltaco.configuration_deltaco import BACKBONES
-from lerobot_deltaco.losses import (
+from lerobot_deltaco.policy.losses import (
     contrastive_logits,
     contrastive_loss,
     cosine_loss,
     gaussian_negative_log_likelihood,
 )
-from lerobot_deltaco.networks import (
+from lerobot_deltaco.policy.networks import (
     INITIAL_LOG_STD,
     ConditionedPolicy,
     DemoEncoder,

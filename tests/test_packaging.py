@@ -71,6 +71,26 @@ def test_the_benchmark_knows_nothing_of_torch_and_lerobot(path):
     assert packages.isdisjoint({"torch", "lerobot", "lerobot_deltaco", "lerobot_policy_deltaco"})
 
 
+# What each part may not import, so that imports go one way.
+FORBIDDEN = {
+    "lerobot_deltaco/data": {"torch", "lerobot_deltaco.policy", "lerobot_deltaco.modeling_deltaco"},
+    "lerobot_deltaco/policy": {"gym_deltaco", "pybullet", "lerobot_deltaco.data"},
+    "lerobot_deltaco/policy/networks.py": {"lerobot", "lerobot_deltaco"},
+    "lerobot_deltaco/policy/losses.py": {"lerobot", "lerobot_deltaco"},
+}
+
+
+@pytest.mark.parametrize("part", FORBIDDEN)
+def test_imports_go_one_way(part):
+    path = ROOT / part
+    paths = [path] if path.suffix else sorted(path.glob("*.py"))
+    assert paths
+    for path in paths:
+        for name in imported_modules(path):
+            parents = {name, *(name.rsplit(".", n)[0] for n in range(1, name.count(".") + 1))}
+            assert parents.isdisjoint(FORBIDDEN[part]), f"{path.name} imports {name}"
+
+
 def test_importing_the_benchmark_loads_neither_torch_nor_lerobot():
     check = "import sys, gym_deltaco; print({'torch', 'lerobot', 'lerobot_deltaco'} & set(sys.modules))"
     result = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)

@@ -12,10 +12,10 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 from torch.utils.data import default_collate
 
-from lerobot_deltaco import language
 from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.training_episodes import training_episodes
+from lerobot_deltaco.policy import language
+from lerobot_deltaco.policy.training_episodes import training_episodes
 
 TASKS = ["stack the cups", "pour the tea", "wave"]
 EPISODES_PER_TASK = {"stack the cups": 3, "pour the tea": 2, "wave": 1}

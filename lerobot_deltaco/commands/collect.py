@@ -10,8 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gym_deltaco.layout import AMBIGUITIES
-from lerobot_deltaco.collection import CollectionError, Summary, collect
-from lerobot_deltaco.collection_plan import COLLECTED_SPLITS, DATA_SETS, CollectionPlan
+from lerobot_deltaco.data.collection import CollectionError, Summary, collect
+from lerobot_deltaco.data.collection_plan import COLLECTED_SPLITS, DATA_SETS, CollectionPlan
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -52,7 +52,7 @@ def _check_sharing(parser: argparse.ArgumentParser, options: argparse.Namespace)
     if options.repo_id is None:
         return
     # Here and below, so that the worker processes, which import this module, start quickly.
-    from lerobot_deltaco.hub import HubError, check_credentials, check_repo_id
+    from lerobot_deltaco.data.hub import HubError, check_credentials, check_repo_id
 
     try:
         check_repo_id(options.repo_id)
@@ -67,8 +67,8 @@ def _check_sharing(parser: argparse.ArgumentParser, options: argparse.Namespace)
 
 def _share(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Writes the card of the finished dataset, and pushes it if that is wanted."""
-    from lerobot_deltaco.dataset_card import has_current_card, write_card
-    from lerobot_deltaco.hub import HubError, push_dataset
+    from lerobot_deltaco.data.dataset_card import has_current_card, write_card
+    from lerobot_deltaco.data.hub import HubError, push_dataset
 
     try:
         if not has_current_card(options.root):

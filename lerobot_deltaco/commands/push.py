@@ -6,8 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from lerobot_deltaco.dataset_card import CARD_FILE, write_card
-from lerobot_deltaco.hub import HubError, check_dataset, check_repo_id, push_dataset
+from lerobot_deltaco.data.dataset_card import CARD_FILE, write_card
+from lerobot_deltaco.data.hub import HubError, check_dataset, check_repo_id, push_dataset
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -34,8 +34,8 @@ from tqdm import tqdm
 from gym_deltaco import ENV_ID
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.tasks import TASKS
-from lerobot_deltaco import dataset_files as files
-from lerobot_deltaco.collection_plan import (
+from lerobot_deltaco.data import dataset_files as files
+from lerobot_deltaco.data.collection_plan import (
     EPISODE_LENGTH,
     EPISODES_PER_FILE,
     FPS,
@@ -46,7 +46,7 @@ from lerobot_deltaco.collection_plan import (
     first_numbers,
     renderer,
 )
-from lerobot_deltaco.dataset_statistics import Statistics, merged_statistics
+from lerobot_deltaco.data.dataset_statistics import Statistics, merged_statistics
 
 STAGING = ".collecting"
 # The same folder once all is done; it is renamed before it is removed, so that it never counts half-removed.

@@ -25,9 +25,10 @@ from gym_deltaco import EPISODE_STEPS
 from gym_deltaco.env import ACTION_SCALE, PickPlaceEnv
 from gym_deltaco.sheets import caption, down, enlarged, framed, grid, picture, save_gif, save_png, write_whole
 from gym_deltaco.tasks import SCENARIOS, TASKS, Task
-from lerobot_deltaco import dataset_files as files
-from lerobot_deltaco.collection import HISTORY_FILE
-from lerobot_deltaco.collection_plan import CollectionPlan
+from lerobot_deltaco.data import dataset_files as files
+from lerobot_deltaco.data.collection import HISTORY_FILE
+from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.templates import template_folder
 
 CARD_FILE = Path("README.md")
 TASKS_PICTURE = Path("assets/tasks.png")
@@ -137,7 +138,7 @@ def card_text(root: Path, repo_id: str | None = None) -> str:
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
-    template = environment.from_string((_templates() / _TEMPLATE).read_text(encoding="utf-8"))
+    template = environment.from_string((template_folder() / _TEMPLATE).read_text(encoding="utf-8"))
     return template.render(
         metadata=metadata.to_yaml().strip(),
         title=title,
@@ -169,13 +170,6 @@ def collect_command(plan: CollectionPlan, append: bool = False) -> str:
     for field in fields(plan):
         words += [f"--{field.name.replace('_', '-')}", str(getattr(plan, field.name))]
     return shlex.join([*words, *(["--append"] if append else [])])
-
-
-def _templates() -> Path:
-    """In the wheel, the templates are a folder of the package; in a clone, it lies beside the package."""
-    package = Path(__file__).parent
-    inside = package / "datasets_cards"
-    return inside if inside.is_dir() else package.parent / "datasets_cards"
 
 
 def _tasks(root: Path) -> list[Task]:

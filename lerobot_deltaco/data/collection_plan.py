@@ -17,7 +17,8 @@ from gym_deltaco.expert import NOISE, expert_episode
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
 from gym_deltaco.seeding import Split, episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASKS, select_tasks
-from lerobot_deltaco.dataset_files import DEFAULT_FEATURES
+from lerobot_deltaco.data.dataset_files import DEFAULT_FEATURES
+from lerobot_deltaco.data.feature_names import ACTION_NAMES, PRIVILEGED, STATE_NAMES
 
 FPS = CONTROL_FPS
 ROBOT_TYPE = "widowx_250"
@@ -126,15 +127,6 @@ class CollectionPlan:
             **dict.fromkeys(PRIVILEGED, number),
             **DEFAULT_FEATURES,
         }
-
-
-STATE_NAMES = [
-    *("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate"),
-    *("end_effector_x", "end_effector_y", "end_effector_z", "gripper_open"),
-]
-ACTION_NAMES = ["delta_x", "delta_y", "delta_z", "gripper"]
-# Outside `observation.`, so that no policy takes them for an input.
-PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_container", "benchmark.seed")
 
 
 def renderer() -> str:

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from PIL import Image
 
-from lerobot_deltaco.dataset_statistics import STATISTICS, Statistics, feature_statistics
+from lerobot_deltaco.data.dataset_statistics import STATISTICS, Statistics, feature_statistics
 
 CODEBASE_VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
