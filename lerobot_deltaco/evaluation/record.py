@@ -1,0 +1,157 @@
+"""The record of an evaluation set: what happened in every episode, and what it takes to repeat it.
+
+An evaluation set is a few episodes of each of several tasks, run with one checkpoint. Its record is one JSON
+file in the folder `evaluations` of the training run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+RECORD_FORMAT = 1
+RECORDS_FOLDER = "evaluations"
+
+Counterfactual = Literal["none", "demo", "instruction"]
+COUNTERFACTUALS: tuple[Counterfactual, ...] = get_args(Counterfactual)
+
+
+class RecordError(ValueError):
+    """A file is not the record of an evaluation; the message says what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """One episode. Objects and containers are numbered as they are in the scene; -1 is none.
+
+    Args:
+        task_id: The scene's task, 0..299, which decides success.
+        trial: Which episode of its task in this evaluation set, from 0.
+        seed: Of the environment's reset.
+        instruction: What the policy was told.
+        demonstration: The task string of the demonstration that it was shown; None without one.
+        success: Whether the scene's task succeeded, at any step.
+        objects: Which of the 32 objects stand in the scene, three of them.
+        object_containers: Where each of them lies at the end: 0 green, 1 red.
+        target_object: The object that the scene's task asks for.
+        target_container: The container that the scene's task asks for.
+        grasped_object: The object that the gripper held last.
+        right_object: Whether that is the target.
+        right_container: Whether something lies in the target container, and nothing in the other one.
+    """
+
+    task_id: int
+    trial: int
+    seed: int
+    instruction: str
+    demonstration: str | None
+    success: bool
+    objects: list[int]
+    object_containers: list[int]
+    target_object: int
+    target_container: int
+    grasped_object: int
+    right_object: bool
+    right_container: bool
+
+
+@dataclass(frozen=True)
+class EvaluationRecord:
+    """An evaluation set of one checkpoint.
+
+    Args:
+        experiment: What was trained, such as "scenario_a/deltaco": runs that differ in their seeds alone
+            share it.
+        method: Of the policy: deltaco, language_only, ...
+        run_seed: Seed of the training run.
+        step: Training step of the checkpoint.
+        evaluation_seed: With the step, it decides the scenes.
+        counterfactual: "none"; "demo" or "instruction": that was another task's.
+        tasks: The selection of tasks, such as "scenario_a_test".
+        trials: Episodes of each task.
+        episodes: What happened.
+        policy: The policy's configuration.
+        versions: Of the benchmark and the packages that matter.
+        command: What was typed.
+        seconds: How long the episodes took, s.
+    """
+
+    experiment: str
+    method: str
+    run_seed: int
+    step: int
+    evaluation_seed: int
+    counterfactual: Counterfactual
+    tasks: str
+    trials: int
+    episodes: list[EpisodeResult]
+    policy: dict[str, Any]
+    versions: dict[str, str]
+    command: str
+    seconds: float
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the episodes that succeeded, 0..1."""
+        return sum(episode.success for episode in self.episodes) / len(self.episodes)
+
+
+def record_path(run_folder: Path, step: int, counterfactual: Counterfactual = "none") -> Path:
+    """Where a run keeps the record of the evaluation set of a step."""
+    suffix = "" if counterfactual == "none" else f"_{counterfactual}"
+    return run_folder / RECORDS_FOLDER / f"{step:07d}{suffix}.json"
+
+
+def write_record(record: EvaluationRecord, path: Path) -> None:
+    """Writes a record, wholly or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".unfinished")
+    text = json.dumps({"format": RECORD_FORMAT, **asdict(record)}, indent=1, ensure_ascii=False)
+    unfinished.write_text(text + "\n", encoding="utf-8")
+    os.replace(unfinished, path)
+
+
+def read_record(path: Path) -> EvaluationRecord:
+    """Reads a record.
+
+    Raises:
+        RecordError: The file is not one, or is one of another version's.
+        OSError: It cannot be read.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise RecordError(f"{path} is not a record of an evaluation: it is no JSON ({error}).") from None
+    if not isinstance(content, dict) or content.get("format") != RECORD_FORMAT:
+        found = content.get("format") if isinstance(content, dict) else None
+        raise RecordError(
+            f"{path} is not a record of an evaluation in the format {RECORD_FORMAT}. Its format is {found!r}. "
+            "Evaluate the checkpoint again with `deltaco-evaluate`."
+        )
+    del content["format"]
+    episodes = content.get("episodes")
+    if not isinstance(episodes, list) or not episodes:
+        raise RecordError(f"{path} has no episodes.")
+    _check_fields(path, content, EvaluationRecord)
+    for episode in episodes:
+        _check_fields(path, episode, EpisodeResult)
+    if content["counterfactual"] not in COUNTERFACTUALS:
+        raise RecordError(
+            f"`counterfactual` must be one of {', '.join(COUNTERFACTUALS)} in {path}. "
+            f"Got {content['counterfactual']!r}."
+        )
+    return EvaluationRecord(**{**content, "episodes": [EpisodeResult(**episode) for episode in episodes]})
+
+
+def _check_fields(path: Path, content: Mapping[str, Any], kind: type[Any]) -> None:
+    expected = {field.name for field in fields(kind)}
+    if set(content) != expected:
+        missing, unknown = sorted(expected - set(content)), sorted(set(content) - expected)
+        raise RecordError(
+            f"{path} is damaged or of another version: {kind.__name__} lacks {missing or 'nothing'}, and has "
+            f"the unknown {unknown or 'nothing'}."
+        )
