@@ -8,16 +8,21 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from gym_deltaco.tasks import N_TASKS, OBJECTS
 
 RECORD_FORMAT = 1
 RECORDS_FOLDER = "evaluations"
 
 Counterfactual = Literal["none", "demo", "instruction"]
 COUNTERFACTUALS: tuple[Counterfactual, ...] = get_args(Counterfactual)
+# The key of an evaluation's `versions` under which the environment's id is, the benchmark's version.
+BENCHMARK = "benchmark"
 
 
 class RecordError(ValueError):
@@ -37,6 +42,8 @@ class EpisodeResult:
         success: Whether the scene's task succeeded, at any step.
         objects: Which of the 32 objects stand in the scene, three of them.
         object_containers: Where each of them lies at the end: 0 green, 1 red.
+        container_quadrants: Where the green and the red container stand, (2, 2): i, 0 right and 1 left, and
+            j, 0 back and 1 front. It decides what a position word of another task would mean in this scene.
         target_object: The object that the scene's task asks for.
         target_container: The container that the scene's task asks for.
         grasped_object: The object that the gripper held last.
@@ -52,6 +59,7 @@ class EpisodeResult:
     success: bool
     objects: list[int]
     object_containers: list[int]
+    container_quadrants: list[list[int]]
     target_object: int
     target_container: int
     grasped_object: int
@@ -71,11 +79,12 @@ class EvaluationRecord:
         step: Training step of the checkpoint.
         evaluation_seed: With the step, it decides the scenes.
         counterfactual: "none"; "demo" or "instruction": that was another task's.
+        ambiguity: Of the scenes: "container", the paper's scheme (i), or "object", scheme (ii).
         tasks: The selection of tasks, such as "scenario_a_test".
         trials: Episodes of each task.
         episodes: What happened.
         policy: The policy's configuration.
-        versions: Of the benchmark and the packages that matter.
+        versions: Of the benchmark ("benchmark": the environment's id) and the packages that matter.
         command: What was typed.
         seconds: How long the episodes took, s.
     """
@@ -86,6 +95,7 @@ class EvaluationRecord:
     step: int
     evaluation_seed: int
     counterfactual: Counterfactual
+    ambiguity: Literal["container", "object"]
     tasks: str
     trials: int
     episodes: list[EpisodeResult]
@@ -129,29 +139,91 @@ def read_record(path: Path) -> EvaluationRecord:
     if not isinstance(content, dict) or content.get("format") != RECORD_FORMAT:
         found = content.get("format") if isinstance(content, dict) else None
         raise RecordError(
-            f"{path} is not a record of an evaluation in the format {RECORD_FORMAT}. Its format is {found!r}. "
+            f"{path} is not a record of an evaluation in format {RECORD_FORMAT}: its format is {found!r}. "
             "Evaluate the checkpoint again with `deltaco-evaluate`."
         )
     del content["format"]
-    episodes = content.get("episodes")
-    if not isinstance(episodes, list) or not episodes:
+    _check_fields(path, content, EvaluationRecord, but="episodes")
+    if BENCHMARK not in content["versions"]:
+        raise RecordError(f"{path} does not say of which version of the benchmark it is (`versions`).")
+    if not isinstance(content["episodes"], list) or not content["episodes"]:
         raise RecordError(f"{path} has no episodes.")
-    _check_fields(path, content, EvaluationRecord)
-    for episode in episodes:
+    for episode in content["episodes"]:
         _check_fields(path, episode, EpisodeResult)
-    if content["counterfactual"] not in COUNTERFACTUALS:
-        raise RecordError(
-            f"`counterfactual` must be one of {', '.join(COUNTERFACTUALS)} in {path}. "
-            f"Got {content['counterfactual']!r}."
-        )
-    return EvaluationRecord(**{**content, "episodes": [EpisodeResult(**episode) for episode in episodes]})
+    episodes = [EpisodeResult(**episode) for episode in content["episodes"]]
+    for episode in episodes:
+        _check_numbers(path, episode)
+    return EvaluationRecord(**{**content, "episodes": episodes})
 
 
-def _check_fields(path: Path, content: Mapping[str, Any], kind: type[Any]) -> None:
+@cache
+def _types(kind: type[Any]) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _check_fields(path: Path, content: Any, kind: type[Any], but: str | None = None) -> None:
+    """Checks that a record or an episode has its fields, of their types (those of one field excepted)."""
+    if not isinstance(content, dict):
+        raise RecordError(f"{path} is damaged: it has {content!r} where {kind.__name__} is due.")
     expected = {field.name for field in fields(kind)}
     if set(content) != expected:
         missing, unknown = sorted(expected - set(content)), sorted(set(content) - expected)
         raise RecordError(
             f"{path} is damaged or of another version: {kind.__name__} lacks {missing or 'nothing'}, and has "
             f"the unknown {unknown or 'nothing'}."
+        )
+    for name, value_kind in _types(kind).items():
+        if name != but and not _is_a(content[name], value_kind):
+            raise RecordError(
+                f"{path} is damaged: `{name}` must be {_in_words(value_kind)}. Got {content[name]!r}."
+            )
+
+
+def _is_a(value: Any, kind: Any) -> bool:
+    """Whether a value of JSON is of a field's type."""
+    origin = get_origin(kind)
+    if origin is Literal:
+        return value in get_args(kind)
+    if origin is UnionType:
+        return any(_is_a(value, option) for option in get_args(kind))
+    if origin is list:
+        return isinstance(value, list) and all(_is_a(item, get_args(kind)[0]) for item in value)
+    if origin is dict:
+        return isinstance(value, dict) and all(_is_a(item, get_args(kind)[1]) for item in value.values())
+    if kind is Any:
+        return True
+    if kind is float:
+        return type(value) in (int, float)
+    return type(value) is kind  # True is no int here
+
+
+def _in_words(kind: Any) -> str:
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(get_args(kind))}"
+    return kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
+
+
+def _check_numbers(path: Path, episode: EpisodeResult) -> None:
+    """Checks that the numbers of an episode name something that there is."""
+    n_objects = len(episode.objects)
+    in_range = (
+        ("task_id", [episode.task_id], range(N_TASKS)),
+        ("objects", episode.objects, range(len(OBJECTS))),
+        ("object_containers", episode.object_containers, range(-1, 2)),
+        ("container_quadrants", sum(episode.container_quadrants, []), range(2)),
+        ("target_object", [episode.target_object], range(n_objects)),
+        ("target_container", [episode.target_container], range(2)),
+        ("grasped_object", [episode.grasped_object], range(-1, n_objects)),
+    )
+    for name, values, valid in in_range:
+        if any(value not in valid for value in values):
+            raise RecordError(
+                f"{path} is damaged: `{name}` must be in {valid.start}..{valid.stop - 1}. Got {values}."
+            )
+    shape = [len(ij) for ij in episode.container_quadrants]
+    if len(episode.object_containers) != n_objects or shape != [2, 2]:
+        raise RecordError(
+            f"{path} is damaged: `object_containers` must have a number for each of `objects`, and "
+            f"`container_quadrants` the shape (2, 2). Got {episode.object_containers} and "
+            f"{episode.container_quadrants}."
         )
