@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from huggingface_hub import hf_hub_download
+from huggingface_hub import ModelCard, hf_hub_download
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
@@ -28,6 +29,7 @@ from lerobot_deltaco.policy.losses import (
     cosine_loss,
     gaussian_negative_log_likelihood,
 )
+from lerobot_deltaco.policy.model_card import model_card
 from lerobot_deltaco.policy.networks import ConditionedPolicy, DemoEncoder, frame_array, random_crop
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
@@ -409,6 +411,20 @@ class DeltacoPolicy(PreTrainedPolicy):
             path = Path(hf_hub_download(str(pretrained_name_or_path), TASKS_FILE, **options))
         policy._read_tasks(path)
         return policy
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str,
+        model_type: str,
+        license: str | None,
+        tags: list[str] | None,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> ModelCard:
+        """The card that goes to the Hub with the policy. LeRobot's arguments."""
+        shown = list(self.shown.rows) if self.shown is not None else []
+        n_known = len(self.instructions.rows)
+        return model_card(self.config, shown, n_known, dataset_repo_id, license, tags, cfg, dataset_meta)
 
     def _read_tasks(self, path: Path) -> None:
         with safe_open(path, framework="pt") as file:

@@ -1,4 +1,4 @@
-"""A small dataset unlike the benchmark's (two cameras, a gripper in the middle), and a fake sentence encoder."""
+"""A small dataset unlike the benchmark's (two cameras, a gripper in the middle); a fake sentence encoder."""
 
 import hashlib
 

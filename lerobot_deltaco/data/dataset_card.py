@@ -13,7 +13,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
@@ -28,7 +27,7 @@ from gym_deltaco.tasks import SCENARIOS, TASKS, Task
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import HISTORY_FILE
 from lerobot_deltaco.data.collection_plan import CollectionPlan
-from lerobot_deltaco.templates import template_folder
+from lerobot_deltaco.templates import env_options, render
 
 CARD_FILE = Path("README.md")
 TASKS_PICTURE = Path("assets/tasks.png")
@@ -135,11 +134,8 @@ def card_text(root: Path, repo_id: str | None = None) -> str:
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
     image = info["features"]["observation.image"]
-    environment = jinja2.Environment(
-        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
-    )
-    template = environment.from_string((template_folder() / _TEMPLATE).read_text(encoding="utf-8"))
-    return template.render(
+    return render(
+        _TEMPLATE,
         metadata=metadata.to_yaml().strip(),
         title=title,
         repo_id=repo_id,
@@ -160,7 +156,7 @@ def card_text(root: Path, repo_id: str | None = None) -> str:
         expert=_expert(history, plans),
         megabytes=_size(root) / 1e6,
         kilobytes_per_episode=_size(root) / 1e3 / info["total_episodes"],
-        env_options=_env_options(image),
+        env_options=env_options(image),
     )
 
 
@@ -250,16 +246,6 @@ def _expert(history: Sequence[Mapping[str, Any]], plans: Sequence[CollectionPlan
         {"kind": kind, "attempts": n, "episodes": successes[kind], "rate": successes[kind] / n}
         for kind, n in attempts.items()
     ]
-
-
-def _env_options(image: Mapping[str, Any]) -> str:
-    """Options of `--env.type=deltaco` which make it show what the dataset shows."""
-    options = []
-    if image["shape"][0] != 48:
-        options.append(f" --env.image_size={image['shape'][0]}")
-    if image["info"]["ambiguity"] != "container":
-        options.append(f" --env.ambiguity={image['info']['ambiguity']}")
-    return "".join(options)
 
 
 def _size(root: Path) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,24 @@ def training_episodes(meta: LeRobotDatasetMetadata) -> list[int]:
     They are those of `--dataset.episodes`, less the last share of each task that `--dataset.eval_split` holds
     back; all of them if neither is given, or outside of that command.
     """
-    episodes = _dataset_option("episodes") or list(range(meta.total_episodes))
-    share = _dataset_option("eval_split") or 0.0
+    return kept_episodes(meta, _dataset_option("episodes"), _dataset_option("eval_split") or 0.0)
+
+
+def kept_episodes(
+    meta: LeRobotDatasetMetadata, episodes: Sequence[int] | None, eval_split: float
+) -> list[int]:
+    """What is left of episodes for training.
+
+    Args:
+        meta: Of their dataset.
+        episodes: Which ones; None or none is all of them.
+        eval_split: Share of each task that is held back, the last ones.
+    """
+    tasks = meta.episodes["tasks"][:]  # at once: one after another takes long
     by_task: dict[str, list[int]] = defaultdict(list)
-    for episode in episodes:
-        by_task[meta.episodes[episode]["tasks"][0]].append(episode)
-    kept = (task[: len(task) - math.ceil(len(task) * share)] for task in by_task.values())
+    for episode in episodes or range(meta.total_episodes):
+        by_task[tasks[episode][0]].append(episode)
+    kept = (task[: len(task) - math.ceil(len(task) * eval_split)] for task in by_task.values())
     return [episode for task in kept for episode in task]
 
 

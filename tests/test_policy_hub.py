@@ -1,0 +1,314 @@
+"""A policy's card, and the policy's way to the Hub and back, with real clients and a fake Hub."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from fake_hub import USER, WITHOUT_CARD_CHECK, FakeHub
+from huggingface_hub import ModelCard
+from lerobot.cameras.opencv import OpenCVCameraConfig  # noqa: F401  (`type: opencv` on the command line)
+from lerobot.configs import FeatureType, PolicyFeature, parser
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.robots import so_follower  # noqa: F401  (`--robot.type=so101_follower`)
+from lerobot.rollout.configs import RolloutConfig
+from small_policies import EPISODES_PER_TASK, REPO_ID, TASKS, small_policy, use_fake_encoder, write_dataset
+
+from gym_deltaco import ENV_ID
+from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
+from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
+from lerobot_deltaco.configuration_env import DeltacoEnv
+from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.model_card import MAX_TASKS_LISTED, METHOD_TEXTS, model_card
+
+POLICY_ID = f"{USER}/policy"
+
+
+@pytest.fixture(autouse=True)
+def _language(monkeypatch):
+    use_fake_encoder(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    episodes = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
+    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data") / "shown", [*TASKS, "juggle"])
+
+
+def foreign_card(dataset, train_config=None, **options):
+    """The card of a small policy, as a push makes it, and the policy."""
+    policy, _, _ = small_policy(dataset, repo_id=POLICY_ID, **options)
+    config = policy.config
+    return policy.generate_model_card(
+        REPO_ID, config.type, config.license, config.tags, cfg=train_config, dataset_meta=dataset.meta
+    ), policy
+
+
+def benchmark_card(train_config=None, plan=None, shown_tasks=(), **options):
+    """The card of a policy that was trained on the benchmark."""
+    plan = plan or CollectionPlan("4,50-59", 2)
+    config = DeltacoConfig(
+        device="cpu",
+        repo_id=POLICY_ID,
+        input_features={
+            "observation.image": PolicyFeature(FeatureType.VISUAL, (3, plan.image_size, plan.image_size)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (10,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
+        **options,
+    )
+    config.resolve(plan.features)
+    meta = SimpleNamespace(
+        features=plan.features,
+        total_episodes=plan.n_episodes,
+        episodes={"tasks": [[BENCHMARK_TASKS[task].instruction] for task in plan.task_ids for _ in range(2)]},
+        robot_type="widowx_250",
+        fps=10,
+    )
+    return model_card(config, shown_tasks, 0, f"{USER}/t11", train_config=train_config, meta=meta)
+
+
+def words_of(card):
+    """The card without line breaks, backquotes and asterisks."""
+    return " ".join(re.sub("[`*]", "", card.text).split())
+
+
+def commands(card):
+    """The commands in a card, as lists of words."""
+    blocks = re.findall(r"```bash\n(.*?)```", card.text, re.DOTALL)
+    return [shlex.split(line) for line in "".join(blocks).replace("\\\n", " ").splitlines()]
+
+
+@parser.wrap()
+def parsed_eval(config: EvalPipelineConfig):
+    return config
+
+
+@parser.wrap()
+def parsed_rollout(config: RolloutConfig):
+    return config
+
+
+def parsed(command, folder, monkeypatch):
+    """What LeRobot makes of a command, with the policy in a folder."""
+    filled = {POLICY_ID: str(folder), "ROBOT": "so101_follower", "PORT": "/dev/null", "TASKS": "4"}
+    program, *words = [re.sub("|".join(filled), lambda match: filled[match[0]], word) for word in command]
+    monkeypatch.setattr("sys.argv", [program, *words])
+    return {"lerobot-eval": parsed_eval, "lerobot-rollout": parsed_rollout}[program]()
+
+
+# The card
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_a_card(dataset, method):
+    card, _ = foreign_card(dataset, method=method)
+    assert set(METHOD_TEXTS) == set(METHODS)
+    name, summary = METHOD_TEXTS[method]
+    assert f"# {name}, trained on {REPO_ID}" in card.text
+    assert summary in card.text
+    assert "None" not in card.text
+    assert "\n\n\n" not in card.text
+    uses_demo = method not in ("language_only", "one_hot")
+    assert ("--policy.demo_repo_id" in card.text) == uses_demo
+    assert ("| a demonstration is | 1 x 2 frames" in card.text) == uses_demo
+    uses_language = method != "one_hot"
+    assert ("paraphrase-MiniLM-L3-v2" in card.text) == uses_language
+
+
+def test_the_metadata_are_what_the_hub_searches(dataset):
+    card, _ = foreign_card(dataset, license="mit", tags=["cups", "lerobot"])
+    data = ModelCard(str(card)).data
+    assert (data.library_name, data.pipeline_tag, data.license) == ("lerobot", "robotics", "mit")
+    assert data.datasets == [REPO_ID]
+    assert {"lerobot", "robotics", "deltaco", "cups"} <= set(data.tags)
+    assert len(data.tags) == len(set(data.tags))
+    assert data.model_name == "deltaco"
+    assert data.eval_results is None
+    assert foreign_card(dataset)[0].data.license == "apache-2.0"
+
+
+def test_the_card_says_what_was_trained_and_on_what(dataset):
+    train_config = TrainPipelineConfig(
+        DatasetConfig(REPO_ID, episodes=[0, 1, 2, 3]), steps=12_345, batch_size=24, seed=77
+    )
+    card, _ = foreign_card(dataset, train_config, seed=5, language_encoder="all-distilroberta-v1")
+    text = words_of(card)
+    assert f"Trained on: {REPO_ID}, 4 episodes of 2 tasks" in text
+    rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", card.text, re.MULTILINE))
+    assert (rows["steps"], rows["batch size"], rows["seed"]) == ("12,345", "24", "77")
+    assert (rows["optimizer"], rows["learning rate"]) == ("adam", "0.0003")
+    assert (rows["backbone"], rows["seed of demonstrations and crops"]) == ("strided", "5")
+    assert rows["through FiLM, into each residual block"] == "the embedding of the demonstration"
+    assert "embedding of the instruction, and the robot's state" in text
+    assert "contrastive, with the instructions of the batch; weight 10, temperature 0.1" in text
+    encoder = LANGUAGE_ENCODERS["all-distilroberta-v1"].repo_id
+    assert f"https://huggingface.co/{encoder}" in rows["language encoder"]
+    assert "independent re-creation" in text
+    assert "arxiv.org/abs/2210.04476" in text
+    assert "@inproceedings{yu2023deltaco" in card.text
+
+
+def test_an_ablation_is_named(dataset):
+    card, _ = foreign_card(dataset, film="language", concat="demo", encoder_loss="cosine")
+    changed = "film is language, concat is demo, encoder_loss is cosine."
+    assert f"an ablation of that method: {changed}" in words_of(card)
+    assert "ablation" not in foreign_card(dataset)[0].text
+
+
+def test_the_demonstrations_that_it_carries_are_listed(dataset, shown):
+    text = words_of(foreign_card(dataset)[0])
+    assert "carries no demonstrations" in text
+    card, _ = foreign_card(dataset, demo_repo_id=REPO_ID, demo_root=str(shown.root))
+    assert "carries demonstrations of 4 tasks" in words_of(card)
+    assert all(f"\n- {task}\n" in card.text for task in [*TASKS, "juggle"])
+    assert str(shown.root) not in card.text
+    many = [f"task\n {number}" for number in range(MAX_TASKS_LISTED + 3)]
+    text = benchmark_card(shown_tasks=many).text
+    assert "\n- task 9\n" in text
+    assert "\n- task 10\n" not in text
+    assert "\n- and 3 more\n" in text
+
+
+def test_a_policy_of_the_benchmark_names_its_version():
+    card = benchmark_card()
+    text = words_of(card)
+    assert f'Benchmark version: {ENV_ID}, ambiguity scheme "container"' in text
+    assert "Pictures by: PyBullet" in text
+    assert "22 episodes of 11 tasks" in text
+    evaluation = commands(card)[0]
+    assert "--env.task=TASKS" in evaluation
+    other = CollectionPlan("4", 2, image_size=64, ambiguity="object")
+    train_config = TrainPipelineConfig(DatasetConfig(f"{USER}/t11"), env=DeltacoEnv(task="50-59"))
+    evaluation = commands(benchmark_card(train_config, other))[0]
+    assert {"--env.task=50-59", "--env.image_size=64", "--env.ambiguity=object"} <= set(evaluation)
+
+
+def test_the_card_says_only_what_is_known():
+    config = DeltacoConfig(
+        device="cpu",
+        input_features={"observation.image": PolicyFeature(FeatureType.VISUAL, (3, 48, 48))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+    )
+    config.resolve(None)
+    text = model_card(config, [], 0, None).text
+    for unknown in ("Trained on", "Benchmark version", "| steps |", "| seed |", "None"):
+        assert unknown not in text
+    assert "| learning rate | 0.0003 |" in text
+
+
+@pytest.mark.parametrize("has_demonstrations", [False, True])
+def test_the_commands_of_the_card_are_lerobots(dataset, shown, tmp_path, monkeypatch, has_demonstrations):
+    source = {"demo_repo_id": REPO_ID, "demo_root": str(shown.root)} if has_demonstrations else {}
+    card, policy = foreign_card(dataset, **source)
+    policy.save_pretrained(tmp_path)
+    plain, with_demonstrations = commands(card)
+    config = parsed(plain, tmp_path, monkeypatch)
+    assert config.policy.demo_repo_id is None
+    assert config.task == TASKS[0]
+    assert set(config.robot.cameras) == {"top", "wrist"}
+    assert (config.robot.cameras["top"].width, config.robot.cameras["top"].height) == (28, 20)
+    config = parsed([*with_demonstrations, "--policy.demo_episode=0"], tmp_path, monkeypatch)
+    assert (config.policy.demo_repo_id, config.policy.demo_episode) == ("USER/DEMOS", 0)
+
+    card = benchmark_card(shown_tasks=TASKS if has_demonstrations else [])
+    plain, with_demonstrations = commands(card)
+    config = parsed(plain, tmp_path, monkeypatch)
+    assert (config.env.type, config.env.task) == ("deltaco", "4")
+    assert parsed(with_demonstrations, tmp_path, monkeypatch).policy.demo_repo_id == "USER/DEMOS"
+
+
+# The way to the Hub and back
+
+PUSH_AND_FETCH = """
+import re, sys
+from pathlib import Path
+
+import torch
+from huggingface_hub import ModelCard
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies import make_pre_post_processors
+from small_policies import *
+
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+
+root, policy_id = Path(sys.argv[1]), sys.argv[2]
+fake_encoder.calls = []
+language.load_language_encoder = fake_encoder
+dataset = write_dataset(root / "train", [*TASKS, *TASKS])
+shown = write_dataset(root / "shown", [*TASKS, "juggle"])
+policy, before, after = small_policy(
+    dataset, repo_id=policy_id, push_to_hub=True, demo_repo_id=REPO_ID, demo_root=str(shown.root)
+)
+policy(before(batch_of(dataset, [0, 7])))
+policy.eval()
+seen = observation(dataset, ["juggle", "wave"])
+expected = after(policy.select_action(before(seen)))
+
+# As `lerobot-train` does at its end.
+train_config = TrainPipelineConfig(DatasetConfig(REPO_ID, root=str(dataset.root)), policy=policy.config)
+policy.push_model_to_hub(train_config, dataset_meta=dataset.meta)
+before.push_to_hub(policy_id)
+after.push_to_hub(policy_id)
+policy.push_to_hub(policy_id + "-bare")
+
+for name in (policy_id, policy_id + "-bare"):
+    fake_encoder.calls = []
+    fetched = DeltacoPolicy.from_pretrained(name)
+    if name == policy_id:
+        before, after = make_pre_post_processors(fetched.config, name)
+    assert torch.equal(after(fetched.select_action(before(seen))), expected)
+    assert fake_encoder.calls == []
+    for (key, value), (other, twin) in zip(
+        policy.state_dict().items(), fetched.state_dict().items(), strict=True
+    ):
+        assert key == other and torch.equal(value, twin), key
+    assert fetched.shown.tasks == policy.shown.tasks
+    assert torch.equal(fetched.shown.frames, policy.shown.frames)
+    assert torch.equal(fetched.shown.episodes, policy.shown.episodes)
+    assert fetched.instructions.rows == policy.instructions.rows
+    assert torch.equal(fetched.instructions.embeddings, policy.instructions.embeddings)
+    assert fetched.config.demo_repo_id is None
+
+# The example in the card.
+card = ModelCard.load(policy_id)
+exec(re.search(r"```python\\n(.+?)```", card.text, re.DOTALL)[1])
+assert action.shape == (1, 3)
+"""
+
+
+def test_a_pushed_policy_is_fetched_by_its_name(tmp_path):
+    with FakeHub() as hub:
+        result = subprocess.run(
+            [sys.executable, "-c", WITHOUT_CARD_CHECK + PUSH_AND_FETCH, str(tmp_path), POLICY_ID],
+            env={**hub.environment(tmp_path / "home"), "PYTHONPATH": str(Path(__file__).parent)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert result.returncode == 0, result.stderr[-3000:]
+        files = hub.repos["model", POLICY_ID].files()
+        weights = {"config.json", "model.safetensors", "tasks.safetensors"}
+        processors = {"policy_preprocessor.json", "policy_postprocessor.json"}
+        assert {*weights, *processors, "train_config.json", "README.md"} <= set(files)
+        assert set(hub.repos["model", f"{POLICY_ID}-bare"].files()) == weights
+        for name in ("README.md", "config.json"):
+            assert str(tmp_path) not in files[name].decode()
+        assert json.loads(files["config.json"])["demo_repo_id"] is None
+
+        card = ModelCard(files["README.md"].decode())
+        assert card.data.datasets == [REPO_ID]
+        assert "carries demonstrations of 4 tasks" in words_of(card)
