@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -39,6 +40,7 @@ ENCODER_LOSSES = ("contrastive", "cosine", "none")
 # Strides of the eight residual blocks.
 BACKBONES = MappingProxyType({"paper": (1, 1, 1, 1, 1, 1, 1, 1), "strided": (1, 1, 1, 1, 2, 1, 2, 1)})
 DEMO_ENCODERS = ("cnn",)
+GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
 DTYPES = ("float32", "bfloat16")
 
 
@@ -65,7 +67,8 @@ class DeltacoConfig(PreTrainedConfig):
         backbone: paper or strided.
         gripper: Which dimension of the action is the gripper: an index, "auto" (the last one whose name
             contains "gripper", if any) or "none".
-        gripper_weight: Of the gripper's squared error in the imitation loss.
+        gripper_loss: squared_error, or cross_entropy (ours).
+        gripper_weight: Of the gripper's loss in the imitation loss; by default 30, or 3 for cross_entropy.
         encoder_loss_weight: Of the encoder's loss, lambda in the paper's equation 4.
         temperature: Of the contrastive loss.
         crop_padding: Pixels by which pictures are shifted at random in training, 0 for none.
@@ -75,8 +78,15 @@ class DeltacoConfig(PreTrainedConfig):
             sentences of one's own.
         demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default those
             that are trained on.
+        drop_n_last_frames: How many of the last frames of each episode are not trained on.
+        tasks_per_batch: With `deltaco-train`, the number of tasks in a batch, with as many samples each (the
+            paper: 16 tasks x 64 samples); 0 for samples of any tasks.
+        upsampled_tasks: With `deltaco-train`, a regular expression; the tasks in which it is found get
+            `upsampled_share` of each batch.
+        upsampled_share: See above; the paper's scenario B has 0.5.
         seed: Of the draws of demonstrations and crops, which are a function of it and the step.
         dtype: float32 or bfloat16, of the networks' arithmetic.
+        compile: Whether the networks are compiled, which pays on a GPU.
         optimizer_lr: Learning rate of Adam.
         grad_clip_norm: Greatest norm of the gradient, 0 for no limit.
     """
@@ -92,7 +102,8 @@ class DeltacoConfig(PreTrainedConfig):
     image_size: int = 48
     backbone: str = "paper"
     gripper: str = "auto"
-    gripper_weight: float = 30.0
+    gripper_loss: str = "squared_error"
+    gripper_weight: float | None = None
     encoder_loss_weight: float = 10.0
     temperature: float = 0.1
     crop_padding: int = 4
@@ -100,8 +111,13 @@ class DeltacoConfig(PreTrainedConfig):
     demo_root: str | None = None
     demo_episode: int | None = None
     demo_episodes: list[int] | None = None
+    drop_n_last_frames: int = 0
+    tasks_per_batch: int = 0
+    upsampled_tasks: str | None = None
+    upsampled_share: float = 0.5
     seed: int = 0
     dtype: str = "float32"
+    compile: bool = False
     optimizer_lr: float = 3e-4
     grad_clip_norm: float = 0.0
     push_to_hub: bool = False
@@ -126,7 +142,10 @@ class DeltacoConfig(PreTrainedConfig):
         self._check_choice("language_encoder", LANGUAGE_ENCODERS)
         self._check_choice("demo_encoder", DEMO_ENCODERS)
         self._check_choice("backbone", BACKBONES)
+        self._check_choice("gripper_loss", GRIPPER_LOSSES)
         self._check_choice("dtype", DTYPES)
+        if self.gripper_weight is None:
+            self.gripper_weight = GRIPPER_LOSSES[self.gripper_loss]
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
             raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
         for name, minimum in (
@@ -136,6 +155,8 @@ class DeltacoConfig(PreTrainedConfig):
             ("gripper_weight", 0),
             ("encoder_loss_weight", 0),
             ("crop_padding", 0),
+            ("drop_n_last_frames", 0),
+            ("tasks_per_batch", 0),
             ("seed", 0),
             ("grad_clip_norm", 0),
         ):
@@ -149,7 +170,25 @@ class DeltacoConfig(PreTrainedConfig):
                 "A demonstration has its first and its last frame: `demo_rows` * `demo_columns` must be "
                 f"at least 2. Got {self.n_demo_frames}."
             )
+        self._check_upsampling()
         self._check_conditioning()
+
+    def _check_upsampling(self) -> None:
+        if self.upsampled_tasks is None:
+            return
+        try:
+            re.compile(self.upsampled_tasks)
+        except re.error as error:
+            raise ValueError(
+                f"`upsampled_tasks` must be a regular expression. Got {self.upsampled_tasks!r}: {error}."
+            ) from None
+        if not 0 < self.upsampled_share < 1:
+            raise ValueError(f"`upsampled_share` must be between 0 and 1. Got {self.upsampled_share}.")
+        if self.tasks_per_batch < 2:
+            raise ValueError(
+                "`upsampled_tasks` get a share of the tasks of a batch: `tasks_per_batch` must be at least "
+                f"2. Got {self.tasks_per_batch}."
+            )
 
     def _check_choice(self, name: str, valid: Collection[str]) -> None:
         value = getattr(self, name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import threading
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -28,10 +29,14 @@ from lerobot_deltaco.policy.losses import (
     contrastive_loss,
     cosine_loss,
     gaussian_negative_log_likelihood,
+    gripper_loss,
 )
 from lerobot_deltaco.policy.model_card import model_card
 from lerobot_deltaco.policy.networks import ConditionedPolicy, DemoEncoder, frame_array, random_crop
+from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.training_episodes import training_episodes
+
+logger = logging.getLogger(__name__)
 
 # Beside the weights: embeddings of instructions, and the demonstrations for evaluation.
 TASKS_FILE = "tasks.safetensors"
@@ -74,6 +79,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         self.instructions = InstructionTable(config.language_encoder)
         self.shown: DemonstrationSet | None = None  # for evaluation
         self.trained_on: DemonstrationSet | None = None  # for training; read when the first batch comes
+        self._knows_all_episodes = False  # whether each episode that is trained on is surely among those
         if config.demo_repo_id is not None:
             self.shown = self._load(config.demo_repo_id, config.demo_root, None)
         if config.method == "one_hot" and not config.one_hot_tasks:
@@ -113,6 +119,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         )
         # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
+        if config.compile:
+            for network in (self.policy, self.demo_encoder):
+                if network is not None:
+                    network.compile()
         self._told: dict[int, _Told] = {}
         self._n_episodes: dict[int, int] = {}
         self.reset()
@@ -123,7 +133,7 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     # Training
 
-    def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+    def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, LoggedScalars]:
         """The loss of a batch: L = L_pi + lambda L_demo (the paper's equation 4).
 
         Args:
@@ -147,10 +157,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         demo = language = None
         if self.config.uses_demo:
             demo = self._encode_demo(*self._draw(batch["episode_index"], generator), generator)
-        distinct = list(dict.fromkeys(tasks))
-        column = torch.tensor([distinct.index(task) for task in tasks], device=device)
+        distinct = {task: n for n, task in enumerate(dict.fromkeys(tasks))}
+        column = torch.tensor([distinct[task] for task in tasks], device=device)
         if self.config.uses_language:
-            known = self.instructions(distinct, device)  # (distinct, embedding)
+            known = self.instructions(list(distinct), device)  # (distinct, embedding)
             language = known[column]  # (batch, embedding)
 
         if self.config.method == "mcil":
@@ -175,8 +185,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             logged["demo_accuracy"] = (logits.argmax(dim=1) == column).float().mean()
         if self.training:
             self.step += 1
-        values = torch.stack([value.detach().float() for value in logged.values()]).tolist()
-        return loss.mean() if reduction == "mean" else loss, dict(zip(logged, values, strict=True))
+        return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
 
     def _imitation_loss(
         self, batch: dict[str, Any], images: Tensor, film: Tensor, concat: Tensor | None
@@ -189,19 +198,35 @@ class DeltacoPolicy(PreTrainedPolicy):
         logged = {"motion_nll": likelihood.mean(), "motion_mse": (mean.float() - motion).square().mean()}
         if gripper is None:
             return likelihood, logged
-        error = (gripper.float() - target).square()
-        logged["gripper_mse"] = error.mean()
-        logged["gripper_accuracy"] = ((gripper > 0.5) == (target > 0.5)).float().mean()
+        error = gripper_loss(gripper.float(), target, self.config.gripper_loss)
+        logged["gripper_loss"] = error.mean()
+        logged["gripper_accuracy"] = ((gripper > 0) == (target > 0.5)).float().mean()
         return likelihood + self.config.gripper_weight * error, logged
+
+    def demonstrate_with(self, demonstrations: DemonstrationSet) -> None:
+        """Gives demonstrations for training, instead of those that the first batch would read from the disk.
+
+        Args:
+            demonstrations: Among them is every episode that is trained on.
+        """
+        self.trained_on = demonstrations
+        self._knows_all_episodes = True
 
     def _draw(self, episodes: Tensor, generator: torch.Generator) -> tuple[DemonstrationSet, Tensor]:
         """The demonstrations, and the row of each sample's."""
         if self.trained_on is None:
             if self._meta is None:
                 raise ValueError("Only a policy that was made with a dataset's metadata can be trained.")
+            if self.config.tasks_per_batch:
+                logger.warning(
+                    "`tasks_per_batch` has no effect here: this loop draws samples of any tasks. Train with "
+                    "`deltaco-train`, which takes the same arguments."
+                )
             chosen = self.config.demo_episodes or training_episodes(self._meta)
             self.trained_on = self._load(self._meta.repo_id, self._meta.root, chosen).to(episodes.device)
-        return self.trained_on, self.trained_on.others(episodes, generator)
+        return self.trained_on, self.trained_on.others(
+            episodes, generator, check=not self._knows_all_episodes
+        )
 
     def _generator(self) -> torch.Generator:
         rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
@@ -241,7 +266,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             if told is None or told.tasks != tasks:
                 told = self._told[threading.get_ident()] = self._tell(tasks, images.device)
             mean, gripper = self.policy(images, told.film, self._concatenated(batch, told.concat))
-        return self._joined(mean.float(), None if gripper is None else gripper.float())
+        return self._joined(mean.float(), None if gripper is None else torch.sigmoid(gripper.float()))
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The mean action as a chunk of one, (batch, 1, action)."""
@@ -338,10 +363,9 @@ class DeltacoPolicy(PreTrainedPolicy):
                 f"The task {unknown!r} is not among the {len(self.config.one_hot_tasks)} that this one-hot "
                 "policy knows: those of its training and demonstration datasets."
             )
-        indices = torch.tensor(
-            [self.config.one_hot_tasks.index(task) for task in tasks], device=self.step.device
-        )
-        return F.one_hot(indices, len(self.config.one_hot_tasks)).float()
+        places = {task: n for n, task in enumerate(self.config.one_hot_tasks)}
+        indices = torch.tensor([places[task] for task in tasks], device=self.step.device)
+        return F.one_hot(indices, len(places)).float()
 
     def _encode_demo(self, shown: DemonstrationSet, rows: Tensor, generator: torch.Generator) -> Tensor:
         """Unit embeddings of demonstrations, (batch, embedding)."""

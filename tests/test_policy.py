@@ -140,7 +140,7 @@ def test_every_method_trains_and_acts_and_leaves_the_batch_alone(make, dataset, 
 def test_the_loss_is_the_papers_sum(make, dataset):
     policy, before, _ = make()
     loss, logged = policy(before(batch_of(dataset, [0, 7, 20])))
-    expected = logged["motion_nll"] + 30 * logged["gripper_mse"] + 10 * logged["encoder_loss"]
+    expected = logged["motion_nll"] + 30 * logged["gripper_loss"] + 10 * logged["encoder_loss"]
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 

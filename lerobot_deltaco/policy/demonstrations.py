@@ -64,12 +64,13 @@ class DemonstrationSet(torch.nn.Module):
                 single[0],
             )
 
-    def others(self, episodes: Tensor, generator: torch.Generator) -> Tensor:
+    def others(self, episodes: Tensor, generator: torch.Generator, check: bool = True) -> Tensor:
         """Draws for each sample another episode of its task.
 
         Args:
             episodes: The samples' own, (batch,), as indices of the dataset.
             generator: Source of the draws, on the CPU.
+            check: Whether to look if they are all in the set, for which a GPU is waited for.
 
         Returns:
             Rows, (batch,). A task's only episode demonstrates itself.
@@ -80,7 +81,7 @@ class DemonstrationSet(torch.nn.Module):
         draws = torch.rand(len(episodes), generator=generator).to(self.frames.device)
         known = episodes < len(self._row_of_episode)
         rows = torch.where(known, self._row_of_episode[episodes.clamp(max=len(self._row_of_episode) - 1)], -1)
-        if (rows < 0).any():
+        if check and (rows < 0).any():
             raise ValueError(
                 f"Episode {int(episodes[rows < 0][0])} is trained on, but is not among those that "
                 "demonstrations are drawn from. Name all of them in `demo_episodes`."
@@ -139,22 +140,39 @@ def load_demonstrations(
     episodes = list(range(total)) if episodes is None else list(episodes)
     if not episodes or not all(0 <= episode < total for episode in episodes):
         raise ValueError(f"{repo_id} has the episodes 0 to {total - 1}. Got {episodes[:5]}.")
-    n_kept = 2 if n_demo_frames == 2 else max(N_KEPT_FRAMES, n_demo_frames)
     frames, tasks = [], []
     for episode in tqdm(episodes, desc="Reading demonstrations", unit="episode", leave=False):
         row = dataset.meta.episodes[episode]
-        first, last = row["dataset_from_index"], row["dataset_to_index"] - 1
-        indices = torch.linspace(first, last, n_kept).round().long().tolist()
+        indices = kept_frames(row["dataset_from_index"], row["dataset_to_index"] - 1, n_demo_frames).tolist()
         pictures = torch.stack([dataset[index][camera] for index in indices])  # (kept, 3, h, w)
         frames.append(scaled_pictures(pictures, image_size))
         tasks.append(row["tasks"][0])
     return DemonstrationSet(torch.stack(frames), tasks, episodes)
 
 
+def kept_frames(first: int, last: int, n_demo_frames: int) -> Tensor:
+    """Which frames of an episode are kept for demonstrations, (kept,) int64.
+
+    Args:
+        first: Its first frame.
+        last: Its last frame.
+        n_demo_frames: Frames of a demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
+    """
+    n_kept = 2 if n_demo_frames == 2 else max(N_KEPT_FRAMES, n_demo_frames)
+    # In double precision, which holds every index of a large dataset.
+    return torch.linspace(first, last, n_kept, dtype=torch.float64).round().long()
+
+
+def as_bytes(pictures: Tensor) -> Tensor:
+    """Pictures, uint8 or 0..1, as uint8."""
+    if pictures.dtype == torch.uint8:
+        return pictures
+    return (pictures * 255).round().clamp(0, 255).to(torch.uint8)
+
+
 def scaled_pictures(pictures: Tensor, size: int) -> Tensor:
     """Pictures (..., 3, H, W), uint8 or 0..1, as uint8 (..., 3, size, size)."""
-    if pictures.dtype != torch.uint8:
-        pictures = (pictures * 255).round().clamp(0, 255).to(torch.uint8)
+    pictures = as_bytes(pictures)
     if pictures.shape[-2:] == (size, size):
         return pictures
     flat = pictures.flatten(0, -4).float()

@@ -24,6 +24,22 @@ def gaussian_negative_log_likelihood(mean: Tensor, log_std: Tensor, target: Tens
     return (0.5 * scaled.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(dim=-1)
 
 
+def gripper_loss(logit: Tensor, target: Tensor, kind: str) -> Tensor:
+    """How far the gripper, the sigmoid of a logit, is from its target.
+
+    Args:
+        logit: (batch,).
+        target: (batch,) in 0..1.
+        kind: "squared_error", the paper's, or "cross_entropy".
+
+    Returns:
+        (batch,).
+    """
+    if kind == "squared_error":
+        return (torch.sigmoid(logit) - target).square()
+    return F.binary_cross_entropy_with_logits(logit, target, reduction="none")
+
+
 def contrastive_logits(demo: Tensor, language: Tensor, temperature: float) -> Tensor:
     """How alike each demonstration is to each instruction: the logits of the paper's equation 3.
 

@@ -89,7 +89,8 @@ class ConditionedPolicy(nn.Module):
             concat: (batch, concat_dim), None if it is 0.
 
         Returns:
-            Mean of the motion, (batch, motion_dim), and the gripper in 0..1, (batch,), or None.
+            Mean of the motion, (batch, motion_dim), and the gripper's logit, (batch,), or None. (Its sigmoid
+            is the gripper in 0..1.)
         """
         n_cameras = images.shape[1]
         if film is not None:
@@ -99,7 +100,7 @@ class ConditionedPolicy(nn.Module):
         )  # (batch * cameras, c, h, w)
         points = rearrange(self.spatial_softmax(maps), "(b n) p -> b (n p)", n=n_cameras)
         features = points if concat is None else torch.cat([points, concat], dim=-1)  # (batch, feature_dim)
-        gripper = None if self.gripper is None else torch.sigmoid(self.gripper(features)).squeeze(-1)
+        gripper = None if self.gripper is None else self.gripper(features).squeeze(-1)
         return self.motion(features), gripper
 
 
@@ -127,7 +128,7 @@ class FilmResNet(nn.Module):
 
     def forward(self, images: Tensor, film: Tensor | None) -> Tensor:
         """From (batch, 3, H, W) to maps (batch, channels, h, w)."""
-        x = self.stem(images)
+        x = self.stem(images.contiguous(memory_format=torch.channels_last))
         for block in self.blocks:
             x = block(x, film)
         return x
@@ -229,7 +230,8 @@ class DemoEncoder(nn.Module):
 
     def forward(self, demonstrations: Tensor) -> Tensor:
         """From (batch, 3, height, width) in 0..1 to unit vectors (batch, embedding_dim)."""
-        return F.normalize(self.layers(self.convolutions(demonstrations)), dim=-1)
+        maps = self.convolutions(demonstrations.contiguous(memory_format=torch.channels_last))
+        return F.normalize(self.layers(maps), dim=-1)
 
 
 def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:

@@ -1,0 +1,1 @@
+"""Fast training: LeRobot's own loop, over frames in memory and batches of tasks."""

@@ -1,0 +1,196 @@
+"""The frames of a LeRobotDataset in memory: decoded once, fetched by index in whole batches."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+from lerobot.datasets import LeRobotDataset
+from PIL import Image
+from torch import Tensor
+from tqdm import tqdm
+
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet, as_bytes, kept_frames, scaled_pictures
+
+# Rows that are decoded at a time.
+CHUNK = 1024
+# Of a memory's free bytes, the share that frames may take: the rest is for training.
+GREATEST_SHARE = {"cuda": 0.6, "cpu": 0.8}
+
+
+class FramesInMemory:
+    """All frames that a dataset has selected, by their place in it.
+
+    Args:
+        dataset: The dataset; its `episodes` are those that are held.
+        device: Where batches are wanted, and frames are held if they fit.
+        image_size: Height and width to which pictures are scaled, None for their own.
+
+    Raises:
+        MemoryError: The frames do not fit into the memory of this machine.
+        ValueError: The dataset changes pictures when they are read.
+    """
+
+    def __init__(
+        self, dataset: LeRobotDataset, device: torch.device | str = "cpu", image_size: int | None = None
+    ) -> None:
+        if dataset.image_transforms is not None:
+            raise ValueError(
+                "Frames in memory are decoded once and cannot be transformed at random each time. Leave out "
+                "--dataset.image_transforms (the policy has `crop_padding`), or train with `lerobot-train`."
+            )
+        self.device = torch.device(device)
+        self.held_on = self._choose_device(dataset, image_size)
+        table = dataset.hf_dataset.with_format("numpy")
+        cameras = dataset.meta.camera_keys
+        self.columns: dict[str, Tensor] = {}
+        self.texts: dict[str, list[str]] = {}
+        for name in table.column_names:
+            if name in cameras:
+                continue
+            values = np.asarray(table[name])
+            if values.dtype.kind in "OUS":
+                self.texts[name] = [str(value) for value in values]
+            else:
+                self.columns[name] = torch.from_numpy(values).to(self.held_on)
+        self.task_names = list(dataset.meta.tasks.sort_values("task_index").index)
+        self._task_of = self.columns["task_index"].reshape(-1).tolist()
+        for camera in cameras:
+            self.columns[camera] = _pictures(dataset, camera, image_size, self.held_on)
+        self._dataset = dataset
+        # Where each episode lies here: rows of an episode follow one another.
+        episodes = self.columns["episode_index"].reshape(-1).cpu().numpy()
+        numbers, first = np.unique(episodes, return_index=True)
+        last = len(episodes) - 1 - np.unique(episodes[::-1], return_index=True)[1]
+        self.spans = {int(n): (int(a), int(b)) for n, a, b in zip(numbers, first, last, strict=True)}
+
+    def __len__(self) -> int:
+        return len(self._task_of)
+
+    @property
+    def tasks(self) -> np.ndarray:
+        """The task of each frame, (frames,) int64, as `task_index`."""
+        return np.array(self._task_of)
+
+    def batch(self, indices: Tensor) -> dict[str, Any]:
+        """What LeRobot's data loader would give for these frames, with pictures as uint8.
+
+        Args:
+            indices: Places of frames in the dataset, (batch,) int64.
+
+        Returns:
+            Every feature, (batch, ...), on the device; "task" and other texts as lists.
+        """
+        places = indices.tolist()
+        rows = indices.to(self.held_on)
+        found: dict[str, Any] = {
+            name: values[rows].to(self.device, non_blocking=True) for name, values in self.columns.items()
+        }
+        for name, texts in self.texts.items():
+            found[name] = [texts[place] for place in places]
+        found["task"] = [self.task_names[self._task_of[place]] for place in places]
+        return found
+
+    def demonstrations(
+        self, camera: str, image_size: int, n_demo_frames: int, episodes: Sequence[int] | None = None
+    ) -> DemonstrationSet:
+        """The demonstrations among the frames.
+
+        Args:
+            camera: Key of the pictures.
+            image_size: Height and width to which they are scaled.
+            n_demo_frames: Frames of a demonstration.
+            episodes: Which of the episodes; all by default.
+        """
+        episodes = list(self.spans) if episodes is None else list(episodes)
+        rows = torch.stack([kept_frames(*self.spans[episode], n_demo_frames) for episode in episodes])
+        pictures = self.columns[camera][rows.to(self.held_on)]  # (episodes, kept, 3, h, w)
+        tasks = [self.task_names[self._task_of[self.spans[episode][0]]] for episode in episodes]
+        return DemonstrationSet(scaled_pictures(pictures, image_size), tasks, episodes).to(self.device)
+
+    def _choose_device(self, dataset: LeRobotDataset, image_size: int | None) -> torch.device:
+        needed = needed_bytes(dataset, image_size)
+        allowed = {"cpu": int(psutil.virtual_memory().available * GREATEST_SHARE["cpu"])}
+        if self.device.type == "cuda":
+            allowed["cuda"] = int(torch.cuda.mem_get_info(self.device)[0] * GREATEST_SHARE["cuda"])
+        if needed <= allowed.get(self.device.type, 0):
+            return self.device
+        if needed <= allowed["cpu"]:
+            return torch.device("cpu")
+        raise MemoryError(
+            f"The {dataset.num_frames:,} frames take {needed / 1e9:.1f} GB of memory, and "
+            f"{allowed['cpu'] / 1e9:.1f} GB may be used here. Train on fewer episodes (--dataset.episodes), "
+            "or with `lerobot-train`, which reads them from the disk."
+        )
+
+
+def needed_bytes(dataset: LeRobotDataset, image_size: int | None = None) -> int:
+    """Bytes that the frames of a dataset take, pictures as uint8."""
+    per_frame = 0
+    for name, feature in dataset.meta.features.items():
+        if name not in dataset.meta.camera_keys:
+            per_frame += 8 * int(np.prod(feature["shape"]))
+        elif image_size is None:
+            per_frame += int(np.prod(feature["shape"]))
+        else:
+            per_frame += 3 * image_size**2
+    return per_frame * dataset.num_frames
+
+
+def _pictures(dataset: LeRobotDataset, camera: str, image_size: int | None, device: torch.device) -> Tensor:
+    """Pictures of a camera, (frames, 3, H, W) uint8."""
+    is_image = dataset.meta.features[camera]["dtype"] == "image"
+    read = _stored_pictures(dataset, camera) if is_image else _read_pictures(dataset, camera)
+    n_frames = dataset.num_frames
+    pictures: Tensor | None = None
+    with (
+        ThreadPoolExecutor(os.cpu_count()) as threads,
+        tqdm(total=n_frames, desc=f"Decoding {camera}", unit="frame") as progress,
+    ):
+        for start in range(0, n_frames, CHUNK):
+            rows = range(start, min(start + CHUNK, n_frames))
+            chunk = torch.stack(list(threads.map(read(rows), range(len(rows)))))
+            if image_size is not None:
+                chunk = scaled_pictures(chunk, image_size)
+            if pictures is None:
+                pictures = torch.empty(n_frames, *chunk.shape[1:], dtype=torch.uint8, device=device)
+            pictures[rows.start : rows.stop] = chunk.to(device)
+            progress.update(len(rows))
+    assert pictures is not None
+    return pictures
+
+
+Reader = Callable[[range], Callable[[int], Tensor]]
+
+
+def _stored_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
+    """Reads pictures of an `image` feature: the stored files are decoded."""
+    table = dataset.hf_dataset.with_format("arrow")
+
+    def read(rows: range) -> Callable[[int], Tensor]:
+        files = table[rows.start : rows.stop][camera].to_pylist()
+
+        def decode(number: int) -> Tensor:
+            picture = np.array(Image.open(io.BytesIO(files[number]["bytes"])).convert("RGB"))
+            return torch.from_numpy(picture).permute(2, 0, 1)
+
+        return decode
+
+    return read
+
+
+def _read_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
+    """Reads pictures of a `video` feature, as LeRobot does."""
+
+    def read(rows: range) -> Callable[[int], Tensor]:
+        # One after another: a decoder is not to be shared by threads.
+        pictures = [as_bytes(dataset[row][camera]) for row in rows]
+        return pictures.__getitem__
+
+    return read

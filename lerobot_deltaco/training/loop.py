@@ -1,0 +1,157 @@
+"""LeRobot's own training loop, over frames in memory.
+
+LeRobot has no hook for the dataset and the sampler. So while a training runs, four names in the module of its
+loop stand for others: the function that makes the datasets, the sampler, the iterator over batches, and the
+function that makes the policy. All else, from the arguments to the checkpoints, is LeRobot's.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
+from lerobot.policies import PreTrainedPolicy
+from lerobot.scripts import lerobot_train
+from torch import Tensor
+
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.training.frames import FramesInMemory
+from lerobot_deltaco.training.task_batches import TaskBatchSampler
+
+logger = logging.getLogger(__name__)
+
+
+class _Places(torch.utils.data.Dataset):
+    """Stands for a dataset where LeRobot loads batches: what it gives are places of frames, no frames."""
+
+    def __init__(self, dataset: LeRobotDataset) -> None:
+        self._dataset = dataset
+
+    def __len__(self) -> int:
+        return len(self._dataset)
+
+    def __getitem__(self, place: int) -> int:
+        return place
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._dataset, name)
+
+
+class InMemoryTraining:
+    """What stands for LeRobot's functions during one training."""
+
+    def __init__(self) -> None:
+        self._config: TrainPipelineConfig | None = None
+        self._frames: FramesInMemory | None = None
+        self._make_datasets = lerobot_train.make_train_eval_datasets
+        self._make_policy = lerobot_train.make_policy
+        self._cycle = lerobot_train.cycle
+
+    @contextmanager
+    def active(self) -> Iterator[None]:
+        """Lets LeRobot's loop run over frames in memory."""
+        with patch.multiple(
+            lerobot_train,
+            make_train_eval_datasets=self.make_datasets,
+            make_policy=self.make_policy,
+            EpisodeAwareSampler=self.make_sampler,
+            cycle=self.batches,
+        ):
+            yield
+
+    def make_datasets(self, config: TrainPipelineConfig) -> tuple[_Places, LeRobotDataset | None]:
+        """LeRobot's datasets, the first of them read into memory.
+
+        Raises:
+            ValueError: The policy is another one, or the data cannot be held in memory.
+            MemoryError: The frames do not fit.
+        """
+        if not isinstance(config.policy, DeltacoConfig):
+            raise ValueError(
+                "`deltaco-train` trains --policy.type=deltaco alone. Use `lerobot-train` for others."
+            )
+        if config.dataset.streaming:
+            raise ValueError("`deltaco-train` holds all frames in memory: leave out --dataset.streaming.")
+        self._config = config
+        # The loader has nothing to do: it gives places, and the frames are gathered on the device.
+        config.num_workers = 0
+        train, evaluation = self._make_datasets(config)
+        # Scaled beforehand where that takes less memory than the pictures as they are.
+        size: int | None = config.policy.image_size
+        shapes = [train.meta.features[camera]["shape"] for camera in train.meta.camera_keys]
+        if all(3 * size**2 >= np.prod(shape) for shape in shapes):
+            size = None
+        self._frames = FramesInMemory(train, self._device(config.policy), size)
+        return _Places(train), evaluation
+
+    def make_policy(self, **arguments: Any) -> PreTrainedPolicy:
+        """LeRobot's policy, which draws its demonstrations from the frames in memory."""
+        policy = self._make_policy(**arguments)
+        config, frames = policy.config, self._frames
+        assert isinstance(policy, DeltacoPolicy)
+        assert frames is not None
+        if config.uses_demo and config.demo_episodes is None:
+            camera = next(iter(config.image_features))
+            policy.demonstrate_with(frames.demonstrations(camera, config.image_size, config.n_demo_frames))
+        return policy
+
+    def make_sampler(self, from_indices: Any, to_indices: Any, **options: Any) -> Any:
+        """Batches of tasks if they are wanted, else LeRobot's sampler."""
+        stock = EpisodeAwareSampler(from_indices, to_indices, **options)
+        assert self._config is not None
+        assert self._frames is not None
+        config: DeltacoConfig = self._config.policy
+        if not config.tasks_per_batch:
+            return stock
+        tasks = self._frames.tasks
+        use = np.zeros(len(tasks), dtype=bool)
+        use[stock.indices] = True
+        upsampled = []
+        if config.upsampled_tasks is not None:
+            names = self._frames.task_names
+            upsampled = [n for n, name in enumerate(names) if re.search(config.upsampled_tasks, name)]
+            if not set(upsampled) & set(tasks[use].tolist()):
+                raise ValueError(
+                    f"`upsampled_tasks` is {config.upsampled_tasks!r}, which is found in no task of the "
+                    f"dataset. They are such as {names[0]!r}."
+                )
+        return TaskBatchSampler(
+            tasks,
+            self._config.batch_size,
+            config.tasks_per_batch,
+            upsampled,
+            config.upsampled_share,
+            seed=options.get("seed", 0),
+            use=use,
+        )
+
+    def batches(self, loader: Any) -> Iterator[dict[str, Any]]:
+        """Batches without end, for a loader of places."""
+        assert self._frames is not None
+        places: Tensor
+        for places in self._cycle(loader):
+            yield self._frames.batch(places)
+
+    @staticmethod
+    def _device(config: DeltacoConfig) -> torch.device:
+        if config.device == "cpu":
+            return torch.device("cpu")
+        # The one that accelerate gives to this process.
+        from accelerate import PartialState
+
+        return PartialState().device
+
+
+def train() -> None:
+    """Trains as the command line says: `lerobot-train`, over frames in memory."""
+    with InMemoryTraining().active():
+        lerobot_train.main()

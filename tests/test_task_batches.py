@@ -1,0 +1,93 @@
+"""Batches of tasks: what is in them, and that their order is a function of the seed."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from lerobot_deltaco.training.task_batches import TaskBatchSampler
+
+# 7 tasks of 10, 20, ... 70 frames.
+TASKS = np.repeat(np.arange(7), np.arange(10, 80, 10))
+
+
+def batches(sampler):
+    return np.array(list(sampler)).reshape(-1, sampler.batch_size)
+
+
+@pytest.mark.parametrize("tasks_per_batch", [1, 3, 4, 7])
+def test_a_batch_has_as_many_samples_of_each_of_its_tasks(tasks_per_batch):
+    sampler = TaskBatchSampler(TASKS, 5 * tasks_per_batch, tasks_per_batch)
+    drawn = batches(sampler)
+    assert drawn.size == len(sampler)
+    for batch in drawn:
+        counts = Counter(TASKS[batch].tolist())
+        assert list(counts.values()) == [5] * tasks_per_batch
+
+
+def test_every_task_is_in_as_many_batches_and_every_frame_of_it_drawn_as_often():
+    sampler = TaskBatchSampler(TASKS, 20, 4)
+    drawn = batches(sampler).ravel()
+    per_task = Counter(TASKS[drawn].tolist())
+    assert set(per_task) == set(range(7))
+    assert max(per_task.values()) - min(per_task.values()) <= 5  # the samples of one visit
+    per_frame = np.bincount(drawn, minlength=len(TASKS))
+    for task in range(7):
+        counts = per_frame[TASKS == task]
+        assert counts.max() - counts.min() <= 1
+
+
+def test_no_frame_is_drawn_twice_before_all_of_its_task_were():
+    drawn = batches(TaskBatchSampler(np.zeros(30, dtype=int), 10, 1)).ravel()
+    assert sorted(drawn) == list(range(30))
+
+
+def test_upsampled_tasks_get_their_share_of_each_batch():
+    sampler = TaskBatchSampler(TASKS, 24, 4, upsampled=[0, 1], upsampled_share=0.5)
+    for batch in batches(sampler):
+        assert np.isin(TASKS[batch], [0, 1]).mean() == 0.5
+        assert len(set(TASKS[batch])) == 4
+
+
+def test_the_order_is_a_function_of_seed_and_epoch():
+    first, again = TaskBatchSampler(TASKS, 12, 3, seed=5), TaskBatchSampler(TASKS, 12, 3, seed=5)
+    np.testing.assert_array_equal(batches(first), batches(again))
+    assert not np.array_equal(first.order(0), first.order(1))
+    assert not np.array_equal(first.order(0), TaskBatchSampler(TASKS, 12, 3, seed=6).order(0))
+    # The second iteration is the second epoch.
+    np.testing.assert_array_equal(batches(again).ravel(), first.order(1))
+
+
+def test_a_resumed_epoch_goes_on_where_it_was():
+    sampler = TaskBatchSampler(TASKS, 12, 3)
+    whole = batches(sampler).ravel()
+    sampler.load_state_dict({"epoch": 0, "start_index": 36})
+    np.testing.assert_array_equal(np.array(list(sampler)), whole[36:])
+    np.testing.assert_array_equal(batches(sampler).ravel(), sampler.order(1))
+
+
+def test_frames_that_are_not_used_are_not_drawn():
+    use = np.arange(len(TASKS)) % 2 == 0
+    drawn = batches(TaskBatchSampler(TASKS, 12, 3, use=use)).ravel()
+    assert use[drawn].all()
+    assert set(TASKS[drawn]) == set(range(7))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"batch_size": 10, "tasks_per_batch": 4}, "10 samples cannot hold 4 tasks.*such as 8"),
+        ({"batch_size": 16, "tasks_per_batch": 8}, "8 different tasks, but the dataset has only 7"),
+        (
+            {"batch_size": 8, "tasks_per_batch": 4, "upsampled": [0], "upsampled_share": 0.5},
+            "2 different upsampled tasks, but the dataset has only 1",
+        ),
+        (
+            {"batch_size": 8, "tasks_per_batch": 4, "upsampled": [0, 1], "upsampled_share": 0.4},
+            "0.4 of 4 tasks is not a whole number",
+        ),
+    ],
+)
+def test_numbers_that_do_not_fit_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        TaskBatchSampler(TASKS, **arguments)

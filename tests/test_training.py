@@ -1,0 +1,196 @@
+"""`deltaco-train`: LeRobot's loop over frames in memory sees what it would read from the disk."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.scripts import lerobot_train
+from safetensors.torch import load_file
+from small_policies import REPO_ID, TASKS, batch_of, use_fake_encoder, write_dataset
+
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.demonstrations import load_demonstrations
+from lerobot_deltaco.training.frames import FramesInMemory, needed_bytes
+from lerobot_deltaco.training.loop import InMemoryTraining
+
+EPISODES = [task for task in TASKS for _ in range(4)]
+
+
+@pytest.fixture(autouse=True)
+def _language(monkeypatch):
+    use_fake_encoder(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", EPISODES)
+
+
+@pytest.fixture
+def train(dataset, tmp_path, monkeypatch):
+    """Runs a training in this process, and returns the folder of its checkpoints."""
+
+    def train(*arguments, name="run", in_memory=True):
+        folder = tmp_path / name
+        defaults = {
+            "policy.type": "deltaco",
+            "policy.device": "cpu",
+            "policy.image_size": "16",
+            "policy.backbone": "strided",
+            "dataset.repo_id": REPO_ID,
+            "dataset.root": str(dataset.root),
+            "batch_size": "6",
+            "steps": "4",
+            "save_freq": "2",
+            "log_freq": "1",
+            "num_workers": "0",
+            "output_dir": str(folder),
+        }
+        given = dict(argument.removeprefix("--").split("=", 1) for argument in arguments)
+        options = given if "resume" in given else {**defaults, **given}
+        monkeypatch.setattr(sys, "argv", ["train", *(f"--{key}={value}" for key, value in options.items())])
+        if in_memory:
+            with InMemoryTraining().active():
+                lerobot_train.main()
+        else:
+            lerobot_train.main()
+        return folder / "checkpoints"
+
+    return train
+
+
+def weights(checkpoint):
+    return load_file(checkpoint / "pretrained_model" / "model.safetensors")
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    different = [name for name in one if not torch.equal(one[name], other[name])]
+    assert different == []
+
+
+@pytest.mark.parametrize("episodes", [None, [1, 4, 5, 11]], ids=["all episodes", "some"])
+def test_frames_equal_those_that_lerobot_reads(dataset, episodes):
+    chosen = LeRobotDataset(REPO_ID, root=dataset.root, episodes=episodes, return_uint8=True)
+    places = [0, 7, 19, 3, 7]
+    expected = batch_of(chosen, places)
+    found = FramesInMemory(chosen).batch(torch.tensor(places))
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        if name in chosen.meta.camera_keys:
+            # LeRobot's loop does the same to pictures of bytes.
+            found[name] = found[name].to(torch.float32) / 255
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(found[name], value, rtol=0, atol=0, msg=name)
+            assert found[name].dtype == value.dtype
+        else:
+            assert found[name] == value
+
+
+def test_demonstrations_equal_those_that_are_read(dataset):
+    frames = FramesInMemory(LeRobotDataset(REPO_ID, root=dataset.root, return_uint8=True))
+    found = frames.demonstrations("observation.images.wrist", 16, 4)
+    expected = load_demonstrations(REPO_ID, dataset.root, None, "observation.images.wrist", 16, 4)
+    assert found.tasks == expected.tasks
+    assert torch.equal(found.episodes, expected.episodes)
+    assert torch.equal(found.frames, expected.frames)
+
+
+def test_training_equals_that_of_lerobots_own_loop(train):
+    # The same seed: the same weights, the same samples, and the same demonstrations of them. (At this size,
+    # pictures are kept as they are; smaller ones would be rounded once more.)
+    stock = train("--policy.image_size=32", name="stock", in_memory=False)
+    memory = train("--policy.image_size=32", name="memory")
+    assert_same(weights(stock / "000004"), weights(memory / "000004"))
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one(train):
+    options = ["--policy.tasks_per_batch=2"]
+    whole = train(*options, "--steps=6", name="whole")
+    part = train(*options, "--steps=6", name="part")
+    config = part / "000002" / "pretrained_model" / "train_config.json"
+    for step in ("000004", "000006"):
+        for file in sorted((part / step).rglob("*"), reverse=True):
+            file.unlink() if file.is_file() else file.rmdir()
+        (part / step).rmdir()
+    train(f"--config_path={config}", "--resume=true", name="part")
+    assert_same(weights(whole / "000006"), weights(part / "000006"))
+
+
+def test_episodes_and_the_split_are_respected(train, monkeypatch):
+    seen = []
+    forward = DeltacoPolicy.forward
+
+    def spy(self, batch, **options):
+        seen.append((self.training, set(batch["episode_index"].tolist())))
+        return forward(self, batch, **options)
+
+    monkeypatch.setattr(DeltacoPolicy, "forward", spy)
+    train("--dataset.episodes=[0,1,2,3,4,5,6]", "--dataset.eval_split=0.4", "--eval_steps=2", "--steps=4")
+    trained = set().union(*(episodes for training, episodes in seen if training))
+    held_back = set().union(*(episodes for training, episodes in seen if not training))
+    assert trained == {0, 1, 4}
+    assert held_back == {2, 3, 5, 6}
+
+
+def test_batches_hold_the_tasks_that_are_wanted(train, monkeypatch):
+    seen = []
+    forward = DeltacoPolicy.forward
+
+    def spy(self, batch, **options):
+        seen.append(batch["task"])
+        return forward(self, batch, **options)
+
+    monkeypatch.setattr(DeltacoPolicy, "forward", spy)
+    train("--policy.tasks_per_batch=2", "--policy.upsampled_tasks=wave", "--policy.upsampled_share=0.5")
+    for tasks in seen:
+        assert tasks.count("wave") == 3
+        assert len(set(tasks)) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--policy.tasks_per_batch=4", "--batch_size=8"], "4 different tasks, but the dataset has only 3"),
+        (["--policy.tasks_per_batch=2", "--policy.upsampled_tasks=dance"], "is found in no task"),
+        (["--dataset.image_transforms.enable=true"], "cannot be transformed at random"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_training(train, options, message):
+    with pytest.raises(ValueError, match=message):
+        train(*options)
+
+
+def test_other_policies_are_sent_to_lerobots_command():
+    config = SimpleNamespace(policy=ACTConfig(push_to_hub=False))
+    with pytest.raises(ValueError, match="--policy.type=deltaco alone. Use `lerobot-train`"):
+        InMemoryTraining().make_datasets(config)
+
+
+def test_too_many_frames_are_refused_before_they_are_read(dataset, monkeypatch):
+    needed = needed_bytes(dataset)
+    assert needed == dataset.num_frames * (20 * 28 * 3 + 24 * 24 * 3 + 8 * (2 + 3 + 5))
+    memory = type("Memory", (), {"available": needed})
+    monkeypatch.setattr("lerobot_deltaco.training.frames.psutil.virtual_memory", lambda: memory)
+    with pytest.raises(MemoryError, match="60 frames take 0.0 GB.*--dataset.episodes"):
+        FramesInMemory(LeRobotDataset(REPO_ID, root=dataset.root, return_uint8=True))
+
+
+def test_what_was_in_lerobots_loop_is_there_again_afterwards(train):
+    before = {name: getattr(lerobot_train, name) for name in ("cycle", "make_policy", "EpisodeAwareSampler")}
+    train("--steps=1")
+    assert {name: getattr(lerobot_train, name) for name in before} == before
+
+
+def test_the_log_has_the_parts_of_the_loss(train, capfd):
+    folder = train("--steps=1")
+    assert (
+        json.loads((folder / "000001" / "pretrained_model" / "config.json").read_text())["type"] == "deltaco"
+    )
+    printed = "".join(capfd.readouterr())
+    for name in ("motion_nll", "gripper_accuracy", "demo_accuracy", "grdn"):
+        assert name in printed
