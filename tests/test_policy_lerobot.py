@@ -1,0 +1,267 @@
+"""What LeRobot asks of its own policies: they are made, saved, loaded, optimized, and trained on videos."""
+
+import copy
+import functools
+
+import numpy as np
+import pytest
+import torch
+from lerobot.common.train_utils import load_training_state, save_checkpoint
+from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.configs.video import RGBEncoderConfig
+from lerobot.datasets import LeRobotDataset
+from lerobot.optim.factory import make_optimizer_and_scheduler
+from lerobot.policies import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
+from small_policies import (
+    EPISODES_PER_TASK,
+    LENGTH,
+    REPO_ID,
+    TASKS,
+    batch_of,
+    observation,
+    small_policy,
+    use_fake_encoder,
+    write_dataset,
+)
+
+from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
+from lerobot_deltaco.configuration_env import DeltacoEnv
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+
+
+@pytest.fixture(autouse=True)
+def _language(monkeypatch):
+    use_fake_encoder(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    episodes = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
+    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
+
+
+@pytest.fixture
+def make(dataset):
+    """Makes a small policy and its processors."""
+    return functools.partial(small_policy, dataset)
+
+
+def assert_equal_weights(policy, other):
+    assert list(policy.state_dict()) == list(other.state_dict())
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name]), name
+
+
+# Construction
+
+
+def test_the_type_names_the_policy_and_its_configuration():
+    assert get_policy_class("deltaco") is DeltacoPolicy
+    assert type(make_policy_config("deltaco", device="cpu")) is DeltacoConfig
+    assert DeltacoPolicy.config_class is DeltacoConfig
+    assert DeltacoPolicy.name == DeltacoConfig(device="cpu").type == "deltaco"
+
+
+def test_a_policy_is_made_for_an_environment():
+    """As `lerobot-eval` does without a checkpoint, and other policies' tests do."""
+    config = make_policy_config("deltaco", device="cpu", backbone="strided", method="language_only")
+    policy = make_policy(config, env_cfg=DeltacoEnv(task="4"))
+    assert set(config.input_features) == {"observation.image", "observation.state"}
+    assert policy.config.action_feature.shape == (4,)
+    assert policy.config.robot_state_feature.shape == (10,)
+
+
+def test_the_datasets_features_become_inputs_and_outputs(make):
+    config = make()[0].config
+    assert {name: feature.shape for name, feature in config.image_features.items()} == {
+        "observation.images.top": (3, 20, 28),
+        "observation.images.wrist": (3, 24, 24),
+    }
+    assert config.robot_state_feature.shape == (2,)
+    assert (config.action_feature.type, config.action_feature.shape) == (FeatureType.ACTION, (3,))
+
+
+def test_inputs_that_are_given_are_kept(dataset):
+    """One camera of two, as `--policy.input_features` says."""
+    config = make_policy_config("deltaco", device="cpu", image_size=16, backbone="strided")
+    both = make_policy(copy.deepcopy(config), ds_meta=dataset.meta).config.input_features
+    config.input_features = {"observation.images.wrist": both["observation.images.wrist"]}
+    policy = make_policy(config, ds_meta=dataset.meta)
+    before, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    loss, _ = policy.train()(before(batch_of(dataset, [0, 7])))
+    assert torch.isfinite(loss)
+    assert list(policy.config.input_features) == ["observation.images.wrist"]
+
+
+def test_a_chunk_is_one_action(make, dataset):
+    policy, before, _ = make(method="language_only")
+    batch = before(observation(dataset, TASKS))
+    policy.eval()
+    assert torch.equal(policy.predict_action_chunk(batch), policy.select_action(batch)[:, None])
+
+
+# Saving and loading
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"method": method} for method in METHODS),
+        {"film": "demo+language", "concat": "none"},
+        {"demo_rows": 2, "crop_padding": 0, "seed": 3},
+        {"gripper": "none", "dtype": "bfloat16", "grad_clip_norm": 1.0},
+    ],
+    ids=str,
+)
+def test_a_policy_and_its_configuration_survive_saving(make, tmp_path, options):
+    policy, _, _ = make(**options)
+    policy.save_pretrained(tmp_path)
+    loaded = DeltacoPolicy.from_pretrained(tmp_path)
+    assert_equal_weights(policy, loaded)
+    assert not loaded.training
+    assert loaded.config == policy.config
+    assert PreTrainedConfig.from_pretrained(tmp_path) == policy.config
+
+
+def test_a_configuration_survives_its_own_file(make, tmp_path):
+    config = make()[0].config
+    config.save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path) == config
+    overridden = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=["--demo_episode=2", "--seed=7"])
+    assert (overridden.demo_episode, overridden.seed) == (2, 7)
+
+
+def test_training_goes_on_from_a_checkpoint_of_lerobots(make, dataset, tmp_path):
+    """Weights, step, Adam's moments: the next update is the same to the bit."""
+    batch = make()[1](batch_of(dataset, [0, 7, 20]))
+
+    def update(policy, optimizer):
+        loss, _ = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    policy, before, after = make()
+    config = TrainPipelineConfig(DatasetConfig(REPO_ID), policy=policy.config, steps=2)
+    config.optimizer = policy.config.get_optimizer_preset()
+    optimizer, scheduler = make_optimizer_and_scheduler(config, policy)
+    assert scheduler is None
+    update(policy, optimizer)
+    save_checkpoint(tmp_path, 1, config, policy, optimizer, scheduler, before, after)
+
+    config.policy.pretrained_path = tmp_path / "pretrained_model"
+    resumed = make_policy(config.policy, ds_meta=dataset.meta).train()
+    other, _ = make_optimizer_and_scheduler(config, resumed)
+    step, other, _ = load_training_state(tmp_path, other, None)
+    assert step == int(resumed.step) == 1
+    update(policy, optimizer)
+    update(resumed, other)
+    assert_equal_weights(policy, resumed)
+
+
+# Processors
+
+
+def test_processors_survive_saving(make, dataset, tmp_path):
+    policy, before, after = make()
+    before.save_pretrained(tmp_path)
+    after.save_pretrained(tmp_path)
+    # As `lerobot-eval` loads them.
+    overrides = {
+        "device_processor": {"device": "cpu"},
+        "rename_observations_processor": {"rename_map": {}},
+    }
+    loaded_before, loaded_after = make_pre_post_processors(
+        policy.config, pretrained_path=str(tmp_path), preprocessor_overrides=overrides
+    )
+    raw = batch_of(dataset, [0, 7, 20])
+    batch, loaded = before(copy.deepcopy(raw)), loaded_before(copy.deepcopy(raw))
+    assert set(batch) == set(loaded)
+    for name, value in batch.items():
+        assert torch.equal(value, loaded[name]) if torch.is_tensor(value) else value == loaded[name]
+    action = torch.rand(3, 3) * 2 - 1
+    assert torch.equal(after(action), loaded_after(action))
+
+
+def test_processors_normalize_and_undo_it(make, dataset):
+    _, before, after = make()
+    raw = batch_of(dataset, list(range(len(dataset))))
+    batch = before(copy.deepcopy(raw))
+    state = batch["observation.state"]
+    torch.testing.assert_close(state.mean(dim=0), torch.zeros(2), atol=1e-4, rtol=0)
+    torch.testing.assert_close(state.std(dim=0, correction=0), torch.ones(2), atol=1e-3, rtol=0)
+    assert batch["action"].min() == pytest.approx(-1, abs=1e-4)
+    assert batch["action"].max() == pytest.approx(1, abs=1e-4)
+    torch.testing.assert_close(after(batch["action"]), raw["action"], atol=1e-3, rtol=0)
+    for camera in dataset.meta.camera_keys:
+        assert torch.equal(batch[camera], raw[camera])
+
+
+# The optimizer
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_optimizer_has_every_weight_of_the_networks_and_no_other(make, dataset, method):
+    policy, before, _ = make(method=method)
+    policy(before(batch_of(dataset, [0, 7])))  # by now, all that is read later is there
+    config = TrainPipelineConfig(DatasetConfig(REPO_ID), policy=policy.config)
+    config.optimizer = policy.config.get_optimizer_preset()
+    optimizer, _ = make_optimizer_and_scheduler(config, policy)
+    (group,) = optimizer.param_groups
+    assert (group["lr"], group["weight_decay"]) == (3e-4, 0)
+    expected = {
+        id(parameter)
+        for network in (policy.policy, policy.demo_encoder, policy.project_language)
+        if network is not None
+        for parameter in network.parameters()
+    }
+    assert {id(parameter) for parameter in group["params"]} == expected
+    assert len(group["params"]) == len(expected)
+    # Neither demonstrations nor embeddings are weights: a checkpoint of the networks stays small.
+    assert not any("shown" in name or "trained_on" in name for name in policy.state_dict())
+
+
+# Videos
+
+
+@pytest.mark.parametrize("codec", ["h264", "libsvtav1"])
+def test_a_dataset_of_videos_trains_and_demonstrates(tmp_path, codec):
+    features = {
+        "observation.images.top": {
+            "dtype": "video",
+            "shape": (64, 96, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "action": {"dtype": "float32", "shape": (2,), "names": ["left.pos", "right.pos"]},
+    }
+    root = tmp_path / "videos"
+    encoder = RGBEncoderConfig(vcodec=codec)
+    dataset = LeRobotDataset.create(REPO_ID, 10, features, root=root, rgb_encoder=encoder)
+    for number, task in enumerate(["wave", "wave", "sing"]):
+        for step in range(LENGTH):
+            dataset.add_frame(
+                {
+                    "observation.images.top": np.full((64, 96, 3), 60 * number + 10 * step, np.uint8),
+                    "action": np.array([number, step], np.float32),
+                    "task": task,
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    dataset = LeRobotDataset(REPO_ID, root=root, video_backend="pyav")
+    assert dataset.meta.video_keys == ["observation.images.top"]
+
+    policy, before, _ = small_policy(dataset, demo_repo_id=REPO_ID, demo_root=str(root))
+    batch = before(batch_of(dataset, [0, 6, 12]))
+    loss, _ = policy(batch)
+    loss.backward()
+    assert torch.isfinite(loss)
+    # Each demonstration is the first and the last frame of its own episode, as well as the codec keeps them.
+    for demonstrations in (policy.trained_on, policy.shown):
+        shades = demonstrations.frames.float().mean(dim=(2, 3, 4))
+        expected = [[60.0 * number, 60.0 * number + 10 * (LENGTH - 1)] for number in range(3)]
+        torch.testing.assert_close(shades, torch.tensor(expected), atol=6, rtol=0)
+    policy.eval()
+    assert policy.select_action(before(observation(dataset, ["sing", "wave"]))).shape == (2, 2)
