@@ -1,0 +1,126 @@
+"""The picture of the learning curves."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_deltaco.evaluation.authors import CHANCE, PUBLISHED, label_of
+
+PANEL_SIZE = (9.0, 4.4)  # inches
+DOTS_PER_INCH = 140
+# The same method has the same color in every picture.
+COLORS = MappingProxyType(
+    {
+        "deltaco": "#c8102e",
+        "demo_only": "#e69f00",
+        "language_only": "#0072b2",
+        "bc_z": "#7f7f7f",
+        "mcil": "#7b4b2a",
+        "one_hot": "#2b3a55",
+        "oracle": "#009e73",
+    }
+)
+_OTHER_COLORS = (
+    "#cc79a7",
+    "#56b4e9",
+    "#6a3d9a",
+    "#a6a600",
+    "#ff7f50",
+    "#33691e",
+    "#17a2b8",
+    "#b15928",
+    "#455a64",
+)
+_OTHER_STYLES = tuple((color, line) for line, color in product(("-", "-.", ":"), _OTHER_COLORS))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The success of an experiment over its training.
+
+    Args:
+        experiment: Its name.
+        steps: Ascending.
+        rates: (steps, seeds), 0..1.
+    """
+
+    experiment: str
+    steps: Sequence[int]
+    rates: NDArray[np.float64]
+
+
+def draw_curves(panels: Sequence[tuple[str, Sequence[Curve]]], authors_levels: bool = False) -> bytes:
+    """Draws success over training steps: the mean over seeds, with a band of one standard deviation.
+
+    Args:
+        panels: Titles and curves, one panel below the other.
+        authors_levels: Draw the authors' rates too, as dashed lines in their experiments' colors.
+
+    Returns:
+        A PNG.
+    """
+    # Only here, so that the command line answers quickly; and without pyplot, which would look for a screen.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    width, height = PANEL_SIZE
+    figure = Figure(figsize=(width, height * len(panels)), dpi=DOTS_PER_INCH, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    for ax, (title, curves) in zip(axes, panels, strict=True):
+        _draw_panel(ax, curves, authors_levels)
+        ax.set_title(title, loc="left", fontsize=12)
+    picture = io.BytesIO()
+    canvas.print_png(picture)
+    return picture.getvalue()
+
+
+def _draw_panel(ax, curves: Sequence[Curve], authors_levels: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    other_styles = iter(_OTHER_STYLES * (1 + len(curves) // len(_OTHER_STYLES)))
+    highest = CHANCE
+    has_levels = False
+    for curve in curves:
+        method = curve.experiment.rpartition("/")[2]
+        color, line = (COLORS[method], "-") if method in COLORS else next(other_styles)
+        mean, sd = curve.rates.mean(axis=1), curve.rates.std(axis=1)
+        n_seeds = curve.rates.shape[1]
+        label = f"{label_of(curve.experiment)} ({n_seeds} seed{'s' * (n_seeds > 1)})"
+        if len(curve.steps) == 1:
+            ax.errorbar(curve.steps, mean, yerr=sd, fmt="o", color=color, capsize=4, label=label)
+        else:
+            ax.fill_between(curve.steps, mean - sd, mean + sd, color=color, alpha=0.15, linewidth=0)
+            marker = "o" if len(curve.steps) <= 20 else None
+            ax.plot(
+                curve.steps, mean, line, color=color, marker=marker, markersize=3.5, linewidth=2, label=label
+            )
+        highest = max(highest, (mean + sd).max())
+        published = PUBLISHED.get(curve.experiment)
+        if authors_levels and published is not None:
+            ax.axhline(published.rate, color=color, linewidth=1, linestyle=(0, (6, 4)), alpha=0.8)
+            highest, has_levels = max(highest, published.rate), True
+    ax.axhline(CHANCE, color="black", linewidth=1, linestyle=(0, (1, 3)))
+    handles, _ = ax.get_legend_handles_labels()
+    handles.append(Line2D([], [], color="black", linewidth=1, linestyle=(0, (1, 3)), label="chance, 1 in 6"))
+    if has_levels:
+        dashes = {"color": "gray", "linewidth": 1, "linestyle": (0, (6, 4))}
+        handles.append(Line2D([], [], **dashes, label="authors' rates\n(another simulation)"))
+    # Beside the axes, where it hides no curve.
+    ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False, fontsize=9)
+    ax.set_xlabel("training step")
+    ax.set_ylabel("success rate")
+    ax.set_xlim(left=0)
+    ax.set_ylim(0, min(1.0, 1.08 * highest))
+    ax.xaxis.set_major_formatter(lambda step, _: f"{step / 1000:g}k" if step >= 1000 else f"{step:g}")
+    ax.yaxis.set_major_formatter(lambda rate, _: f"{100 * rate:g} %")
+    ax.grid(axis="y", color="0.9")
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,394 @@
+"""The report on evaluations: the paper's tables and curves, from the records of several runs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lerobot_deltaco.evaluation.authors import CHANCE, NOTE, PUBLISHED, TITLES, label_of
+from lerobot_deltaco.evaluation.curves import Curve, draw_curves
+from lerobot_deltaco.evaluation.series import Report, Series, counted, find_records, make_report
+from lerobot_deltaco.evaluation.statistics import (
+    CUES,
+    KINDS,
+    N_BEST_SETS,
+    OUTCOMES,
+    WORDS,
+    BreakdownRow,
+    PaperRate,
+    Proportion,
+    breakdown,
+    followed,
+    paper_rate,
+)
+
+REPORT_FILE = "report.md"
+CURVES_PICTURE = "curves.png"
+FILES = (
+    CURVES_PICTURE,
+    "curves.csv",
+    "rates.csv",
+    "breakdown.csv",
+    "counterfactual.csv",
+    REPORT_FILE,
+)
+# Of the policy's configuration: what the report names.
+_NAMED_OPTIONS = ("language_encoder", "demo_encoder", "backbone", "dtype")
+
+
+def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = False) -> Report:
+    """Reports on all evaluations of some runs, in Markdown, CSV files and a picture.
+
+    All files are written, or none. Those of an earlier report are replaced.
+
+    Args:
+        folders: Of runs, or folders with such folders in them, however deep.
+        out: The report's folder, which is made.
+        authors_levels: Draw the authors' rates into the picture.
+
+    Returns:
+        What was reported. Without ordinary evaluations, there are no rates and no curves; without
+        counterfactual ones, no `counterfactual.csv`.
+
+    Raises:
+        ReportError: A folder has no records, or they do not belong together.
+        RecordError: A record is damaged.
+        OSError: Something cannot be read or written.
+    """
+    report = make_report(find_records(folders))
+    contents = {
+        "curves.csv": _csv(_curve_rows(report)),
+        "breakdown.csv": _csv(_breakdown_rows(report)),
+    }
+    if report.regular:
+        contents["rates.csv"] = _csv(_rate_rows(report))
+        panels = [
+            (_title(name), [Curve(series.experiment, series.steps, series.rates) for series in group])
+            for name, group in report.comparisons.items()
+        ]
+        contents[CURVES_PICTURE] = draw_curves(panels, authors_levels)
+    if report.counterfactual:
+        contents["counterfactual.csv"] = _csv(_counterfactual_rows(report))
+    contents[REPORT_FILE] = _markdown(report).encode()
+    _write_files(out, contents)
+    return report
+
+
+# The CSV files. Rates are shares, 0..1.
+
+
+def _rate_rows(report: Report) -> list[dict[str, Any]]:
+    rows = []
+    for series in report.regular:
+        paper, last = paper_rate(series.rates), series.last
+        published = PUBLISHED.get(series.experiment)
+        rows.append(
+            {
+                "experiment": series.experiment,
+                "seeds": _joined(series.seeds),
+                "evaluation_sets": len(series.steps),
+                "best_sets": len(paper.best),
+                "best_steps": _joined(series.steps[index] for index in paper.best),
+                "rate": paper.rate,
+                "sd": paper.sd,
+                "last_step": series.steps[-1],
+                **_proportion_columns(last, "last_"),
+                "authors_rate_in_another_simulation": published and published.rate,
+                "authors_sd_in_another_simulation": published and published.sd,
+            }
+        )
+    return rows
+
+
+def _curve_rows(report: Report) -> list[dict[str, Any]]:
+    return [
+        {
+            "experiment": series.experiment,
+            "counterfactual": series.counterfactual,
+            "seed": item.record.run_seed,
+            "step": item.record.step,
+            "successes": item.result.count,
+            "episodes": item.result.total,
+            "rate": item.result.rate,
+            "counted": item.record.step in series.steps,
+        }
+        for series in report.series
+        for item in series.sets
+    ]
+
+
+def _breakdown_rows(report: Report) -> list[dict[str, Any]]:
+    return [
+        {
+            "experiment": series.experiment,
+            "counterfactual": series.counterfactual,
+            "step": series.steps[-1],
+            "kind_of_task": row.kind,
+            "kind_of_container_word": row.word,
+            "outcome": outcome,
+            **_proportion_columns(proportion),
+        }
+        for series in report.series
+        for row in breakdown(series.last_episodes)
+        for outcome, proportion in row.outcomes.items()
+    ]
+
+
+def _counterfactual_rows(report: Report) -> list[dict[str, Any]]:
+    return [
+        {
+            "experiment": series.experiment,
+            "counterfactual": series.counterfactual,
+            "step": series.steps[-1],
+            "seeds": _joined(series.seeds),
+            "aspect": item.aspect,
+            "among": item.among,
+            "followed": item.cue,
+            **_proportion_columns(item.proportion),
+        }
+        for series in report.counterfactual
+        for item in followed(series.last_episodes, series.counterfactual)
+    ]
+
+
+def _proportion_columns(proportion: Proportion, prefix: str = "") -> dict[str, Any]:
+    low, high = proportion.interval or (None, None)
+    values = {
+        "count": proportion.count,
+        "episodes": proportion.total,
+        "rate": proportion.rate,
+        "wilson_low": low,
+        "wilson_high": high,
+    }
+    return {prefix + name: value for name, value in values.items()}
+
+
+def _joined(numbers: Iterable[int]) -> str:
+    return " ".join(map(str, numbers))
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow(
+            {name: round(value, 6) if isinstance(value, float) else value for name, value in row.items()}
+        )
+    return text.getvalue().encode()
+
+
+# Markdown. Rates are percentages.
+
+
+def _markdown(report: Report) -> str:
+    sections = [
+        "# Evaluation report\n",
+        _introduction(report),
+        *(_comparison_section(name, group) for name, group in report.comparisons.items()),
+    ]
+    if report.regular:
+        sections.append(
+            "## Learning curves\n\n"
+            f"![Success rates over training steps]({CURVES_PICTURE})\n\n"
+            "Lines are means over seeds, bands one standard deviation to both sides. Nothing is smoothed.\n"
+        )
+    if report.counterfactual:
+        sections.append(_counterfactual_section(report.counterfactual))
+    notes = [f"- {note}" for note in report.notes] or ["Nothing."]
+    sections.append("## Left out, and to be minded\n\n" + "\n".join(notes) + "\n")
+    sections.append(_origin_section(report))
+    return "\n".join(sections)
+
+
+def _introduction(report: Report) -> str:
+    return (
+        f"Success rates in {report.series[0].sets[0].benchmark}, in %. Those in another version of the "
+        f"benchmark are not to be compared with them. Picking at random comes to {_percent(CHANCE)}.\n\n"
+        f"- **Rate (SD)** is the paper's: over the {N_BEST_SETS} evaluation sets (steps) with the highest "
+        "mean over seeds, or all if there are fewer, the mean, and the mean of the standard deviation over "
+        "seeds (the population's; – with one seed). It picks its sets by what it then averages, which "
+        "flatters.\n"
+        "- **Last** is the rate at the last step, over the episodes of all seeds, with its 95 % Wilson "
+        "interval. The interval is that of these checkpoints; other seeds may differ more.\n"
+        "- Only steps count of which all seeds of an experiment have a record.\n"
+        f"- **Authors** are the paper's numbers, {NOTE}: compare them with one another, not with ours.\n"
+    )
+
+
+def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
+    example = group[0].sets[0]
+    header = (
+        f"{len(example.task_ids)} tasks (`{example.record.tasks}`), {example.record.trials} trials of each "
+        f"in an evaluation set; evaluation seed {example.record.evaluation_seed}; ambiguity scheme "
+        f"`{example.record.ambiguity}`."
+    )
+    rates = _table(
+        [
+            "experiment",
+            "seeds",
+            "rate (SD)",
+            "of the best",
+            "last [95 %]",
+            "at step",
+            "authors, another simulation",
+        ],
+        [_rate_cells(series) for series in group],
+    )
+    breakdowns = {series.experiment: breakdown(series.last_episodes) for series in group}
+    outcomes = _table(
+        ["experiment", "episodes", *(name.replace("_", " ") for name in OUTCOMES)],
+        [
+            [
+                label_of(experiment),
+                str(rows[0].outcomes["success"].total),
+                *(_percent(proportion.rate) for proportion in rows[0].outcomes.values()),
+            ]
+            for experiment, rows in breakdowns.items()
+        ],
+    )
+    columns = [
+        *((kind, "all") for kind in KINDS),
+        *(("all", word) for word in WORDS),
+        *((kind, word) for kind in KINDS for word in WORDS),
+    ]
+    kinds = _table(
+        ["experiment", *(_group_name(kind, word) for kind, word in columns)],
+        [
+            [label_of(experiment), *(_success(rows, kind, word) for kind, word in columns)]
+            for experiment, rows in breakdowns.items()
+        ],
+    )
+    return (
+        f"## {_title(comparison)}\n\n{header}\n\n{rates}\n"
+        f"What happened at the last step that counts:\n\n{outcomes}\n"
+        "Success there, by how the task asks for its object (name, color, shape) and for its container "
+        f"(color word: green, red; position word: front, back, left, right):\n\n{kinds}"
+    )
+
+
+def _rate_cells(series: Series) -> list[str]:
+    paper, published = paper_rate(series.rates), PUBLISHED.get(series.experiment)
+    return [
+        label_of(series.experiment),
+        ", ".join(map(str, series.seeds)),
+        rate_text(paper),
+        f"{len(paper.best)} of {len(series.steps)} sets",
+        last_text(series.last),
+        f"{series.steps[-1]:,}",
+        "–" if published is None else f"{_percent(published.rate)} ({_percent(published.sd)})",
+    ]
+
+
+def rate_text(paper: PaperRate) -> str:
+    """The paper's rate in %, such as "25.8 (3.4)"."""
+    return f"{_percent(paper.rate)} ({_percent(paper.sd)})"
+
+
+def last_text(last: Proportion) -> str:
+    """A rate in % with its interval, such as "24.1 [20.9, 27.6]"."""
+    low, high = last.interval or (None, None)
+    return f"{_percent(last.rate)} [{_percent(low)}, {_percent(high)}]"
+
+
+def _group_name(kind: str, word: str) -> str:
+    parts = [part.replace("_", " ") for part in (kind, word) if part != "all"]
+    return ", ".join(parts)
+
+
+def _success(rows: Sequence[BreakdownRow], kind: str, word: str) -> str:
+    (row,) = (row for row in rows if (row.kind, row.word) == (kind, word))
+    return _percent(row.outcomes["success"].rate)
+
+
+def _counterfactual_section(group: Sequence[Series]) -> str:
+    parts = [
+        "## Counterfactuals\n\n"
+        "The demonstration or the instruction was another task's than the scene's, at the last step that "
+        "counts. Success is still that of the scene's task. The tables tell whose object was held last, and "
+        "whose container alone got something: in % of the episodes in which that task asks for some of the "
+        "scene's objects (containers), but not all; and of the conflicts, in which demonstration and "
+        "instruction ask for different ones that are both there. Counts and intervals are in "
+        "`counterfactual.csv`.\n"
+    ]
+    for series in group:
+        rows = followed(series.last_episodes, series.counterfactual)
+        shares = {(row.aspect, row.among, row.cue): _share(row.proportion) for row in rows}
+        table = _table(
+            ["followed", "scene's task", "demonstration's", "instruction's", "neither"],
+            [
+                [
+                    f"{aspect}, in conflicts" if among == "conflicts" else aspect,
+                    *(shares.get((aspect, among, cue), "") for cue in (*CUES, "neither")),
+                ]
+                for aspect in ("object", "container")
+                for among in ("all", "conflicts")
+            ],
+        )
+        parts.append(
+            f"### {series.name}\n\n"
+            f"Step {series.steps[-1]:,}, {counted('seed', series.seeds)}; "
+            f"success {last_text(series.last)}.\n\n{table}"
+        )
+    return "\n".join(parts)
+
+
+def _share(proportion: Proportion) -> str:
+    return f"{_percent(proportion.rate)} (of {proportion.total})"
+
+
+def _origin_section(report: Report) -> str:
+    parts = ["## How the records were made\n"]
+    for series in report.series:
+        records = [item.record for item in series.sets]
+        policy = records[-1].policy
+        options = "".join(f", `{name}={policy[name]}`" for name in _NAMED_OPTIONS if name in policy)
+        versions = defaultdict(set)
+        for record in records:
+            for name, version in record.versions.items():
+                versions[name].add(version)
+        commands = dict.fromkeys(record.command for record in records)
+        parts.append(
+            f"### {series.name}\n\n"
+            f"- Policy: `method={records[0].method}`{options}.\n"
+            f"- {counted('seed', series.seeds).capitalize()}; {len(records)} records; "
+            f"{sum(record.seconds for record in records) / 3600:.1f} h of evaluation.\n"
+            f"- {', '.join(f'{name} {" and ".join(sorted(found))}' for name, found in versions.items())}.\n\n"
+            + "\n".join(f"    {line}" for command in commands for line in command.splitlines())
+            + "\n"
+        )
+    return "\n".join(parts)
+
+
+def _title(comparison: str) -> str:
+    return TITLES.get(comparison, comparison or "Experiments")
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.1f}"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _write_files(out: Path, contents: Mapping[str, bytes]) -> None:
+    """Puts all files in place once all of them are written; removes those of an earlier report."""
+    out.mkdir(parents=True, exist_ok=True)
+    unfinished = {name: out / f".{name}.unfinished" for name in contents}
+    try:
+        for name, content in contents.items():
+            unfinished[name].write_bytes(content)
+        for name, path in unfinished.items():
+            os.replace(path, out / name)
+    finally:
+        for path in unfinished.values():
+            path.unlink(missing_ok=True)
+    for name in set(FILES) - set(contents):
+        (out / name).unlink(missing_ok=True)

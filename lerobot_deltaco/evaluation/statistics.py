@@ -1,0 +1,284 @@
+"""The statistics of evaluations: the paper's success rate, intervals, breakdowns and what behaviour followed.
+
+Rates are shares, 0..1. Nothing here reads or writes a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from statistics import NormalDist
+from types import MappingProxyType
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, ContainerWord, Task, get_task
+from lerobot_deltaco.evaluation.record import Counterfactual, EpisodeResult
+
+N_BEST_SETS = 10  # the paper's
+
+
+class PaperRate(NamedTuple):
+    """The success rate of an experiment as the paper reports it.
+
+    Attributes:
+        rate: Mean over the best evaluation sets of the mean over seeds.
+        sd: Mean over the best evaluation sets of the standard deviation over seeds; None of a single seed.
+        best: Which evaluation sets are the best, ascending. Their number is 10, or fewer if there are fewer.
+    """
+
+    rate: float
+    sd: float | None
+    best: tuple[int, ...]
+
+
+def paper_rate(rates: ArrayLike) -> PaperRate:
+    """The paper's success rate: of the 10 evaluation sets with the highest mean over seeds.
+
+    They are chosen by the very episodes that are then averaged, which flatters. With fewer than ten sets, all
+    count. Of sets with the same mean, the earlier ones count. The standard deviation is the population's
+    (NumPy's default, `ddof=0`): the paper does not say which one it is, and with three seeds the sample's
+    would be 22 % greater.
+
+    Args:
+        rates: (sets, seeds), 0..1, at least one of each; sets in the order of their steps.
+
+    Returns:
+        Rate, SD and the rows of `rates` that they are of.
+    """
+    rates = np.asarray(rates, dtype=np.float64)
+    means = rates.mean(axis=1)
+    # Rounded, so that means that are the same but for the order of their sum remain a tie.
+    best = np.sort(np.argsort(-means.round(12), kind="stable")[:N_BEST_SETS])
+    sd = float(rates[best].std(axis=1).mean()) if rates.shape[1] > 1 else None
+    return PaperRate(float(means[best].mean()), sd, tuple(best.tolist()))
+
+
+@dataclass(frozen=True)
+class Proportion:
+    """A count of episodes out of others.
+
+    Args:
+        count: In how many of them it was so.
+        total: How many there are; with 0, rate and interval are None.
+    """
+
+    count: int
+    total: int
+
+    @property
+    def rate(self) -> float | None:
+        """Their share, 0..1."""
+        return self.count / self.total if self.total else None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """The 95 % Wilson interval of the share."""
+        return wilson_interval(self.count, self.total) if self.total else None
+
+
+def wilson_interval(count: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's interval of a share (Wilson 1927): it stays within 0..1, and is not empty at 0 and 1.
+
+    Args:
+        count: In how many episodes it was so.
+        total: Of how many, at least 1.
+        confidence: That the interval covers the true share, 0..1.
+
+    Returns:
+        Its ends.
+    """
+    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    share = count / total
+    middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
+    half = z / (1 + z**2 / total) * sqrt(share * (1 - share) / total + z**2 / (4 * total**2))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+OUTCOMES = MappingProxyType[str, Callable[[EpisodeResult], bool]](
+    {
+        "success": lambda episode: episode.success,
+        "grasped_anything": lambda episode: episode.grasped_object >= 0,
+        "right_object": lambda episode: episode.right_object,
+        "right_container": lambda episode: episode.right_container,
+        "right_object_and_container": lambda episode: episode.right_object and episode.right_container,
+    }
+)
+KINDS = ("name", "color", "shape")
+WORDS = ("color_word", "position_word")
+
+
+class BreakdownRow(NamedTuple):
+    """What happened in the episodes of a group of tasks.
+
+    Attributes:
+        kind: How their object is asked for: name, color, shape, or "all".
+        word: How their container is asked for: color_word (green, red), position_word (front, back, left,
+            right), or "all".
+        outcomes: For each of `OUTCOMES`, in how many episodes it came about.
+    """
+
+    kind: str
+    word: str
+    outcomes: dict[str, Proportion]
+
+
+def breakdown(episodes: Sequence[EpisodeResult]) -> list[BreakdownRow]:
+    """Outcomes of all episodes, by kind of task, by kind of container word, and by both."""
+    rows = []
+    for kind in ("all", *KINDS):
+        for word in ("all", *WORDS):
+            group = [
+                episode
+                for episode in episodes
+                if kind in ("all", get_task(episode.task_id).kind) and word in ("all", _word_kind(episode))
+            ]
+            outcomes = {
+                name: Proportion(sum(map(came_about, group)), len(group))
+                for name, came_about in OUTCOMES.items()
+            }
+            rows.append(BreakdownRow(kind, word, outcomes))
+    return rows
+
+
+def _word_kind(episode: EpisodeResult) -> str:
+    return WORDS[get_task(episode.task_id).is_position_task]
+
+
+Aspect = Literal["object", "container"]
+Cue = Literal["scene", "demonstration", "instruction"]
+CUES: tuple[Cue, ...] = ("scene", "demonstration", "instruction")
+
+
+class Followed(NamedTuple):
+    """How often behaviour was what a cue asks for.
+
+    Attributes:
+        aspect: "object": the one that the gripper held last. "container": the only one in which something
+            lies at the end.
+        among: "all": the episodes in whose scene the cue leaves a choice that it can be seen to follow.
+            "conflicts": those in which, besides, demonstration and instruction ask for different ones.
+        cue: The task of the scene, of the demonstration or of the instruction; of conflicts also "neither".
+        proportion: In how many of those episodes.
+    """
+
+    aspect: Aspect
+    among: Literal["all", "conflicts"]
+    cue: str
+    proportion: Proportion
+
+
+def followed(episodes: Sequence[EpisodeResult], counterfactual: Counterfactual) -> list[Followed]:
+    """What behaviour followed when demonstration and instruction are of different tasks.
+
+    A task asks for those objects of the scene that it describes, whatever the scene is for, and for those
+    containers that its word describes. Two tasks may agree in one of the two; and what a task asks for may
+    not be in the scene, or, with a position word, be both containers. Therefore a cue counts only in scenes
+    in which it asks for some objects (containers), but not for all, and conflicts are counted apart: those in
+    which demonstration and instruction ask for different ones, and either can be followed.
+
+    Args:
+        episodes: Of an evaluation set.
+        counterfactual: What was another task's. The other cue belongs to the scene's task in whatever words.
+
+    Returns:
+        Counts by aspect, among which episodes, and cue.
+    """
+    aspects: tuple[Aspect, ...] = ("object", "container")
+    rows = []
+    for aspect in aspects:
+        asked = [_asked_for(episode, counterfactual, aspect) for episode in episodes]
+        chosen = [
+            _chosen_object(item) if aspect == "object" else _chosen_container(item) for item in episodes
+        ]
+        for cue in CUES:
+            follows = [
+                choice in wanted[cue] for wanted, choice in zip(asked, chosen, strict=True) if wanted[cue]
+            ]
+            rows.append(Followed(aspect, "all", cue, Proportion(sum(follows), len(follows))))
+        conflicts = [
+            {cue: choice in wanted[cue] for cue in CUES[1:]}
+            for wanted, choice in zip(asked, chosen, strict=True)
+            if wanted["demonstration"]
+            and wanted["instruction"]
+            and wanted["demonstration"].isdisjoint(wanted["instruction"])
+        ]
+        for cue in CUES[1:]:
+            count = sum(conflict[cue] for conflict in conflicts)
+            rows.append(Followed(aspect, "conflicts", cue, Proportion(count, len(conflicts))))
+        neither = sum(not any(conflict.values()) for conflict in conflicts)
+        rows.append(Followed(aspect, "conflicts", "neither", Proportion(neither, len(conflicts))))
+    return rows
+
+
+def unknown_sentences(episodes: Sequence[EpisodeResult], counterfactual: Counterfactual) -> int:
+    """In how many episodes the cue that is another task's is a sentence of none of the 300 tasks.
+
+    Nobody knows then what it asks for: as a cue it is not counted.
+    """
+    tasks = (_cue_tasks(episode, counterfactual) for episode in episodes)
+    changed: Cue = "demonstration" if counterfactual == "demo" else "instruction"
+    return sum(counterfactual != "none" and cues[changed] is None for cues in tasks)
+
+
+_TASK_OF_SENTENCE = MappingProxyType({task.instruction: task for task in TASKS})
+
+
+def _cue_tasks(episode: EpisodeResult, counterfactual: Counterfactual) -> dict[Cue, Task | None]:
+    scene_task = get_task(episode.task_id)
+    demonstration = None
+    if episode.demonstration is not None:
+        own = None if counterfactual == "demo" else scene_task
+        demonstration = _TASK_OF_SENTENCE.get(episode.demonstration, own)
+    # A paraphrase is still the scene's task, unless the instruction is what was changed.
+    own = None if counterfactual == "instruction" else scene_task
+    instruction = _TASK_OF_SENTENCE.get(episode.instruction, own)
+    return {"scene": scene_task, "demonstration": demonstration, "instruction": instruction}
+
+
+def _asked_for(
+    episode: EpisodeResult, counterfactual: Counterfactual, aspect: Aspect
+) -> dict[Cue, frozenset[int]]:
+    """Numbers of the objects (containers) for which each cue asks; none where that leaves no choice."""
+    asked = {}
+    for cue, task in _cue_tasks(episode, counterfactual).items():
+        if task is None:
+            numbers = []
+        elif aspect == "container" and task.index == episode.task_id:
+            numbers = [episode.target_container]
+        elif aspect == "container":
+            numbers = [
+                number
+                for number, color in enumerate(CONTAINER_COLORS)
+                if task.container == color
+                or position_satisfies(episode.container_quadrants[number], task.container)
+            ]
+        elif task.index == episode.task_id and cue != "instruction":
+            # In ambiguity scheme (ii), the instruction describes the target's twin as well.
+            numbers = [episode.target_object]
+        else:
+            numbers = [n for n, index in enumerate(episode.objects) if task.describes(OBJECTS[index])]
+        n_options = len(episode.objects) if aspect == "object" else len(episode.container_quadrants)
+        asked[cue] = frozenset(numbers) if len(numbers) < n_options else frozenset()
+    return asked
+
+
+def position_satisfies(quadrant: Sequence[int], word: ContainerWord) -> bool:
+    """Whether a quadrant (i, j) lies where a position word says.
+
+    The same as `gym_deltaco.workspace.Quadrant.satisfies`, which cannot be had without the simulator.
+    """
+    i, j = quadrant
+    return word in (("right", "left")[i], ("back", "front")[j])
+
+
+def _chosen_object(episode: EpisodeResult) -> int | None:
+    return episode.grasped_object if episode.grasped_object >= 0 else None
+
+
+def _chosen_container(episode: EpisodeResult) -> int | None:
+    filled = {container for container in episode.object_containers if container >= 0}
+    return filled.pop() if len(filled) == 1 else None

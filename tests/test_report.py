@@ -1,0 +1,668 @@
+"""The report on evaluations: statistics against numbers worked by hand, and what becomes of odd records."""
+
+import csv
+import json
+import re
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gym_deltaco import ENV_ID
+from gym_deltaco.tasks import CONTAINER_WORDS, TASKS
+from gym_deltaco.workspace import QUADRANTS
+from lerobot_deltaco.commands import report as report_command
+from lerobot_deltaco.evaluation.authors import PUBLISHED, TITLES, in_order, label_of
+from lerobot_deltaco.evaluation.record import (
+    EpisodeResult,
+    EvaluationRecord,
+    RecordError,
+    read_record,
+    record_path,
+    write_record,
+)
+from lerobot_deltaco.evaluation.report import FILES, write_report
+from lerobot_deltaco.evaluation.series import ReportError, counted, find_records, make_report
+from lerobot_deltaco.evaluation.statistics import (
+    breakdown,
+    followed,
+    paper_rate,
+    position_satisfies,
+    unknown_sentences,
+    wilson_interval,
+)
+
+# Names, colors and shapes; a color word and position words.
+TASK_IDS = (24, 32, 45, 124, 132, 145)
+VERSIONS = {"benchmark": ENV_ID, "lerobot": "0.6.1"}
+
+
+def task_named(row, word):
+    return TASKS[50 * CONTAINER_WORDS.index(word) + row]
+
+
+def episode(task_id, trial=0, success=False, **changes):
+    """The target, number 0, goes where it shall, or nothing happens. Green is in front, on the right."""
+    task = TASKS[task_id]
+    container = int(task.container not in ("green", "front", "right"))
+    result = EpisodeResult(
+        task_id=task_id,
+        trial=trial,
+        seed=task_id,
+        instruction=task.instruction,
+        demonstration=task.instruction,
+        success=success,
+        objects=[task.targets[0], *[index for index in range(32) if index not in task.targets][:2]],
+        object_containers=[container if success else -1, -1, -1],
+        container_quadrants=[[0, 1], [1, 0]],
+        target_object=0,
+        target_container=container,
+        grasped_object=0 if success else -1,
+        right_object=success,
+        right_container=success,
+    )
+    return replace(result, **changes)
+
+
+def record(experiment="scenario_a/deltaco", seed=0, step=10_000, n_successes=3, trials=1, **changes):
+    """Six tasks, of which the first ones succeed."""
+    cells = [(task_id, trial) for trial in range(trials) for task_id in TASK_IDS]
+    result = EvaluationRecord(
+        experiment=experiment,
+        method=experiment.rpartition("/")[2],
+        run_seed=seed,
+        step=step,
+        evaluation_seed=0,
+        counterfactual="none",
+        ambiguity="container",
+        tasks=",".join(map(str, TASK_IDS)),
+        trials=trials,
+        episodes=[episode(*cell, success=number < n_successes) for number, cell in enumerate(cells)],
+        policy={"language_encoder": "all-MiniLM-L6-v2", "backbone": "strided", "seed": seed},
+        versions=VERSIONS,
+        command=f"deltaco-evaluate --run {experiment}_{seed}",
+        seconds=36.0,
+    )
+    return replace(result, **changes)
+
+
+def write(root, *records):
+    for item in records:
+        folder = root / f"{item.experiment.replace('/', '_')}_{item.run_seed}"
+        write_record(item, record_path(folder, item.step, item.counterfactual))
+    return root
+
+
+def run(root, experiment, seed, n_successes):
+    """A run whose evaluation sets, from step 10,000 on, have so many successes of six."""
+    write(root, *(record(experiment, seed, 10_000 * (n + 1), k) for n, k in enumerate(n_successes)))
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Two experiments with two seeds each, and a counterfactual evaluation of one of them."""
+    root = tmp_path / "runs"
+    for seed in (0, 1):
+        run(root, "scenario_a/deltaco", seed, [1, 2 + seed, 4])
+        run(root, "scenario_a/one_hot", seed, [0, 1, 1])
+        other = TASKS[47].instruction
+        result = record("scenario_a/deltaco", seed, 30_000, 2, counterfactual="demo")
+        episodes = [replace(item, demonstration=other) for item in result.episodes]
+        write(root, replace(result, episodes=episodes))
+    return root
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# The statistics
+
+
+def test_the_papers_rate_by_hand():
+    rates = np.array([[0.1, 0.3], [0.6, 0.2], [0.5, 0.5]])  # means .2 .4 .5, SDs .1 .2 0
+    rate, sd, best = paper_rate(rates)
+    assert rate == pytest.approx((0.2 + 0.4 + 0.5) / 3)
+    assert sd == pytest.approx((0.1 + 0.2 + 0.0) / 3)
+    assert best == (0, 1, 2)
+
+
+def test_the_papers_rate_is_of_the_ten_best_sets():
+    rates = np.array([[0.0, 0.0], *([[0.4, 0.6]] * 5), [0.1, 0.1], *([[0.3, 0.3]] * 6)])
+    rate, sd, best = paper_rate(rates)
+    assert best == (1, 2, 3, 4, 5, 7, 8, 9, 10, 11)  # of those with a mean of .3, the earlier ones
+    assert rate == pytest.approx((5 * 0.5 + 5 * 0.3) / 10)
+    assert sd == pytest.approx(5 * 0.1 / 10)
+
+
+def test_ties_do_not_depend_on_the_order_of_the_seeds():
+    rates = np.array([[0.1, 0.2, 0.3]] * 10 + [[0.3, 0.2, 0.1]])
+    assert rates[0].mean() != rates[-1].mean()
+    assert paper_rate(rates).best == tuple(range(10))
+
+
+def test_one_seed_has_no_standard_deviation():
+    rate, sd, best = paper_rate([[0.25], [0.75]])
+    assert (rate, sd, best) == (0.5, None, (0, 1))
+
+
+@pytest.mark.parametrize(
+    ("count", "total", "low", "high"),
+    [
+        # Newcombe, Statistics in Medicine 17 (1998), table I, method 3.
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0000, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+        # By symmetry.
+        (20, 20, 0.8389, 1.0000),
+    ],
+)
+def test_wilson_intervals_against_published_ones(count, total, low, high):
+    assert wilson_interval(count, total) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_the_breakdown_counts_each_kind_and_word():
+    green, front = task_named(0, "green").index, task_named(0, "front").index
+    color, shape = task_named(33, "left").index, task_named(40, "red").index
+    episodes = [
+        episode(green, success=True),
+        episode(green, 1, grasped_object=0, right_object=True),
+        episode(front, grasped_object=2),
+        episode(color, success=True),
+        episode(shape, object_containers=[-1, 0, -1], grasped_object=1, right_container=True),
+    ]
+    found = {(row.kind, row.word): row.outcomes for row in breakdown(episodes)}
+    assert len(found) == 4 * 3
+    counts = {name: item.count for name, item in found["all", "all"].items()}
+    assert counts == {
+        "success": 2,
+        "grasped_anything": 5,
+        "right_object": 3,
+        "right_container": 3,
+        "right_object_and_container": 2,
+    }
+    totals = {group: outcomes["success"].total for group, outcomes in found.items()}
+    assert totals["all", "all"] == 5
+    assert [totals[kind, "all"] for kind in ("name", "color", "shape")] == [3, 1, 1]
+    assert [totals["all", word] for word in ("color_word", "position_word")] == [3, 2]
+    assert [totals["name", word] for word in ("color_word", "position_word")] == [2, 1]
+    assert found["name", "color_word"]["right_object"].count == 2
+    assert found["color", "color_word"]["success"].rate is None
+    assert found["color", "color_word"]["success"].interval is None
+
+
+def test_position_words_mean_what_they_mean_in_the_scene():
+    for quadrant in QUADRANTS:
+        for word in CONTAINER_WORDS:
+            assert position_satisfies(quadrant, word) == quadrant.satisfies(word)
+
+
+# What behavior followed. Green stands in front on the right, red at the back on the left.
+
+SCENE = {"objects": [24, 1, 4], "container_quadrants": [[0, 1], [1, 0]]}  # a bathtub, a vase, a chalice
+GREEN_BATHTUB = task_named(24, "green")
+
+
+def follow(counterfactual="demo", among="all", **changes):
+    """What was followed, by aspect and cue: the counts (of how many)."""
+    scene = episode(GREEN_BATHTUB.index, **{**SCENE, **changes})
+    found = followed([scene], counterfactual)
+    return {
+        (item.aspect, item.cue): (item.proportion.count, item.proportion.total)
+        for item in found
+        if item.among == among
+    }
+
+
+def test_following_the_demonstration():
+    other = task_named(40, "back").instruction  # a vase, into what is the red container here
+    done = {"demonstration": other, "grasped_object": 1, "object_containers": [-1, 1, -1]}
+    assert follow(**done) == {
+        ("object", "scene"): (0, 1),
+        ("object", "demonstration"): (1, 1),
+        ("object", "instruction"): (0, 1),
+        ("container", "scene"): (0, 1),
+        ("container", "demonstration"): (1, 1),
+        ("container", "instruction"): (0, 1),
+    }
+    assert follow(**done, among="conflicts") == {
+        ("object", "demonstration"): (1, 1),
+        ("object", "instruction"): (0, 1),
+        ("object", "neither"): (0, 1),
+        ("container", "demonstration"): (1, 1),
+        ("container", "instruction"): (0, 1),
+        ("container", "neither"): (0, 1),
+    }
+
+
+def test_following_the_instruction_in_one_and_the_demonstration_in_the_other():
+    found = follow(
+        demonstration=task_named(1, "red").instruction,
+        grasped_object=0,
+        object_containers=[1, -1, -1],
+        among="conflicts",
+    )
+    assert found["object", "instruction"] == found["container", "demonstration"] == (1, 1)
+    assert found["object", "demonstration"] == found["container", "instruction"] == (0, 1)
+
+
+@pytest.mark.parametrize(
+    "done",
+    [
+        {"grasped_object": -1, "object_containers": [-1, -1, -1]},
+        {"grasped_object": 2, "object_containers": [0, 1, -1]},  # something in both containers
+    ],
+)
+def test_following_neither(done):
+    found = follow(demonstration=task_named(1, "red").instruction, among="conflicts", **done)
+    for aspect in ("object", "container"):
+        assert found[aspect, "neither"] == (1, 1)
+        assert found[aspect, "demonstration"] == found[aspect, "instruction"] == (0, 1)
+
+
+def test_what_both_ask_for_is_no_conflict():
+    other = task_named(24, "front").instruction  # the same object, and the same container here
+    done = {"demonstration": other, "grasped_object": 0, "object_containers": [0, -1, -1]}
+    assert set(follow(**done).values()) == {(1, 1)}
+    assert {total for _, total in follow(**done, among="conflicts").values()} == {0}
+
+
+def test_what_is_not_in_the_scene_cannot_be_followed():
+    other = task_named(16, "left").instruction  # no canoe; red stands on the left
+    found = follow(demonstration=other, grasped_object=2)
+    assert found["object", "demonstration"] == (0, 0)
+    assert found["container", "demonstration"] == (0, 1)
+    assert follow(demonstration=other, among="conflicts")["object", "neither"] == (0, 0)
+
+
+def test_a_word_that_describes_both_containers_leaves_no_choice():
+    in_front = {"container_quadrants": [[0, 1], [1, 1]], "object_containers": [0, -1, -1]}
+    for word in ("front", "back"):
+        found = follow(demonstration=task_named(1, word).instruction, **in_front)
+        assert found["container", "demonstration"] == (0, 0)
+    found = follow(demonstration=task_named(1, "left").instruction, **in_front)
+    assert found["container", "demonstration"] == (0, 1)
+
+
+def test_a_color_of_another_task_may_be_that_of_several_objects():
+    brown = task_named(33, "red").instruction
+    for grasped, count in ((0, 0), (1, 1), (2, 1)):
+        found = follow(demonstration=brown, objects=[24, 1, 3], grasped_object=grasped)
+        assert found["object", "demonstration"] == (count, 1)
+
+
+def test_of_identical_objects_the_demonstration_means_one_and_the_instruction_either():
+    twins = {"objects": [24, 24, 1]}
+    for grasped, scene in ((0, 1), (1, 0)):
+        found = follow("instruction", grasped_object=grasped, **twins)
+        assert found["object", "scene"] == found["object", "demonstration"] == (scene, 1)
+        assert found["object", "instruction"] == (1, 1)
+    found = follow("instruction", "conflicts", grasped_object=1, **twins)
+    assert found["object", "neither"] == (0, 0)
+
+
+def test_sentences_of_no_task():
+    paraphrase = {"instruction": "drop the tub into the green thing", "grasped_object": 0}
+    other = task_named(1, "red").instruction
+    # Unless the instruction is what was changed, it is the scene's task in other words.
+    assert follow("demo", demonstration=other, **paraphrase)["object", "instruction"] == (1, 1)
+    assert follow("instruction", **paraphrase)["object", "instruction"] == (0, 0)
+    scene = episode(GREEN_BATHTUB.index, **SCENE, **paraphrase)
+    assert unknown_sentences([scene], "instruction") == 1
+    assert unknown_sentences([scene], "demo") == unknown_sentences([scene], "none") == 0
+    assert follow("demo", demonstration=None)["object", "demonstration"] == (0, 0)
+
+
+# The authors' numbers
+
+
+def test_experiments_stand_as_in_the_papers_tables():
+    mine = ["z", "scenario_a/z", "mine/a"]
+    published = list(PUBLISHED)
+    end_of_a = published.index("scenario_b/deltaco")
+    expected = [*published[:end_of_a], "scenario_a/z", *published[end_of_a:], "z", "mine/a"]
+    assert sorted([*mine, *reversed(published)], key=in_order) == expected
+
+
+def test_the_authors_numbers():
+    assert PUBLISHED["scenario_a/deltaco"][1:] == pytest.approx((0.258, 0.034))
+    assert PUBLISHED["scenario_b/oracle"][1:] == pytest.approx((0.617, 0.14))
+    assert PUBLISHED["ablations/clip_mlp_1"].rate < PUBLISHED["ablations/clip_mlp_2"].rate
+    groups = Counter(name.partition("/")[0] for name in PUBLISHED)
+    assert groups == {"scenario_a": 15, "scenario_b": 5, "ambiguity_object": 3, "ablations": 11}
+    assert set(groups) == set(TITLES)
+    assert all(0 < item.sd < item.rate < 1 for item in PUBLISHED.values())
+    assert label_of("mine/my_method") == "my method"
+
+
+# Records
+
+
+def test_a_record_comes_back_as_it_was(tmp_path):
+    original = record(trials=2)
+    original = replace(original, episodes=[replace(original.episodes[0], demonstration=None)])
+    path = record_path(tmp_path, 20_000, "demo")
+    assert path.name == "0020000_demo.json"
+    write_record(original, path)
+    assert read_record(path) == original
+    assert original.success_rate == 1
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_an_interrupted_write_leaves_the_record_as_it_was(tmp_path, monkeypatch):
+    path = record_path(tmp_path, 1)
+    write_record(record(), path)
+    before = path.read_bytes()
+
+    def full_disk(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", full_disk)
+    with pytest.raises(OSError, match="disk full"):
+        write_record(record(n_successes=0), path)
+    assert path.read_bytes() == before
+    # What is left of it is no record.
+    assert find_records([tmp_path]) == [path]
+
+
+def without(name):
+    def damage(content):
+        del content[name]
+
+    return damage
+
+
+def with_value(name, value, in_episode=True):
+    def damage(content):
+        (content["episodes"][0] if in_episode else content)[name] = value
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (without("format"), "in format 1: its format is None.*deltaco-evaluate"),
+        (without("trials"), r"lacks \['trials'\]"),
+        (with_value("more", 1), r"EpisodeResult lacks nothing, and has the unknown \['more'\]"),
+        (with_value("counterfactual", "both", False), "one of none, demo, instruction. Got 'both'"),
+        (with_value("step", "10", False), "`step` must be int. Got '10'"),
+        (with_value("episodes", [], False), "has no episodes"),
+        (with_value("episodes", [3], False), "it has 3 where EpisodeResult is due"),
+        (with_value("versions", {}, False), "which version of the benchmark"),
+        (with_value("success", 1), "`success` must be bool. Got 1"),
+        (with_value("objects", [0, None, 1]), r"`objects` must be list\[int\]"),
+        (with_value("demonstration", 4), r"`demonstration` must be str \| None. Got 4"),
+        (with_value("task_id", 300), r"`task_id` must be in 0..299. Got \[300\]"),
+        (with_value("grasped_object", 3), r"`grasped_object` must be in -1..2"),
+        (with_value("container_quadrants", [[0, 1]]), r"the shape \(2, 2\)"),
+        (with_value("container_quadrants", [[0, 1], [0, 2]]), "must be in 0..1"),
+        (with_value("object_containers", [0]), "a number for each of `objects`"),
+    ],
+)
+def test_a_damaged_record_is_refused(tmp_path, damage, message):
+    content = {"format": 1, **asdict(record())}
+    damage(content)
+    path = tmp_path / "evaluations/0010000.json"
+    path.parent.mkdir()
+    path.write_text(json.dumps(content))
+    with pytest.raises(RecordError, match=message) as caught:
+        read_record(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ['{"format": 1, "epis', "[]", ""])
+def test_a_cut_off_record_is_refused(tmp_path, text):
+    path = tmp_path / "0010000.json"
+    path.write_text(text)
+    with pytest.raises(RecordError, match=re.escape(str(path))):
+        read_record(path)
+
+
+# Records that belong together, and those that do not
+
+
+def test_records_are_found_at_any_depth_and_only_once(runs):
+    folder = runs / "scenario_a_deltaco_0"
+    assert len(find_records([folder])) == 4
+    assert len(find_records([runs, folder, folder / "evaluations"])) == 14
+
+
+def test_seeds_of_an_experiment_are_taken_together(runs):
+    report = make_report(find_records([runs]))
+    deltaco, one_hot = report.regular
+    assert (deltaco.experiment, one_hot.experiment) == ("scenario_a/deltaco", "scenario_a/one_hot")
+    assert deltaco.seeds == (0, 1)
+    assert deltaco.steps == (10_000, 20_000, 30_000)
+    assert deltaco.rates == pytest.approx(np.array([[1, 1], [2, 3], [4, 4]]) / 6)
+    assert (deltaco.last.count, deltaco.last.total) == (8, 12)
+    assert len(deltaco.last_episodes) == 12
+    (counterfactual,) = report.counterfactual
+    assert (counterfactual.last.count, counterfactual.last.total) == (4, 12)
+    assert report.notes == []
+
+
+def test_only_steps_that_all_seeds_have_count(tmp_path):
+    run(tmp_path, "scenario_a/deltaco", 0, [1, 2, 3, 6])
+    run(tmp_path, "scenario_a/deltaco", 1, [1, 4])
+    run(tmp_path, "scenario_a/bc_z", 0, [1, 1, 1])
+    report = make_report(find_records([tmp_path]))
+    deltaco, bc_z = report.regular
+    assert deltaco.steps == (10_000, 20_000)
+    assert (deltaco.last.count, deltaco.last.total) == (6, 12)
+    assert bc_z.steps == (10_000, 20_000, 30_000)
+    missing, ends, uneven = report.notes
+    assert "scenario_a/bc_z has no records of seed 1" in missing
+    assert "scenario_a/deltaco 20,000, scenario_a/bc_z 30,000" in ends
+    assert "seed 0, steps 30,000 and 40,000 do not count" in uneven
+
+
+def test_an_experiment_without_a_common_step_is_left_out(tmp_path):
+    write(tmp_path, record(seed=0, step=1), record(seed=1, step=2))
+    with pytest.raises(ReportError, match="nothing to report"):
+        make_report(find_records([tmp_path]))
+    write(tmp_path, record("scenario_a/bc_z", step=1), record("scenario_a/bc_z", seed=1, step=1))
+    report = make_report(find_records([tmp_path]))
+    assert [series.experiment for series in report.regular] == ["scenario_a/bc_z"]
+    assert any("scenario_a/deltaco is left out" in note for note in report.notes)
+
+
+def test_configurations_that_differ_between_seeds_are_noted(tmp_path):
+    policy = {**record().policy, "seed": 1, "backbone": "paper", "device": "cuda"}
+    write(tmp_path, record(), record(seed=1, policy=policy))
+    (note,) = make_report(find_records([tmp_path])).notes
+    assert "differ in more than their seed: in backbone of" in note
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"versions": {"benchmark": "gym_deltaco/PickPlace-v1"}}, "version of the benchmark: .*-v0.*-v1"),
+        ({"evaluation_seed": 7}, "records of 'scenario_a' differ in their evaluation seed: 0 in .* 7 in"),
+        ({"ambiguity": "object"}, "ambiguity scheme: 'container' .* 'object'"),
+        ({"trials": 2}, "trials: 1 in .* 2 in"),
+        ({"tasks": "24", "episodes": [episode(24)]}, "tasks: '24,32,.*' in .* '24' in"),
+    ],
+)
+def test_what_was_evaluated_differently_is_not_compared(tmp_path, changes, message):
+    other = record("scenario_a/one_hot", trials=changes.get("trials", 1))
+    write(tmp_path, record(), replace(other, **changes))
+    with pytest.raises(ReportError, match=message) as caught:
+        make_report(find_records([tmp_path]))
+    assert "scenario_a_deltaco_0" in str(caught.value)
+    assert "scenario_a_one_hot_0" in str(caught.value)
+
+
+def test_other_comparisons_may_have_other_tasks_but_not_another_benchmark(tmp_path):
+    write(tmp_path, record(), record("scenario_b/deltaco", trials=2, evaluation_seed=7))
+    report = make_report(find_records([tmp_path]))
+    assert list(report.comparisons) == ["scenario_a", "scenario_b"]
+    write(tmp_path, record("ablations/r3m", versions={"benchmark": "another"}))
+    with pytest.raises(ReportError, match="version of the benchmark"):
+        make_report(find_records([tmp_path]))
+
+
+def test_runs_of_an_experiment_have_one_method(tmp_path):
+    write(tmp_path, record(), record(seed=1, method="bc_z"))
+    with pytest.raises(ReportError, match="'scenario_a/deltaco' differ in their method: 'deltaco' .* 'bc_z'"):
+        make_report(find_records([tmp_path]))
+
+
+def test_two_runs_of_the_same_seed_are_refused(tmp_path):
+    write(tmp_path / "first", record())
+    write(tmp_path / "second", record())
+    with pytest.raises(
+        ReportError, match="with the seed 0: .*first.* and .*second.*Report on one of the two"
+    ):
+        make_report(find_records([tmp_path]))
+
+
+@pytest.mark.parametrize("change", [lambda episodes: episodes[:-1] + episodes[:1], lambda e: [e[0], *e]])
+def test_a_record_with_trials_twice_is_refused(tmp_path, change):
+    item = record(trials=2)
+    write(tmp_path, replace(item, episodes=change(item.episodes)))
+    with pytest.raises(ReportError, match="not 2 different trials of each of its 6 tasks"):
+        make_report(find_records([tmp_path]))
+
+
+def test_many_numbers_are_told_by_their_ends():
+    assert counted("seed", [3]) == "seed 3"
+    assert counted("step", [10, 20, 3000]) == "steps 10, 20 and 3,000"
+    assert counted("step", range(0, 8000, 1000)) == "8 steps from 0 to 7,000"
+
+
+# The files
+
+
+def test_the_files(runs, tmp_path, capsys):
+    out = tmp_path / "new/report"
+    report_command.main([str(runs), "--out", str(out)])
+    assert "scenario_a/deltaco: 41.7 (2.8); 66.7 [39.1, 86.2] at step 30,000" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == set(FILES)
+
+    deltaco, one_hot = rows(out / "rates.csv")
+    # Means 1/6, 2.5/6 and 4/6; SDs 0, .5/6 and 0.
+    assert float(deltaco["rate"]) == pytest.approx(7.5 / 18, abs=1e-6)
+    assert float(deltaco["sd"]) == pytest.approx(0.5 / 18, abs=1e-6)
+    assert (deltaco["seeds"], deltaco["best_sets"], deltaco["last_step"]) == ("0 1", "3", "30000")
+    assert (deltaco["last_count"], deltaco["last_episodes"]) == ("8", "12")
+    assert float(deltaco["authors_rate_in_another_simulation"]) == 0.258
+    assert float(one_hot["last_rate"]) == pytest.approx(1 / 6, abs=1e-6)
+
+    points = rows(out / "curves.csv")
+    assert len(points) == 14
+    assert {point["counted"] for point in points} == {"True"}
+
+    groups = rows(out / "breakdown.csv")
+    assert len(groups) == 3 * 12 * 5
+    assert sum(
+        int(group["count"])
+        for group in groups
+        if (group["experiment"], group["counterfactual"]) == ("scenario_a/deltaco", "none")
+        and group["outcome"] == "success"
+        and group["kind_of_task"] != "all"
+        and group["kind_of_container_word"] != "all"
+    ) == int(deltaco["last_count"])
+
+    assert len(rows(out / "counterfactual.csv")) == 2 * 6
+    with Image.open(out / "curves.png") as picture:
+        assert picture.format == "PNG"
+        assert 1000 < picture.width < 3000
+        assert 400 < picture.height < 3000
+        assert len(picture.convert("RGB").getcolors(1 << 24)) > 10
+
+
+def test_the_text(runs, tmp_path):
+    write_report([runs], tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert "| DeL-TaCo | 0, 1 | 41.7 (2.8) | 3 of 3 sets | 66.7 [39.1, 86.2] | 30,000 | 25.8 (3.4) |" in text
+    assert "authors, another simulation" in text
+    assert ENV_ID in text
+    assert "`method=one_hot`, `language_encoder=all-MiniLM-L6-v2`" in text
+    assert "Seeds 0 and 1; 6 records" in text
+    assert "    deltaco-evaluate --run scenario_a/deltaco_1\n" in text
+    assert "Nothing." in text
+    # Every table is whole.
+    for table in re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE):
+        assert len({line.count("|") for line in table.splitlines()}) == 1
+    assert set(re.findall(r"!\[.+\]\((.+)\)", text)) == {"curves.png"}
+
+
+def test_one_seed_and_one_step(tmp_path):
+    write(tmp_path / "runs", record())
+    write_report([tmp_path / "runs"], tmp_path / "out")
+    assert "| DeL-TaCo | 0 | 50.0 (–) | 1 of 1 sets |" in (tmp_path / "out/report.md").read_text()
+    (row,) = rows(tmp_path / "out/rates.csv")
+    assert (row["rate"], row["sd"]) == ("0.5", "")
+
+
+def test_a_new_report_replaces_the_old_one(runs, tmp_path):
+    write_report([runs], tmp_path / "out")
+    (tmp_path / "out/mine.txt").touch()
+    write_report([runs / "scenario_a_one_hot_0"], tmp_path / "out", authors_levels=True)
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {*FILES, "mine.txt"} - {"counterfactual.csv"}
+    for path in runs.rglob("evaluations/00?0000.json"):
+        path.unlink()
+    write_report([runs / "scenario_a_deltaco_0"], tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {*FILES, "mine.txt"} - {"rates.csv", "curves.png"}
+
+
+def test_a_report_is_written_wholly_or_not_at_all(runs, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    write_report([runs], out)
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    write(runs, record("scenario_a/mcil"))
+
+    def fails(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", fails)
+    with pytest.raises(OSError, match="disk full"):
+        write_report([runs], out)
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_a_large_report_keeps_no_episodes(runs):
+    for item in make_report(find_records([runs])).regular[0].sets:
+        assert item.record.episodes == []
+        assert item.task_ids == TASK_IDS
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("empty", r"empty has no records of evaluations \(evaluations/\*\.json.*deltaco-evaluate"),
+        ("missing", "missing is no folder"),
+    ],
+)
+def test_the_command_says_what_is_wrong(tmp_path, name, message, capsys):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SystemExit, match="1"):
+        report_command.main([str(tmp_path / name), "--out", str(tmp_path / "out")])
+    errors = capsys.readouterr().err
+    assert re.search(message, errors)
+    assert errors.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_refuses_a_damaged_record(runs, tmp_path, capsys):
+    path = next(runs.rglob("*.json"))
+    path.write_text(path.read_text()[:-100])
+    with pytest.raises(SystemExit, match="1"):
+        report_command.main([str(runs), "--out", str(tmp_path / "out")])
+    assert f"deltaco-report: {path} is not a record" in capsys.readouterr().err
+
+
+def test_the_command_starts_without_heavy_imports():
+    program = f"import sys; import {report_command.__name__}; print([*sys.modules])"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    heavy = {"torch", "lerobot", "matplotlib", "pybullet", "pandas"}
+    assert heavy.isdisjoint(re.findall(r"'(\w+)'", result.stdout))
