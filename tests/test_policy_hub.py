@@ -217,7 +217,7 @@ def test_the_commands_of_the_card_are_lerobots(dataset, shown, tmp_path, monkeyp
     plain, with_demonstrations = commands(card)
     config = parsed(plain, tmp_path, monkeypatch)
     assert config.policy.demo_repo_id is None
-    assert config.task == TASKS[0]
+    assert (config.task, config.fps) == (TASKS[0], dataset.meta.fps)
     assert set(config.robot.cameras) == {"top", "wrist"}
     assert (config.robot.cameras["top"].width, config.robot.cameras["top"].height) == (28, 20)
     config = parsed([*with_demonstrations, "--policy.demo_episode=0"], tmp_path, monkeypatch)

@@ -210,15 +210,16 @@ def _example(
         env_task = getattr(env, "task", None)
         words = [f"--env.type={env.type}", *([f"--env.task={env_task}"] if env_task else [])]
         return "lerobot-eval", f"{shlex.join(words)} {episodes}"
+    fps = meta.fps if meta is not None else 30  # LeRobot's default
     cameras = ", ".join(
         f"{key.split('.')[-1]}: {{type: opencv, index_or_path: {n}, width: {feature.shape[2]}, "
-        f"height: {feature.shape[1]}, fps: {meta.fps if meta is not None else 30}}}"
+        f"height: {feature.shape[1]}, fps: {fps}}}"
         for n, (key, feature) in enumerate(config.image_features.items())
     )
     robot = (meta.robot_type if meta is not None else None) or "ROBOT"
     return "lerobot-rollout", (
         f"--robot.type={robot} --robot.port=PORT \\\n    --robot.cameras={shlex.quote(f'{{{cameras}}}')} \\\n"
-        f"    --task={shlex.quote(_example_task(config, tasks))} --duration=60"
+        f"    --task={shlex.quote(_example_task(config, tasks))} --fps={fps} --duration=60"
     )
 
 
