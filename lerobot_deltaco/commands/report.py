@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lerobot_deltaco.evaluation.record import RecordError
 from lerobot_deltaco.evaluation.report import REPORT_FILE, last_text, rate_text, write_report
-from lerobot_deltaco.evaluation.series import Report, ReportError
+from lerobot_deltaco.evaluation.series import Report, ReportError, counted
 from lerobot_deltaco.evaluation.statistics import paper_rate
 
 
@@ -16,6 +16,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Writes the report, and shows its rates."""
     parser = _parser()
     options = parser.parse_args(arguments)
+    if options.out.exists() and not options.out.is_dir():
+        parser.error(f"--out must be a folder. {options.out} is a file.")
     try:
         report = write_report(options.runs, options.out, options.authors_levels)
     except (ReportError, RecordError, OSError) as error:
@@ -56,7 +58,7 @@ def _text(report: Report, out: Path) -> str:
     for series in report.regular:
         lines.append(
             f"  {series.experiment}: {rate_text(paper_rate(series.rates))}; {last_text(series.last)} at step "
-            f"{series.steps[-1]:,}; seeds {', '.join(map(str, series.seeds))}"
+            f"{series.steps[-1]:,}; {counted('seed', series.seeds)}"
         )
     lines += [f"Note: {note}" for note in report.notes]
     return "\n".join(lines) + "\n"

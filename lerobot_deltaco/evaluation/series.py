@@ -297,8 +297,8 @@ def _notes_on_series(series: Series) -> Iterator[str]:
         left_out = sorted(set(series.runs[seed]) - set(series.steps))
         if left_out:
             yield (
-                f"Of {series.name}, seed {seed}, {counted('step', left_out)} do not count: other seeds have "
-                "no record of them."
+                f"Left out of {series.name}, seed {seed}: {counted('step', left_out)}, of which not every "
+                "seed has a record."
             )
     unknown = unknown_sentences(series.last_episodes, series.counterfactual)
     if unknown:
