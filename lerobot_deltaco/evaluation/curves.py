@@ -39,6 +39,7 @@ _OTHER_COLORS = (
     "#455a64",
 )
 _OTHER_STYLES = tuple((color, line) for line, color in product(("-", "-.", ":"), _OTHER_COLORS))
+_DASHED, _DOTTED = (0, (6, 4)), (0, (1, 3))
 
 
 @dataclass(frozen=True)
@@ -105,14 +106,14 @@ def _draw_panel(ax, curves: Sequence[Curve], authors_levels: bool) -> None:
         highest = max(highest, (mean + sd).max())
         published = PUBLISHED.get(curve.experiment)
         if authors_levels and published is not None:
-            ax.axhline(published.rate, color=color, linewidth=1, linestyle=(0, (6, 4)), alpha=0.8)
+            ax.axhline(published.rate, color=color, linewidth=1, linestyle=_DASHED, alpha=0.8)
             highest, has_levels = max(highest, published.rate), True
-    ax.axhline(CHANCE, color="black", linewidth=1, linestyle=(0, (1, 3)))
+    ax.axhline(CHANCE, color="black", linewidth=1, linestyle=_DOTTED)
     handles, _ = ax.get_legend_handles_labels()
-    handles.append(Line2D([], [], color="black", linewidth=1, linestyle=(0, (1, 3)), label="chance, 1 in 6"))
+    handles.append(Line2D([], [], color="black", linewidth=1, linestyle=_DOTTED, label="chance, 1 in 6"))
     if has_levels:
-        dashes = {"color": "gray", "linewidth": 1, "linestyle": (0, (6, 4))}
-        handles.append(Line2D([], [], **dashes, label="authors' rates\n(another simulation)"))
+        label = "authors' rates\n(another simulation)"
+        handles.append(Line2D([], [], color="gray", linewidth=1, linestyle=_DASHED, label=label))
     # Beside the axes, where it hides no curve.
     ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False, fontsize=9)
     ax.set_xlabel("training step")
