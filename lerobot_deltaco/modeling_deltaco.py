@@ -156,7 +156,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             images = random_crop(images, self.config.crop_padding, generator)
         demo = language = None
         if self.config.uses_demo:
-            demo = self._encode_demo(*self._draw(batch["episode_index"], generator), generator)
+            demo = self._encode_demo(*self._draw(batch["episode_index"], tasks, generator), generator)
         distinct = {task: n for n, task in enumerate(dict.fromkeys(tasks))}
         column = torch.tensor([distinct[task] for task in tasks], device=device)
         if self.config.uses_language:
@@ -212,7 +212,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         self.trained_on = demonstrations
         self._knows_all_episodes = True
 
-    def _draw(self, episodes: Tensor, generator: torch.Generator) -> tuple[DemonstrationSet, Tensor]:
+    def _draw(
+        self, episodes: Tensor, tasks: Sequence[str], generator: torch.Generator
+    ) -> tuple[DemonstrationSet, Tensor]:
         """The demonstrations, and the row of each sample's."""
         if self.trained_on is None:
             if self._meta is None:
@@ -224,9 +226,11 @@ class DeltacoPolicy(PreTrainedPolicy):
                 )
             chosen = self.config.demo_episodes or training_episodes(self._meta)
             self.trained_on = self._load(self._meta.repo_id, self._meta.root, chosen).to(episodes.device)
-        return self.trained_on, self.trained_on.others(
-            episodes, generator, check=not self._knows_all_episodes
-        )
+        if self.training:
+            rows = self.trained_on.others(episodes, generator, check=not self._knows_all_episodes)
+        else:
+            rows = self.trained_on.others(episodes, generator, tasks=tasks)
+        return self.trained_on, rows
 
     def _generator(self) -> torch.Generator:
         rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0

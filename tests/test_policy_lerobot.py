@@ -223,6 +223,37 @@ def test_the_optimizer_has_every_weight_of_the_networks_and_no_other(make, datas
     assert not any("shown" in name or "trained_on" in name for name in policy.state_dict())
 
 
+# The loss of episodes that `--dataset.eval_split` holds back
+
+
+def test_an_episode_that_is_held_back_is_shown_by_any_of_its_task(make, dataset):
+    policy, before, _ = make(demo_episodes=[0, 1, 3, 5])
+    held_back = before(batch_of(dataset, [2 * LENGTH, 4 * LENGTH]))
+    with pytest.raises(ValueError, match="Episode 2 is trained on, but is not among"):
+        policy(held_back)
+    policy.eval()
+    loss, _ = policy(held_back)
+    assert torch.isfinite(loss)
+    # As `deltaco-train` gives them.
+    policy.demonstrate_with(policy.trained_on)
+    assert policy(held_back)[0] == loss
+
+    shown, generator = policy.trained_on, torch.Generator().manual_seed(0)
+    drawn = {}
+    tasks = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
+    for episode, task in enumerate(tasks):
+        rows = shown.others(torch.full((100,), episode), generator, tasks=[task] * 100)
+        drawn[episode] = set(shown.episodes[rows].tolist())
+    assert drawn == {0: {1}, 1: {0}, 2: {0, 1}, 3: {3}, 4: {3}, 5: {5}}
+
+
+def test_a_task_that_is_held_back_altogether_is_named(make, dataset):
+    policy, before, _ = make(demo_episodes=[0, 1, 2])
+    policy.eval()
+    with pytest.raises(ValueError, match="'wave' has no episode .*`demo_episodes`"):
+        policy(before(batch_of(dataset, [0, 5 * LENGTH])))
+
+
 # Videos
 
 

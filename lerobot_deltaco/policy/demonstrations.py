@@ -64,24 +64,35 @@ class DemonstrationSet(torch.nn.Module):
                 single[0],
             )
 
-    def others(self, episodes: Tensor, generator: torch.Generator, check: bool = True) -> Tensor:
+    def others(
+        self,
+        episodes: Tensor,
+        generator: torch.Generator,
+        check: bool = True,
+        tasks: Sequence[str] | None = None,
+    ) -> Tensor:
         """Draws for each sample another episode of its task.
 
         Args:
             episodes: The samples' own, (batch,), as indices of the dataset.
             generator: Source of the draws, on the CPU.
             check: Whether to look if they are all in the set, for which a GPU is waited for.
+            tasks: Of each sample. If they are given, episodes may be missing in the set, as those that
+                `--dataset.eval_split` holds back: any episode of the same task shows them.
 
         Returns:
             Rows, (batch,). A task's only episode demonstrates itself.
 
         Raises:
-            ValueError: An episode is not in the set.
+            ValueError: An episode is not in the set, or no episode of its task.
         """
         draws = torch.rand(len(episodes), generator=generator).to(self.frames.device)
         known = episodes < len(self._row_of_episode)
         rows = torch.where(known, self._row_of_episode[episodes.clamp(max=len(self._row_of_episode) - 1)], -1)
-        if check and (rows < 0).any():
+        held_back = rows < 0
+        if tasks is not None and held_back.any():
+            rows = torch.where(held_back, self._any_rows(tasks, held_back), rows)
+        elif check and held_back.any():
             raise ValueError(
                 f"Episode {int(episodes[rows < 0][0])} is trained on, but is not among those that "
                 "demonstrations are drawn from. Name all of them in `demo_episodes`."
@@ -89,7 +100,21 @@ class DemonstrationSet(torch.nn.Module):
         own, count = self._place[rows].unbind(dim=1)
         place = (draws * (count - 1)).long()  # one of the count - 1 others
         place = torch.where(count > 1, place + (place >= own), own)
+        if tasks is not None:
+            place = torch.where(held_back, (draws * count).long(), place)
         return self._order[self._start[rows] + place]
+
+    def _any_rows(self, tasks: Sequence[str], wanted: Tensor) -> Tensor:
+        """A row of each sample's task, (batch,); -1 where none is wanted."""
+        rows = [-1] * len(tasks)
+        for sample in wanted.nonzero().flatten().tolist():
+            if tasks[sample] not in self.rows:
+                raise ValueError(
+                    f"The task {tasks[sample]!r} has no episode among those that demonstrations are drawn "
+                    "from. Hold back fewer of its episodes, or name some in `demo_episodes`."
+                )
+            rows[sample] = self.rows[tasks[sample]][0]
+        return torch.tensor(rows, device=wanted.device)
 
     def pictures(self, rows: Tensor, n_frames: int, generator: torch.Generator) -> Tensor:
         """Frames of demonstrations in the order of time: the first, random ones between, and the last.
