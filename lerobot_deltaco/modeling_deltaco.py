@@ -57,6 +57,10 @@ class DeltacoPolicy(PreTrainedPolicy):
     evaluation, demonstrations come from the dataset that the configuration names, or from the checkpoint.
     The instruction is the batch's `task`.
 
+    Attributes:
+        shown_as: For an instruction, the task string whose demonstrations are shown with it, where that is
+            another one: `policy.shown_as["fetch me the red one"] = "Put red colored object in green bin."`.
+
     Args:
         config: The configuration. Features that it lacks are filled in by LeRobot beforehand.
         dataset_stats: Unused; normalization is the processors' business.
@@ -79,6 +83,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         self.instructions = InstructionTable(config.language_encoder)
         self.shown: DemonstrationSet | None = None  # for evaluation
         self.trained_on: DemonstrationSet | None = None  # for training; read when the first batch comes
+        self.shown_as: dict[str, str] = {}
         self._knows_all_episodes = False  # whether each episode that is trained on is surely among those
         if config.demo_repo_id is not None:
             self.shown = self._load(config.demo_repo_id, config.demo_root, None)
@@ -305,6 +310,7 @@ class DeltacoPolicy(PreTrainedPolicy):
                     f"{self.shown.episodes.tolist()[:10]} ..."
                 )
             return self.shown, found[:1].expand(len(tasks))
+        tasks = tuple(self.shown_as.get(task, task) for task in tasks)
         for shown in candidates:
             if all(task in shown.rows for task in tasks):
                 rows = [

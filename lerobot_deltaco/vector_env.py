@@ -125,10 +125,16 @@ class TaskVectorEnv(VectorEnv):
             seed: The seed of the first environment (each next one has the next seed), or all of them.
             options: Passed on to the environments.
         """
+        return self.reset_to(self._episode_seeds(seed), options)
+
+    def reset_to(
+        self, seeds: Sequence[int | None], options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts the episodes that the environments' own seeds stand for, of `gym_deltaco.seeding`."""
         if self._simulators is None and not self.closed:
             self._simulators = self._pool.borrow()
         options = {**(options or {}), NEW_ROLLOUT_OPTION: True, "task_id": self.task_id}
-        return self._ask("reset", seed=self._episode_seeds(seed), options=options)
+        return self._ask("reset", seed=list(seeds), options=options)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Does one action, of shape (4,), in each environment."""

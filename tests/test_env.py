@@ -420,6 +420,8 @@ def test_only_the_target_in_the_target_container_is_a_success(small_envs, ambigu
         assert not info["is_success"]
         assert not info["right_container"]
         assert info["object_containers"].tolist() == [-1, -1, -1]
+        quadrants = [tuple(container.quadrant) for container in env.unwrapped.scene.layout.containers]
+        assert [tuple(row) for row in info["container_quadrants"].tolist()] == quadrants
         is_right = (number, container) == (info["target_object"], info["target_container"])
         info = put(env, number, container)
         assert info["is_success"] == is_right

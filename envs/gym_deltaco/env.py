@@ -59,17 +59,18 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     Of every reset and step; objects and containers are numbered as they are in the scene, -1 is none.
 
-    | key                 | what                                                                        |
-    |---------------------|-----------------------------------------------------------------------------|
-    | `is_success`        | whether the task has succeeded in this episode                               |
-    | `task_id`           | 0..299                                                                      |
-    | `objects`           | (3,) int64: which of the 32 objects stand in the scene                       |
-    | `object_containers` | (3,) int64: the container in which each of them lies: 0 green, 1 red         |
-    | `target_object`     | number of the object that the task asks for                                  |
-    | `target_container`  | number of the container that the task asks for                               |
-    | `grasped_object`    | number of the object that the gripper has held last                          |
-    | `right_object`      | whether that one is the target                                               |
-    | `right_container`   | whether something lies in the target container, and nothing in the other one |
+    | key                   | what                                                                         |
+    |-----------------------|------------------------------------------------------------------------------|
+    | `is_success`          | whether the task has succeeded in this episode                               |
+    | `task_id`             | 0..299                                                                       |
+    | `objects`             | (3,) int64: which of the 32 objects stand in the scene                       |
+    | `object_containers`   | (3,) int64: the container in which each of them lies: 0 green, 1 red         |
+    | `container_quadrants` | (2, 2) int64: i (0 right, 1 left) and j (0 back, 1 front) of both            |
+    | `target_object`       | number of the object that the task asks for                                  |
+    | `target_container`    | number of the container that the task asks for                               |
+    | `grasped_object`      | number of the object that the gripper has held last                          |
+    | `right_object`        | whether that one is the target                                               |
+    | `right_container`     | whether something lies in the target container, and nothing in the other one |
 
     Args:
         task_id: 0..299. `reset(options={"task_id": ...})` changes it from then on.
@@ -225,6 +226,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             "task_id": self.task.index,
             "objects": np.array([item.label.index for item in layout.objects], dtype=np.int64),
             "object_containers": containers,
+            "container_quadrants": np.array([item.quadrant for item in layout.containers], dtype=np.int64),
             "target_object": target_object,
             "target_container": target_container,
             "grasped_object": self._grasped_object,

@@ -1,0 +1,179 @@
+"""`deltaco-evaluate`: evaluation sets of checkpoints, one record for each."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import draccus
+
+from gym_deltaco.layout import AMBIGUITIES
+from lerobot_deltaco.evaluation.evaluate import EvaluationPlan, evaluate, versions
+from lerobot_deltaco.evaluation.record import (
+    COUNTERFACTUALS,
+    EvaluationRecord,
+    RecordError,
+    read_record,
+    record_path,
+    write_record,
+)
+from lerobot_deltaco.evaluation.runs import Checkpoint, RunError, checkpoints, describe, load_policy
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Evaluates what is not evaluated yet, and shows the rates."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    command = shlex.join([parser.prog, *(sys.argv[1:] if arguments is None else arguments)])
+    try:
+        plan = EvaluationPlan(
+            options.tasks, options.trials, options.seed, options.counterfactual, options.ambiguity
+        )
+        todo = [(run, checkpoint) for run in options.runs for checkpoint in _chosen(run, options.steps)]
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    try:
+        for run, checkpoint in todo:
+            _evaluate(run, checkpoint, plan, options, command)
+    except (RunError, RecordError, ValueError, OSError) as error:
+        parser.exit(1, f"{parser.prog}: {error}\n")
+    except KeyboardInterrupt:
+        parser.exit(130, f"\n{parser.prog}: Interrupted. The same command goes on from here.\n")
+
+
+def _chosen(run: Path, steps: str) -> list[Checkpoint]:
+    """The checkpoints of a run that are asked for."""
+    found = checkpoints(run)
+    if steps == "all":
+        return found
+    if steps == "last":
+        return found[-1:]
+    wanted = {int(step) for step in steps.split(",")}
+    missing = sorted(wanted - {checkpoint.step for checkpoint in found})
+    if missing:
+        there = ", ".join(str(checkpoint.step) for checkpoint in found)
+        raise RunError(f"{run} has no checkpoint of step {missing[0]}. There are {there}.")
+    return [checkpoint for checkpoint in found if checkpoint.step in wanted]
+
+
+def _evaluate(
+    run: Path, checkpoint: Checkpoint, plan: EvaluationPlan, options: argparse.Namespace, command: str
+) -> None:
+    path = record_path(run, checkpoint.step, plan.counterfactual)
+    if path.exists():
+        record = read_record(path)
+        made_for = EvaluationPlan(
+            record.tasks, record.trials, record.evaluation_seed, record.counterfactual, record.ambiguity
+        )
+        if made_for != plan:
+            raise RecordError(
+                f"{path} is of another evaluation: {asdict(made_for)}. Asked for is {asdict(plan)}. Ask for "
+                "the same one, or move the record away."
+            )
+        sys.stdout.write(_text(run, record, "was there already"))
+        return
+    description = describe(checkpoint)
+    overrides = [f"--device={options.device}"] if options.device else []
+    policy, preprocessor, postprocessor = load_policy(checkpoint.folder, overrides)
+    start = time.monotonic()
+    episodes = evaluate(policy, preprocessor, postprocessor, plan, checkpoint.step)
+    seconds = time.monotonic() - start
+    record = EvaluationRecord(
+        experiment=options.experiment or description.experiment,
+        method=policy.config.method,
+        run_seed=description.seed,
+        step=checkpoint.step,
+        evaluation_seed=plan.seed,
+        counterfactual=plan.counterfactual,
+        ambiguity=plan.ambiguity,
+        tasks=plan.tasks,
+        trials=plan.trials,
+        episodes=episodes,
+        policy=_plain(policy.config),
+        versions=versions(policy),
+        command=command,
+        seconds=seconds,
+    )
+    write_record(record, path)
+    sys.stdout.write(_text(run, record, f"{seconds:.0f} s"))
+
+
+def _plain(config: object) -> dict[str, object]:
+    """The policy's configuration as JSON knows it, less what is found out from the data."""
+    encoded = draccus.encode(config)
+    return {
+        name: value
+        for name, value in encoded.items()
+        if name not in ("input_features", "output_features", "one_hot_tasks", "demo_episodes")
+    }
+
+
+def _text(run: Path, record: EvaluationRecord, remark: str) -> str:
+    n_episodes = len(record.episodes)
+    what = "" if record.counterfactual == "none" else f", another task's {record.counterfactual}"
+    return (
+        f"{run}, step {record.step}{what}: {record.success_rate:.1%} of {n_episodes} episodes of "
+        f"{record.tasks} succeeded ({remark}).\n"
+    )
+
+
+def _steps(text: str) -> str:
+    if text not in ("all", "last") and not all(part.isdecimal() for part in text.split(",")):
+        raise argparse.ArgumentTypeError(f"must be 'all', 'last' or steps such as 1000,2000. Got {text!r}.")
+    return text
+
+
+def _parser() -> argparse.ArgumentParser:
+    plan = EvaluationPlan()
+    parser = argparse.ArgumentParser(
+        prog="deltaco-evaluate",
+        description="Evaluates checkpoints of training runs, and writes a record of each evaluation set into "
+        "the run's folder `evaluations`. What has a record is skipped; `deltaco-report` makes tables of them.",
+    )
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_DIR", help="--output_dir of a training")
+    parser.add_argument(
+        "--tasks",
+        default=plan.tasks,
+        help="a task set (scenario_a_test, ...) or indices and ranges, such as 4,50-73 (%(default)s)",
+    )
+    parser.add_argument(
+        "--trials", type=int, default=plan.trials, metavar="N", help="episodes of each task (%(default)s)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=plan.seed, help="of the scenes, with the step (%(default)s)"
+    )
+    parser.add_argument(
+        "--counterfactual",
+        choices=COUNTERFACTUALS,
+        default=plan.counterfactual,
+        help="show the demonstration, or tell the instruction, of another task (%(default)s)",
+    )
+    parser.add_argument(
+        "--ambiguity",
+        choices=AMBIGUITIES,
+        default=plan.ambiguity,
+        help="what of a task is ambiguous: the paper's scheme i or ii (%(default)s)",
+    )
+    parser.add_argument(
+        "--steps",
+        type=_steps,
+        default="all",
+        metavar="all|last|STEP,...",
+        help="which checkpoints (%(default)s)",
+    )
+    parser.add_argument(
+        "--experiment",
+        metavar="NAME",
+        help="what was trained; runs of the same name differ in their seeds "
+        "alone (by default, the run's --job_name)",
+    )
+    parser.add_argument("--device", help="such as cpu or cuda (by default, the checkpoint's)")
+    return parser
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""Runs an evaluation set: some episodes of each task, with LeRobot's rollout, and every outcome kept."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import torch
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.scripts.lerobot_eval import rollout
+from tqdm import tqdm
+
+from gym_deltaco import ENV_ID
+from gym_deltaco.layout import AMBIGUITIES
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, Task, get_task, select_tasks
+from gym_deltaco.workspace import Quadrant
+from lerobot_deltaco.configuration_env import DeltacoEnv
+from lerobot_deltaco.evaluation.record import BENCHMARK, COUNTERFACTUALS, Counterfactual, EpisodeResult
+from lerobot_deltaco.evaluation.recorded_env import RecordedTask
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.vector_env import make_task_vector_envs
+
+PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
+
+
+@dataclass(frozen=True)
+class EvaluationPlan:
+    """Which episodes an evaluation set consists of.
+
+    Args:
+        tasks: A selection of tasks, as `--env.task` takes it.
+        trials: Episodes of each task.
+        seed: With the set's number, the task and the trial, it decides the scenes.
+        counterfactual: "demo" or "instruction": that one is another task's, whose object stands in the scene
+            and whose container is the other one, if there is such a task; "none": both are the scene's.
+        ambiguity: "container" or "object", the paper's schemes i and ii.
+
+    Raises:
+        ValueError: An argument is not valid; the message says what is.
+    """
+
+    tasks: str = "scenario_a_test"
+    trials: int = 2
+    seed: int = 0
+    counterfactual: Counterfactual = "none"
+    ambiguity: str = "container"
+
+    def __post_init__(self) -> None:
+        select_tasks(self.tasks)
+        for name, minimum in (("trials", 1), ("seed", 0)):
+            if getattr(self, name) < minimum:
+                raise ValueError(f"`{name}` must be at least {minimum}. Got {getattr(self, name)}.")
+        for name, valid in (("counterfactual", COUNTERFACTUALS), ("ambiguity", AMBIGUITIES)):
+            if getattr(self, name) not in valid:
+                raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
+
+
+def evaluate(
+    policy: DeltacoPolicy,
+    preprocessor: PolicyProcessorPipeline,
+    postprocessor: PolicyProcessorPipeline,
+    plan: EvaluationPlan,
+    set_number: int,
+) -> list[EpisodeResult]:
+    """Runs an evaluation set.
+
+    Args:
+        policy: In evaluation mode, on its device.
+        preprocessor: The policy's.
+        postprocessor: The policy's.
+        plan: What is run.
+        set_number: Which set; usually the training step. Sets of different numbers share no scene.
+
+    Returns:
+        The episodes, task after task.
+
+    Raises:
+        ValueError: A task has no demonstration.
+    """
+    task_ids = select_tasks(plan.tasks)
+    # What another task's instruction or demonstration asks for depends on the scene, so that each episode of
+    # a counterfactual evaluation is told something else.
+    n_envs = 1 if plan.counterfactual != "none" else plan.trials
+    gym_kwargs = {**DeltacoEnv(ambiguity=plan.ambiguity).gym_kwargs, "render_mode": None}
+    envs = make_task_vector_envs(ENV_ID, gym_kwargs, task_ids, n_envs)
+    identity: PolicyProcessorPipeline = PolicyProcessorPipeline(steps=[])
+    results = []
+    try:
+        for env in tqdm(envs, desc=f"Evaluating step {set_number}", unit="task"):
+            for trials in _chunks(range(plan.trials), n_envs):
+                seeds = [episode_seed(plan.seed, "evaluation", env.task_id, set_number, t) for t in trials]
+                told = _Told(policy, get_task(env.task_id), task_ids, plan.counterfactual, seeds[0])
+                recorded = RecordedTask(env, seeds, told.instruct)
+                try:
+                    with torch.no_grad():
+                        rollout(recorded, policy, identity, identity, preprocessor, postprocessor, seeds)
+                finally:
+                    policy.shown_as.clear()
+                results += [
+                    _result(recorded, index, trial, seed, told.demonstration)
+                    for index, (trial, seed) in enumerate(zip(trials, seeds, strict=True))
+                ]
+            env.close()
+    finally:
+        for env in envs:
+            env.close()
+    return results
+
+
+def versions(policy: DeltacoPolicy) -> dict[str, str]:
+    """What an evaluation depends on."""
+    packages = {name: version(name) for name in PACKAGES}
+    return {BENCHMARK: ENV_ID, **packages, "language_encoder": policy.config.language_encoder}
+
+
+class _Told:
+    """What the policy is told in the episodes of a task: the task's own, or in part another one's."""
+
+    def __init__(
+        self,
+        policy: DeltacoPolicy,
+        task: Task,
+        task_ids: Sequence[int],
+        counterfactual: Counterfactual,
+        seed: int,
+    ) -> None:
+        self.demonstration = task.instruction if policy.config.uses_demo else None
+        self._policy = policy
+        self._task = task
+        self._counterfactual = counterfactual
+        self._others = [get_task(index) for index in task_ids if index != task.index]
+        if counterfactual == "demo" and policy.shown is not None:
+            self._others = [other for other in self._others if other.instruction in policy.shown.rows]
+        self._random = random.Random(seed)
+
+    def instruct(self, infos: list[dict[str, Any]]) -> list[str]:
+        """The instructions for scenes, once they are drawn."""
+        own = self._task.instruction
+        if self._counterfactual == "none":
+            return [own] * len(infos)
+        (info,) = infos
+        other = other_task(self._others, info, self._random).instruction
+        if self._counterfactual == "instruction":
+            self._policy.shown_as[other] = own
+            return [other]
+        self._policy.shown_as[own] = other
+        if self.demonstration is not None:
+            self.demonstration = other
+        return [own]
+
+
+def other_task(others: Sequence[Task], info: dict[str, Any], rng: random.Random) -> Task:
+    """Another task that can be told in a scene.
+
+    If there is one, it asks for another object that stands there, and for the other container; else, at least
+    for the other container.
+
+    Args:
+        others: Which tasks may be chosen.
+        info: The scene's.
+        rng: Of the choice.
+
+    Raises:
+        ValueError: There is no other task.
+    """
+    if not others:
+        raise ValueError(
+            "A counterfactual evaluation needs at least two tasks that the policy can be told. Evaluate more "
+            "tasks, and give demonstrations of them."
+        )
+    labels = [OBJECTS[index] for index in info["objects"]]
+
+    def wants(task: Task) -> tuple[bool, bool]:
+        objects = [n for n, label in enumerate(labels) if task.describes(label)]
+        containers = [
+            n
+            for n, color in enumerate(CONTAINER_COLORS)
+            if task.container == color or Quadrant(*info["container_quadrants"][n]).satisfies(task.container)
+        ]
+        is_other_container = containers == [1 - info["target_container"]]
+        is_other_object = len(objects) == 1 and objects != [info["target_object"]]
+        return is_other_container, is_other_object
+
+    ranked = [(wants(task), task) for task in others]
+    best = max(rank for rank, _ in ranked)
+    return rng.choice([task for rank, task in ranked if rank == best])
+
+
+def _result(
+    recorded: RecordedTask, index: int, trial: int, seed: int, demonstration: str | None
+) -> EpisodeResult:
+    info = recorded.infos[index]
+    return EpisodeResult(
+        task_id=int(info["task_id"]),
+        trial=trial,
+        seed=seed,
+        instruction=recorded.instructions[index],
+        demonstration=demonstration,
+        success=bool(info["is_success"]),
+        objects=info["objects"].tolist(),
+        object_containers=info["object_containers"].tolist(),
+        container_quadrants=info["container_quadrants"].tolist(),
+        target_object=int(info["target_object"]),
+        target_container=int(info["target_container"]),
+        grasped_object=int(info["grasped_object"]),
+        right_object=bool(info["right_object"]),
+        right_container=bool(info["right_container"]),
+    )
+
+
+def _chunks(numbers: range, size: int) -> Iterator[range]:
+    for start in range(0, len(numbers), size):
+        yield numbers[start : start + size]

@@ -1,0 +1,59 @@
+"""A task's vector environment that remembers how its episodes ended, and may tell something else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lerobot_deltaco.vector_env import TaskVectorEnv
+
+# What each environment's policy is told, given the info of the scene that was drawn.
+Instruct = Callable[[list[dict[str, Any]]], list[str]]
+
+
+class RecordedTask:
+    """Stands between LeRobot's rollout and the vector environment of a task.
+
+    Args:
+        env: The vector environment.
+        seeds: Of the environments' resets, just as they are.
+        instruct: Tells the instructions of the drawn scenes; None leaves them to the environment.
+    """
+
+    def __init__(self, env: TaskVectorEnv, seeds: Sequence[int], instruct: Instruct | None = None) -> None:
+        self._env = env
+        self._seeds = list(seeds)
+        self._instruct = instruct
+        self.infos: list[dict[str, Any]] = []  # of each environment, after its last step
+        self.instructions: list[str] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts the episodes, of the seeds that were given before."""
+        observations, infos = self._env.reset_to(self._seeds, options)
+        self.infos = _of_each(infos, self._env.num_envs)
+        told = self._instruct(self.infos) if self._instruct is not None else None
+        self.instructions = list(self._env.call("task_description")) if told is None else told
+        return observations, infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Does one action in each environment."""
+        result = self._env.step(actions)
+        self.infos = _of_each(result[-1], self._env.num_envs)
+        return result
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Calls a method of each environment, or reads an attribute."""
+        if name == "task_description":
+            return tuple(self.instructions)
+        return self._env.call(name, *args, **kwargs)
+
+
+def _of_each(infos: Mapping[str, Any], n_envs: int) -> list[dict[str, Any]]:
+    """The infos of each environment; gymnasium gives arrays over all of them."""
+    names = [name for name, values in infos.items() if isinstance(values, np.ndarray) and name[0] != "_"]
+    return [{name: infos[name][index] for name in names} for index in range(n_envs)]
