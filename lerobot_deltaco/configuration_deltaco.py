@@ -9,9 +9,9 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamConfig
 
 from lerobot_deltaco.data.feature_names import ACTION_NAMES
+from lerobot_deltaco.optimization import CosineSchedulerConfig, FusedAdamWConfig
 from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
 
 
@@ -37,10 +37,24 @@ METHODS = MappingProxyType(
 )
 INPUTS = ("none", "demo", "language", "demo+language")
 ENCODER_LOSSES = ("contrastive", "cosine", "none")
-# Strides of the eight residual blocks.
-BACKBONES = MappingProxyType({"paper": (1, 1, 1, 1, 1, 1, 1, 1), "strided": (1, 1, 1, 1, 2, 1, 2, 1)})
+
+
+class Backbone(NamedTuple):
+    """What differs between the policy's convolutional networks."""
+
+    channels: tuple[int, ...]  # of the residual blocks
+    stem_stride: int  # of the first convolution
+
+
+BACKBONES = MappingProxyType(
+    {
+        "paper": Backbone((16, 16, 32, 32, 64, 64, 128, 128), stem_stride=1),
+        "strided": Backbone((16, 16, 32, 32, 64, 64, 64, 64), stem_stride=2),
+    }
+)
 DEMO_ENCODERS = ("cnn",)
 GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
+SCHEDULERS = ("constant", "cosine")
 DTYPES = ("float32", "bfloat16")
 
 
@@ -50,7 +64,8 @@ class DeltacoConfig(PreTrainedConfig):
     """DeL-TaCo (Yu & Mooney, ICLR 2023): a policy told its task by a demonstration and an instruction.
 
     The defaults are the paper's (appendix B), for pictures of 48 x 48 pixels. On a small machine, choose
-    `backbone=strided`: the same network, whose maps are halved before the blocks of 64 and of 128 channels.
+    `backbone=strided`: the same network on maps of half the size, 12 x 12, and with 64 channels at most, a
+    tenth of the arithmetic.
 
     Args:
         method: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
@@ -88,6 +103,9 @@ class DeltacoConfig(PreTrainedConfig):
         dtype: float32 or bfloat16, of the networks' arithmetic.
         compile: Whether the networks are compiled, which pays on a GPU.
         optimizer_lr: Learning rate of Adam.
+        optimizer_weight_decay: Of the weights, as in AdamW.
+        scheduler_name: Course of the learning rate: constant, or cosine, down to 0 at the training's end.
+        scheduler_warmup_steps: Over which a learning rate on a cosine rises from 0.
         grad_clip_norm: Greatest norm of the gradient, 0 for no limit.
     """
 
@@ -119,6 +137,9 @@ class DeltacoConfig(PreTrainedConfig):
     dtype: str = "float32"
     compile: bool = False
     optimizer_lr: float = 3e-4
+    optimizer_weight_decay: float = 0.0
+    scheduler_name: str = "constant"
+    scheduler_warmup_steps: int = 0
     grad_clip_norm: float = 0.0
     push_to_hub: bool = False
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -143,6 +164,7 @@ class DeltacoConfig(PreTrainedConfig):
         self._check_choice("demo_encoder", DEMO_ENCODERS)
         self._check_choice("backbone", BACKBONES)
         self._check_choice("gripper_loss", GRIPPER_LOSSES)
+        self._check_choice("scheduler_name", SCHEDULERS)
         self._check_choice("dtype", DTYPES)
         if self.gripper_weight is None:
             self.gripper_weight = GRIPPER_LOSSES[self.gripper_loss]
@@ -158,6 +180,8 @@ class DeltacoConfig(PreTrainedConfig):
             ("drop_n_last_frames", 0),
             ("tasks_per_batch", 0),
             ("seed", 0),
+            ("optimizer_weight_decay", 0),
+            ("scheduler_warmup_steps", 0),
             ("grad_clip_norm", 0),
         ):
             if not getattr(self, name) >= minimum:
@@ -289,13 +313,19 @@ class DeltacoConfig(PreTrainedConfig):
                 "The action is nothing but a gripper. Set `gripper` to 'none' to learn it as a motion."
             )
 
-    def get_optimizer_preset(self) -> AdamConfig:
-        """Adam without weight decay."""
-        return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0, grad_clip_norm=self.grad_clip_norm)
+    def get_optimizer_preset(self) -> FusedAdamWConfig:
+        """Adam; without weight decay by default."""
+        return FusedAdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.grad_clip_norm,
+        )
 
-    def get_scheduler_preset(self) -> None:
-        """The learning rate is constant."""
-        return
+    def get_scheduler_preset(self) -> CosineSchedulerConfig | None:
+        """The learning rate's course; None is a constant."""
+        if self.scheduler_name == "constant":
+            return None
+        return CosineSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
     @property
     def observation_delta_indices(self) -> None:

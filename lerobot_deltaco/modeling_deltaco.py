@@ -107,7 +107,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             concat_dim=dims[concat] + (state.shape[0] if state else 0),
             motion_dim=action_dim - (config.gripper_index is not None),
             has_gripper=config.gripper_index is not None,
-            strides=BACKBONES[config.backbone],
+            **BACKBONES[config.backbone]._asdict(),
         )
         self.demo_encoder = (
             DemoEncoder(

@@ -53,7 +53,7 @@ def test_the_defaults_are_the_papers():
     assert (config.gripper_weight, config.encoder_loss_weight, config.temperature) == (30, 10, 0.1)
     optimizer = config.get_optimizer_preset()
     assert (optimizer.type, optimizer.lr, optimizer.weight_decay, optimizer.grad_clip_norm) == (
-        "adam",
+        "fused_adamw",
         3e-4,
         0,
         0,

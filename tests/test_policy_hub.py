@@ -149,7 +149,7 @@ def test_the_card_says_what_was_trained_and_on_what(dataset):
     assert f"Trained on: {REPO_ID}, 4 episodes of 2 tasks" in text
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", card.text, re.MULTILINE))
     assert (rows["steps"], rows["batch size"], rows["seed"]) == ("12,345", "24", "77")
-    assert (rows["optimizer"], rows["learning rate"]) == ("adam", "0.0003")
+    assert (rows["optimizer"], rows["learning rate"]) == ("fused_adamw", "0.0003")
     assert (rows["backbone"], rows["seed of demonstrations and crops"]) == ("strided", "5")
     assert rows["through FiLM, into each residual block"] == "the embedding of the demonstration"
     assert "embedding of the instruction, and the robot's state" in text

@@ -33,7 +33,7 @@ def test_every_task_is_in_as_many_batches_and_every_frame_of_it_drawn_as_often()
     assert max(per_task.values()) - min(per_task.values()) <= 5  # the samples of one visit
     per_frame = np.bincount(drawn, minlength=len(TASKS))
     for task in range(7):
-        counts = per_frame[TASKS == task]
+        counts = per_frame[task == TASKS]
         assert counts.max() - counts.min() <= 1
 
 

@@ -134,7 +134,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Evaluates checkpoints of training runs, and writes a record of each evaluation set into "
         "the run's folder `evaluations`. What has a record is skipped; `deltaco-report` makes tables of them.",
     )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_DIR", help="--output_dir of a training")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_DIR", help="of a training")
     parser.add_argument(
         "--tasks",
         default=plan.tasks,
@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
         "--counterfactual",
         choices=COUNTERFACTUALS,
         default=plan.counterfactual,
-        help="show the demonstration, or tell the instruction, of another task (%(default)s)",
+        help="show another task's demonstration, or tell its instruction (%(default)s)",
     )
     parser.add_argument(
         "--ambiguity",

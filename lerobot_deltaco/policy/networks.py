@@ -43,7 +43,7 @@ class ConditionedPolicy(nn.Module):
         motion_dim: Size of the action without the gripper.
         has_gripper: Whether the action has a gripper.
         channels: Of the residual blocks, one number each.
-        strides: Of the residual blocks.
+        stem_stride: Of the first convolution.
         hidden_dims: Of the fully connected layers.
         gripper_hidden_dim: Of the gripper's hidden layer.
         spatial_softmax_temperature: Divides the activations.
@@ -57,13 +57,13 @@ class ConditionedPolicy(nn.Module):
         motion_dim: int,
         has_gripper: bool,
         channels: Sequence[int] = (16, 16, 32, 32, 64, 64, 128, 128),
-        strides: Sequence[int] = (1, 1, 1, 1, 1, 1, 1, 1),
+        stem_stride: int = 1,
         hidden_dims: Sequence[int] = (1024, 512, 256),
         gripper_hidden_dim: int = 32,
         spatial_softmax_temperature: float = 1.0,
     ) -> None:
         super().__init__()
-        self.backbone = FilmResNet(film_dim, channels, strides)
+        self.backbone = FilmResNet(film_dim, channels, stem_stride)
         self.spatial_softmax = SpatialSoftmax(spatial_softmax_temperature)
         feature_dim = n_cameras * 2 * channels[-1] + concat_dim
         self.motion = multilayer_perceptron([feature_dim, *hidden_dims, motion_dim])
@@ -110,21 +110,19 @@ class FilmResNet(nn.Module):
     Args:
         film_dim: Size of the embedding, 0 for no FiLM.
         channels: Of the blocks.
-        strides: Of the blocks. The paper's are all 1, so that the maps keep half the picture's size.
+        stem_stride: Of the first convolution. With the paper's 1, the maps have half the picture's size.
     """
 
-    def __init__(self, film_dim: int, channels: Sequence[int], strides: Sequence[int]) -> None:
+    def __init__(self, film_dim: int, channels: Sequence[int], stem_stride: int = 1) -> None:
         super().__init__()
         self.stem = nn.Sequential(
-            nn.Conv2d(3, channels[0], kernel_size=7, padding=3, bias=False),
+            nn.Conv2d(3, channels[0], kernel_size=7, stride=stem_stride, padding=3, bias=False),
             nn.BatchNorm2d(channels[0]),
             nn.ReLU(inplace=True),
             nn.MaxPool2d(kernel_size=3, stride=2, padding=1),
         )
         inputs = [channels[0], *channels[:-1]]
-        self.blocks = nn.ModuleList(
-            FilmBlock(*dims, film_dim) for dims in zip(inputs, channels, strides, strict=True)
-        )
+        self.blocks = nn.ModuleList(FilmBlock(*dims, film_dim) for dims in zip(inputs, channels, strict=True))
 
     def forward(self, images: Tensor, film: Tensor | None) -> Tensor:
         """From (batch, 3, H, W) to maps (batch, channels, h, w)."""
@@ -137,21 +135,21 @@ class FilmResNet(nn.Module):
 class FilmBlock(nn.Module):
     """A basic residual block, with FiLM after its second batch norm and before the sum."""
 
-    def __init__(self, in_channels: int, out_channels: int, stride: int, film_dim: int) -> None:
+    def __init__(self, in_channels: int, out_channels: int, film_dim: int) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False)
+        self.conv1 = nn.Conv2d(in_channels, out_channels, 3, padding=1, bias=False)
         self.norm1 = nn.BatchNorm2d(out_channels)
         self.conv2 = nn.Conv2d(out_channels, out_channels, 3, padding=1, bias=False)
         self.norm2 = nn.BatchNorm2d(out_channels)
         self.film = Film(film_dim, out_channels) if film_dim else None
         self.shortcut: nn.Module = nn.Identity()
-        if stride != 1 or in_channels != out_channels:
+        if in_channels != out_channels:
             self.shortcut = nn.Sequential(
-                nn.Conv2d(in_channels, out_channels, 1, stride, bias=False), nn.BatchNorm2d(out_channels)
+                nn.Conv2d(in_channels, out_channels, 1, bias=False), nn.BatchNorm2d(out_channels)
             )
 
     def forward(self, x: Tensor, film: Tensor | None) -> Tensor:
-        """From (batch, in, h, w) to (batch, out, h / stride, w / stride)."""
+        """From (batch, in, h, w) to (batch, out, h, w)."""
         y = F.relu(self.norm1(self.conv1(x)), inplace=True)
         y = self.norm2(self.conv2(y))
         if self.film is not None:

@@ -1,0 +1,48 @@
+"""The optimizer and the learning rate's course, as LeRobot's configurations."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
+from torch.optim.lr_scheduler import LambdaLR
+
+
+@OptimizerConfig.register_subclass("fused_adamw")
+@dataclass
+class FusedAdamWConfig(AdamWConfig):
+    """AdamW (Adam, where `weight_decay` is 0), updated in one pass over the weights.
+
+    The steps of a small network are short: on a CPU, LeRobot's Adam, operation by operation, takes a fifth of
+    them.
+    """
+
+    def build(self, params: Any) -> torch.optim.Optimizer:
+        """The optimizer of some weights."""
+        options = asdict(self)
+        options.pop("grad_clip_norm")
+        return torch.optim.AdamW(params, fused=True, **options)
+
+
+@LRSchedulerConfig.register_subclass("cosine")
+@dataclass
+class CosineSchedulerConfig(LRSchedulerConfig):
+    """From the learning rate down to 0, along half a cosine that lasts as long as the training.
+
+    Args:
+        num_warmup_steps: Over which the learning rate rises from 0.
+    """
+
+    num_warmup_steps: int = 0
+
+    def build(self, optimizer: torch.optim.Optimizer, num_training_steps: int) -> LambdaLR:
+        """The schedule of an optimizer."""
+
+        def factor(step: int) -> float:
+            warmup = min(1.0, (step + 1) / (self.num_warmup_steps + 1))
+            return warmup * 0.5 * (1 + math.cos(math.pi * min(1.0, step / num_training_steps)))
+
+        return LambdaLR(optimizer, factor)
