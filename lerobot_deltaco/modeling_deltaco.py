@@ -435,7 +435,6 @@ class DeltacoPolicy(PreTrainedPolicy):
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> DeltacoPolicy:
         """Loads a policy with what it knows of tasks. See `PreTrainedPolicy.from_pretrained`."""
-        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
         folder = Path(pretrained_name_or_path)
         if folder.is_dir():
             path = folder / TASKS_FILE
@@ -443,6 +442,9 @@ class DeltacoPolicy(PreTrainedPolicy):
             names = ("revision", "cache_dir", "token", "local_files_only", "force_download")
             options = {name: kwargs[name] for name in names if name in kwargs}
             path = Path(hf_hub_download(str(pretrained_name_or_path), TASKS_FILE, **options))
+        if kwargs.get("config") is not None:
+            _check_language_encoder(path, kwargs["config"])
+        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
         policy._read_tasks(path)
         return policy
 
@@ -463,11 +465,6 @@ class DeltacoPolicy(PreTrainedPolicy):
     def _read_tasks(self, path: Path) -> None:
         with safe_open(path, framework="pt") as file:
             known = file.metadata()
-            if known["language_encoder"] != self.config.language_encoder:
-                raise ValueError(
-                    f"The checkpoint was made with the language encoder {known['language_encoder']}. "
-                    f"`language_encoder` cannot be {self.config.language_encoder}."
-                )
             names = set(file.keys())
             self.instructions.put(json.loads(known["instructions"]), file.get_tensor("embeddings"))
             # Demonstrations named on the command line come before those of the checkpoint.
@@ -475,3 +472,14 @@ class DeltacoPolicy(PreTrainedPolicy):
                 self.shown = DemonstrationSet(
                     file.get_tensor("frames"), json.loads(known["tasks"]), file.get_tensor("episodes")
                 ).to(self.config.device)
+
+
+def _check_language_encoder(path: Path, config: DeltacoConfig) -> None:
+    """Refuses another encoder than the checkpoint's, before its weights turn out not to fit."""
+    with safe_open(path, framework="pt") as file:
+        name = file.metadata()["language_encoder"]
+    if name != config.language_encoder:
+        raise ValueError(
+            f"The checkpoint was made with the language encoder {name}. `language_encoder` cannot be "
+            f"{config.language_encoder}."
+        )

@@ -337,11 +337,12 @@ def test_a_checkpoint_is_complete_and_equal_to_the_bit(make, dataset, shown, tmp
         assert torch.equal(value, twin)
 
 
-def test_another_language_encoder_is_refused_at_evaluation(make, tmp_path):
+@pytest.mark.parametrize("other", ["all-MiniLM-L6-v2", "all-distilroberta-v1"], ids=["as large", "larger"])
+def test_another_language_encoder_is_refused_at_evaluation(make, tmp_path, other):
     policy, _, _ = make()
     policy.save_pretrained(tmp_path)
     config = copy.deepcopy(policy.config)
-    config.language_encoder = "all-MiniLM-L6-v2"
+    config.language_encoder = other
     with pytest.raises(ValueError, match="made with the language encoder paraphrase-MiniLM-L3-v2"):
         DeltacoPolicy.from_pretrained(tmp_path, config=config)
 
