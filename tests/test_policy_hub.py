@@ -149,7 +149,8 @@ def test_the_card_says_what_was_trained_and_on_what(dataset):
     assert f"Trained on: {REPO_ID}, 4 episodes of 2 tasks" in text
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", card.text, re.MULTILINE))
     assert (rows["steps"], rows["batch size"], rows["seed"]) == ("12,345", "24", "77")
-    assert (rows["optimizer"], rows["learning rate"]) == ("fused_adamw", "0.0003")
+    assert (rows["optimizer"], rows["learning rate"]) == ("Adam", "0.0003, constant")
+    assert (rows["gripper's loss"], rows["random shifts"]) == ("squared error, weight 30", "up to 4 pixels")
     assert (rows["backbone"], rows["seed of demonstrations and crops"]) == ("strided", "5")
     assert rows["through FiLM, into each residual block"] == "the embedding of the demonstration"
     assert "embedding of the instruction, and the robot's state" in text
@@ -159,6 +160,26 @@ def test_the_card_says_what_was_trained_and_on_what(dataset):
     assert "independent re-creation" in text
     assert "arxiv.org/abs/2210.04476" in text
     assert "@inproceedings{yu2023deltaco" in card.text
+
+
+def test_the_card_names_what_was_chosen_for_a_run():
+    chosen = {
+        "tasks_per_batch": 16,
+        "upsampled_tasks": "green|red",
+        "scheduler_name": "cosine",
+        "scheduler_warmup_steps": 1000,
+        "optimizer_weight_decay": 0.01,
+        "gripper_loss": "cross_entropy",
+    }
+    text = benchmark_card(**chosen).text
+    for row in (
+        "| learning rate | 0.0003, cosine after 1,000 steps |",
+        "| weight decay | 0.01 |",
+        "| tasks in a batch | 16 |",
+        "| tasks drawn more often | those with `green\\|red`, 50% of each batch |",
+        "| gripper's loss | cross entropy, weight 3 |",
+    ):
+        assert row in text
 
 
 def test_an_ablation_is_named(dataset):
@@ -206,7 +227,7 @@ def test_the_card_says_only_what_is_known():
     text = model_card(config, [], 0, None).text
     for unknown in ("Trained on", "Benchmark version", "| steps |", "| seed |", "None"):
         assert unknown not in text
-    assert "| learning rate | 0.0003 |" in text
+    assert "| learning rate | 0.0003, constant |" in text
 
 
 @pytest.mark.parametrize("has_demonstrations", [False, True])

@@ -175,8 +175,24 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
     options: dict[str, Any] = {}
     if train_config is not None:
         options |= {"steps": f"{train_config.steps:,}", "batch size": train_config.batch_size}
-    optimizer = getattr(train_config, "optimizer", None) or config.get_optimizer_preset()
-    options |= {"optimizer": optimizer.type, "learning rate": f"{optimizer.lr:g}"}
+    preset = config.get_optimizer_preset()
+    optimizer = getattr(train_config, "optimizer", None) or preset
+    # Fused or not, AdamW without weight decay is Adam.
+    is_adam = isinstance(optimizer, type(preset)) and not optimizer.weight_decay
+    course = config.scheduler_name
+    if course != "constant" and config.scheduler_warmup_steps:
+        course += f" after {config.scheduler_warmup_steps:,} steps"
+    options |= {
+        "optimizer": "Adam" if is_adam else optimizer.type,
+        "learning rate": f"{optimizer.lr:g}, {course}",
+    }
+    if optimizer.weight_decay:
+        options["weight decay"] = f"{optimizer.weight_decay:g}"
+    if config.tasks_per_batch:
+        options["tasks in a batch"] = config.tasks_per_batch
+    if config.tasks_per_batch and config.upsampled_tasks is not None:
+        share = f"{config.upsampled_share:.0%} of each batch"
+        options["tasks drawn more often"] = f"those with `{config.upsampled_tasks}`, {share}"
     if train_config is not None:
         options["seed"] = train_config.seed
     options |= {
@@ -187,7 +203,8 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
         "arithmetic": config.dtype,
     }
     if config.gripper_index is not None:
-        options["weight of the gripper's loss"] = f"{config.gripper_weight:g}"
+        kind = config.gripper_loss.replace("_", " ")
+        options["gripper's loss"] = f"{kind}, weight {config.gripper_weight:g}"
     return options
 
 
