@@ -129,7 +129,7 @@ class DeltacoPolicy(PreTrainedPolicy):
                 if network is not None:
                     network.compile()
         self._told: dict[int, _Told] = {}
-        self._n_episodes: dict[int, int] = {}
+        self._n_episodes: dict[str, int] = {}  # of each task
         self.reset()
 
     def get_optim_params(self) -> list[nn.Parameter]:
@@ -251,9 +251,7 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Begins an episode (of this thread, if several evaluate tasks at the same time)."""
-        thread = threading.get_ident()
-        self._told.pop(thread, None)
-        self._n_episodes[thread] = self._n_episodes.get(thread, -1) + 1
+        self._told.pop(threading.get_ident(), None)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
@@ -283,23 +281,31 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     def _tell(self, tasks: tuple[str, ...], device: torch.device) -> _Told:
         """Encodes the demonstrations and instructions of tasks, once an episode."""
-        n_before = self._n_episodes[threading.get_ident()] * len(tasks)
+        trials = self._count(tasks)
         demo = language = None
         if self.config.uses_demo:
-            shown, rows = self._choose(tasks, n_before)
+            shown, rows = self._choose(tasks, trials)
             generator = torch.Generator().manual_seed(self.config.seed)
             demo = self._encode_demo(shown, rows, generator)
         if self.config.uses_language:
             language = self.instructions(tasks, device)
         if self.config.method == "mcil":
             # The trials of a task use the language and the demonstration in turn.
-            by_language = (n_before + torch.arange(len(tasks), device=device)) % 2 == 0
+            by_language = torch.tensor(trials, device=device) % 2 == 0
             return _Told(
                 tasks, torch.where(by_language[:, None], self.project_language(language), demo), None
             )
         return _Told(tasks, *self._told_by(tasks, demo, language))
 
-    def _choose(self, tasks: tuple[str, ...], n_before: int) -> tuple[DemonstrationSet, Tensor]:
+    def _count(self, tasks: tuple[str, ...]) -> list[int]:
+        """The number of each sample's episode among those of its task, from 0, whichever thread runs them."""
+        trials = []
+        for task in tasks:
+            trials.append(self._n_episodes.get(task, 0))
+            self._n_episodes[task] = trials[-1] + 1
+        return trials
+
+    def _choose(self, tasks: tuple[str, ...], trials: Sequence[int]) -> tuple[DemonstrationSet, Tensor]:
         """The demonstrations for evaluation, and the row of each task's; those of a task take turns."""
         candidates = [shown for shown in (self.shown, self.trained_on) if shown is not None]
         if self.config.demo_episode is not None and self.shown is not None:
@@ -314,7 +320,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         for shown in candidates:
             if all(task in shown.rows for task in tasks):
                 rows = [
-                    shown.rows[task][(n_before + n) % len(shown.rows[task])] for n, task in enumerate(tasks)
+                    shown.rows[task][trial % len(shown.rows[task])]
+                    for task, trial in zip(tasks, trials, strict=True)
                 ]
                 return shown, torch.tensor(rows, device=shown.frames.device)
         there = sorted({task for shown in candidates for task in shown.rows})

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -221,6 +222,39 @@ def test_the_optimizer_has_every_weight_of_the_networks_and_no_other(make, datas
     assert len(group["params"]) == len(expected)
     # Neither demonstrations nor embeddings are weights: a checkpoint of the networks stays small.
     assert not any("shown" in name or "trained_on" in name for name in policy.state_dict())
+
+
+# Evaluation by several threads
+
+
+def test_a_thread_that_never_reset_the_policy_may_act(make, dataset):
+    """As in LeRobot's policy server, whose requests come in threads of their own."""
+    policy, before, _ = make(method="language_only")
+    batch = before(observation(dataset, TASKS))
+    expected = policy.eval().select_action(batch)
+    with ThreadPoolExecutor(1) as pool:
+        assert torch.equal(pool.submit(policy.select_action, batch).result(), expected)
+
+
+@pytest.mark.parametrize("n_threads", [1, 2])
+def test_the_trials_of_a_task_do_not_depend_on_other_tasks(make, dataset, n_threads):
+    """Each task's demonstrations take turns, and for MCIL language and demonstration, whoever came before."""
+    policy, before, _ = make(method="mcil", demo_repo_id=REPO_ID, demo_root=str(dataset.root))
+    policy.eval()
+    batches = {task: before(observation(dataset, [task])) for task in TASKS}
+
+    def act(task, policy):
+        actions = []
+        for _ in range(3):
+            policy.reset()
+            actions.append(policy.select_action(batches[task]))
+        return torch.cat(actions)
+
+    alone = {task: act(task, copy.deepcopy(policy)) for task in TASKS}
+    with ThreadPoolExecutor(n_threads) as pool:
+        shown = {task: pool.submit(act, task, policy) for task in TASKS}
+    for task, actions in alone.items():
+        assert torch.equal(shown[task].result(), actions)
 
 
 # The loss of episodes that `--dataset.eval_split` holds back
