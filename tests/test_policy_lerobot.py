@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -21,6 +22,7 @@ from small_policies import (
     REPO_ID,
     TASKS,
     batch_of,
+    fake_encoder,
     observation,
     small_policy,
     use_fake_encoder,
@@ -30,6 +32,8 @@ from small_policies import (
 from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
 from lerobot_deltaco.configuration_env import DeltacoEnv
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy import language
+from lerobot_deltaco.policy.language import InstructionTable
 
 
 @pytest.fixture(autouse=True)
@@ -255,6 +259,25 @@ def test_the_trials_of_a_task_do_not_depend_on_other_tasks(make, dataset, n_thre
         shown = {task: pool.submit(act, task, policy) for task in TASKS}
     for task, actions in alone.items():
         assert torch.equal(shown[task].result(), actions)
+
+
+def test_threads_embed_instructions_without_mixing_them_up(monkeypatch):
+    """Each is embedded once, even if several threads ask for it at the same time."""
+    encode = fake_encoder("all-MiniLM-L6-v2")
+
+    def slowly(sentences):
+        time.sleep(0.01)
+        return encode(sentences)
+
+    monkeypatch.setattr(language, "load_language_encoder", lambda _: slowly)
+    table = InstructionTable("all-MiniLM-L6-v2")
+    asked = [[f"task {n // 2}"] for n in range(16)]
+    with ThreadPoolExecutor(8) as pool:
+        embeddings = list(pool.map(lambda instructions: table(instructions, "cpu"), asked))
+    for instructions, embedding in zip(asked, embeddings, strict=True):
+        assert torch.equal(embedding, encode(instructions))
+        assert torch.equal(table(instructions, "cpu"), encode(instructions))
+    assert len(table.embeddings) == len(table.rows) == 8
 
 
 # The loss of episodes that `--dataset.eval_split` holds back

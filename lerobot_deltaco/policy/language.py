@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -104,8 +105,12 @@ def _checked_package() -> Path:
     return folder
 
 
+# With `--env.max_parallel_tasks` above 1, threads share a policy. A table with a lock could not be copied.
+_LOCK = threading.RLock()
+
+
 class InstructionTable:
-    """Embeddings of instructions, each computed once.
+    """Embeddings of instructions, each computed once. Several threads may ask at the same time.
 
     Args:
         encoder_name: One of `LANGUAGE_ENCODERS`.
@@ -123,21 +128,25 @@ class InstructionTable:
         Raises:
             LanguageEncoderError: The encoder cannot be loaded.
         """
-        new = [text for text in dict.fromkeys(instructions) if text not in self.rows]
-        if not new:
-            return
-        if self._encode is None:
-            self._encode = load_language_encoder(self.encoder_name)
-        self.put(new, self._encode(new))
+        with _LOCK:
+            new = [text for text in dict.fromkeys(instructions) if text not in self.rows]
+            if not new:
+                return
+            if self._encode is None:
+                self._encode = load_language_encoder(self.encoder_name)
+            self.put(new, self._encode(new))
 
     def put(self, instructions: Sequence[str], embeddings: Tensor) -> None:
         """Adds instructions whose embeddings, (instructions, embedding), are known."""
-        self.rows |= {text: len(self.rows) + i for i, text in enumerate(instructions)}
-        self.embeddings = torch.cat([self.embeddings, embeddings.to(self.embeddings)])
+        with _LOCK:
+            n_known = len(self.embeddings)
+            self.embeddings = torch.cat([self.embeddings, embeddings.to(self.embeddings)])
+            self.rows |= {text: n_known + i for i, text in enumerate(instructions)}
 
     def __call__(self, instructions: Sequence[str], device: torch.device | str) -> Tensor:
         """Embeddings of instructions, (instructions, embedding)."""
-        self.add(instructions)
-        if self.embeddings.device != torch.device(device):
-            self.embeddings = self.embeddings.to(device)
-        return self.embeddings[[self.rows[text] for text in instructions]]
+        with _LOCK:
+            self.add(instructions)
+            if self.embeddings.device != torch.device(device):
+                self.embeddings = self.embeddings.to(device)
+            return self.embeddings[[self.rows[text] for text in instructions]]
