@@ -9,19 +9,24 @@ INSTALLING := $(VENV)/.installing
 PYTHON ?=
 # More arguments for pytest: make test ARGS="-k tasks"
 ARGS ?=
+# A row of the paper's tables, a file in experiments/, and the seed of its training
+ROW ?= scenario_a/deltaco
+SEED ?= 0
 
 export UV_PYTHON_DOWNLOADS := never
 
-.PHONY: help install demo test test-slow lint benchmark-env
+.PHONY: help install demo experiment test test-slow lint benchmark-env benchmark-policy benchmark-train
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 22
 
 install: $(INSTALLED) ## Only set up the environment, in .venv
 
-demo: $(INSTALLED) ## Collect a few episodes of the scripted expert, and show them in outputs/demo
-	$(BIN)/deltaco-collect --tasks 4,64,231 --episodes-per-task 4 --root outputs/demo/dataset
-	$(BIN)/deltaco-gallery --out outputs/demo
+demo: $(INSTALLED) ## Collect, train and evaluate on a few tasks, in a quarter of an hour: outputs/demo
+	$(BIN)/deltaco-demo --out outputs/demo
+
+experiment: $(INSTALLED) ## Run a row of the tables: make experiment ROW=scenario_a/deltaco SEED=0
+	$(BIN)/deltaco-experiment $(ROW) --seed $(SEED)
 
 test: $(INSTALLED) ## Run the default tests: a few minutes, no network, no GPU
 	$(BIN)/python -m pytest $(ARGS)
@@ -36,6 +41,12 @@ lint: $(INSTALLED) ## Check style and types
 
 benchmark-env: $(INSTALLED) ## Measure the speed of the environment
 	$(BIN)/python benchmarks/env.py
+
+benchmark-policy: $(INSTALLED) ## Measure the speed of the policy
+	$(BIN)/python benchmarks/policy.py
+
+benchmark-train: $(INSTALLED) ## Measure the speed of lerobot-train and deltaco-train
+	$(BIN)/python benchmarks/train.py
 
 # Candidates are run, not only looked up: a shim may be on the path and still fail. Building PyBullet also needs
 # Python's headers.

@@ -131,8 +131,8 @@ def _parser() -> argparse.ArgumentParser:
     plan = EvaluationPlan()
     parser = argparse.ArgumentParser(
         prog="deltaco-evaluate",
-        description="Evaluates checkpoints of training runs, and writes a record of each evaluation set into "
-        "the run's folder `evaluations`. What has a record is skipped; `deltaco-report` makes tables of them.",
+        description="Evaluates checkpoints of training runs, and writes a record of each evaluation set "
+        "into the run's folder `evaluations`. What has a record is skipped. `deltaco-report` tabulates them.",
     )
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_DIR", help="of a training")
     parser.add_argument(

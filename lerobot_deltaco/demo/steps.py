@@ -1,0 +1,206 @@
+"""The demo's steps, each a command of its own, and each done once: an interrupted demo goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lerobot_deltaco.demo import recipe
+from lerobot_deltaco.demo.machine import fast_dtype
+
+TRAINING_SET = "deltaco/demo"
+DEMONSTRATIONS = "deltaco/demo_demonstrations"
+# Nothing is fetched from the Hub: the language encoder comes with the extra `offline`.
+_OFFLINE = {**os.environ, "HF_HUB_OFFLINE": "1"}
+# What a finished step leaves, with the seconds that it took.
+_DONE = "done.json"
+
+
+class DemoError(RuntimeError):
+    """A step failed; the message says which, and how it was called."""
+
+
+class Demo:
+    """The folder of a demo, and what is done there.
+
+    Args:
+        folder: Where everything goes. A demo that was made with other settings there is refused.
+        settings: Changes of the recipe, for tests: steps, episodes per task, trials.
+
+    Raises:
+        DemoError: The folder has a demo of another recipe.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any] | None = None) -> None:
+        self.folder = folder
+        self.settings: dict[str, Any] = {
+            "tasks": list(recipe.TRAINED_TASKS),
+            "new_combinations": list(recipe.NEW_COMBINATIONS),
+            "episodes_per_task": recipe.EPISODES_PER_TASK,
+            "steps": recipe.STEPS,
+            "save_every": recipe.SAVE_EVERY,
+            "batch_size": recipe.BATCH_SIZE,
+            "trials": dict(recipe.TRIALS),
+            "counterfactual_trials": recipe.COUNTERFACTUAL_TRIALS,
+            "policy": dict(recipe.POLICY_OPTIONS),
+            **(settings or {}),
+        }
+        file = folder / "settings.json"
+        there = json.loads(file.read_text()) if file.exists() else None
+        # Once chosen, it stays, also if the folder is moved to another machine.
+        if there is not None and "dtype" not in self.settings["policy"]:
+            self.settings["policy"]["dtype"] = there.get("policy", {}).get("dtype")
+        elif "dtype" not in self.settings["policy"]:
+            self.settings["policy"]["dtype"] = fast_dtype()
+        if there not in (None, self.settings):
+            raise DemoError(
+                f"{folder} has a demo with other settings. Move that folder away, and run the demo again."
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(self.settings, indent=2) + "\n")
+
+    @property
+    def run(self) -> Path:
+        """The folder of the training run."""
+        return self.folder / "training"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The policy at the end of the training."""
+        return self.run / "checkpoints" / "last" / "pretrained_model"
+
+    def seconds(self) -> dict[str, float]:
+        """How long each finished step took, interruptions not counted."""
+        file = self.folder / _DONE
+        return json.loads(file.read_text()) if file.exists() else {}
+
+    def collect(self) -> None:
+        """Collects the training set and the demonstrations."""
+        tasks = recipe.selection(tuple(self.settings["tasks"]))
+        everything = recipe.selection((*self.settings["tasks"], *self.settings["new_combinations"]))
+        number = str(self.settings["episodes_per_task"])
+        self._do(
+            "collect",
+            "Collecting the expert's episodes",
+            self._deltaco(
+                "collect", "--tasks", tasks, "--episodes-per-task", number, "--root", self.folder / "dataset"
+            ),
+        )
+        self._do(
+            "demonstrate",
+            "Collecting one demonstration of each task",
+            self._deltaco(
+                "collect",
+                "--tasks",
+                everything,
+                "--episodes-per-task",
+                str(recipe.DEMONSTRATIONS_PER_TASK),
+                "--split",
+                "validation",
+                "--root",
+                self.folder / "demonstrations",
+            ),
+        )
+
+    def train(self) -> None:
+        """Trains with `lerobot-train`, from the last checkpoint if there is one."""
+        steps = self.settings["steps"]
+        last = self.checkpoint / "train_config.json"
+        if last.exists():
+            arguments = [f"--config_path={last}", "--resume=true"]
+        else:
+            # What an interrupted training left before its first checkpoint.
+            shutil.rmtree(self.run, ignore_errors=True)
+            policy = {f"policy.{name}": value for name, value in self.settings["policy"].items()}
+            options = {
+                **policy,
+                "policy.demo_repo_id": DEMONSTRATIONS,
+                "policy.demo_root": self.folder / "demonstrations",
+                "dataset.repo_id": TRAINING_SET,
+                "dataset.root": self.folder / "dataset",
+                "batch_size": self.settings["batch_size"],
+                "steps": steps,
+                "save_freq": self.settings["save_every"],
+                "log_freq": 100,
+                "num_workers": 0,
+                "job_name": "demo",
+                "output_dir": self.run,
+            }
+            arguments = [f"--{name}={value}" for name, value in options.items()]
+        self._do("train", f"Training for {steps} steps", self._lerobot("train", arguments))
+
+    def evaluate(self) -> None:
+        """Evaluates with `lerobot-eval`, on new scenes of trained tasks and of new combinations."""
+        for name, tasks in (("trained", "tasks"), ("new", "new_combinations")):
+            trials = self.settings["trials"][name]
+            options = {
+                "policy.path": self.checkpoint,
+                "env.type": "deltaco",
+                "env.task": recipe.selection(tuple(self.settings[tasks])),
+                "env.render_size": 128,
+                "eval.n_episodes": trials,
+                "eval.batch_size": min(10, trials),
+                "eval.use_async_envs": "false",
+                "output_dir": self.folder / "evaluation" / name,
+            }
+            arguments = [f"--{key}={value}" for key, value in options.items()]
+            text = {"trained": "in new scenes", "new": "on combinations that it was not trained on"}[name]
+            self._do(f"evaluate_{name}", f"Evaluating {text}", self._lerobot("eval", arguments))
+
+    def ask_otherwise(self) -> None:
+        """Shows the policy another task's demonstration, or tells it another task's instruction."""
+        everything = recipe.selection((*self.settings["tasks"], *self.settings["new_combinations"]))
+        for what in ("demo", "instruction"):
+            arguments = ("--tasks", everything, "--steps", "last", "--counterfactual", what)
+            trials = ("--trials", str(self.settings["counterfactual_trials"]))
+            self._do(
+                f"other_{what}",
+                f"Giving it another task's {what}",
+                self._deltaco("evaluate", self.run, *arguments, *trials),
+            )
+
+    def _do(self, name: str, what: str, command: Sequence[Any]) -> None:
+        """Runs a command, unless it was run to its end before."""
+        seconds = self.seconds()
+        if name in seconds:
+            sys.stdout.write(f"[demo] {what}: done before.\n")
+            return
+        words = [str(word) for word in command]
+        sys.stdout.write(f"\n[demo] {what}:\n{shlex.join(['python', *words[1:]])}\n")
+        sys.stdout.flush()
+        start = time.monotonic()
+        try:
+            code = subprocess.run(words, check=False, env=_OFFLINE).returncode
+        finally:
+            self._note(f"{name}_so_far", time.monotonic() - start)
+        if code != 0:
+            raise DemoError(
+                f"{what} failed (exit status {code}); see above for why. The command was\n"
+                f"{shlex.join(words)}\nOnce its reason is gone, the demo goes on from here."
+            )
+        so_far = self.seconds().get(f"{name}_so_far", 0.0)
+        self._note(name, so_far)
+
+    def _note(self, name: str, seconds: float) -> None:
+        everything = self.seconds()
+        everything[name] = everything.get(name, 0.0) + seconds
+        file = self.folder / _DONE
+        unfinished = file.with_suffix(".unfinished")
+        unfinished.write_text(json.dumps(everything, indent=2) + "\n")
+        unfinished.replace(file)
+
+    @staticmethod
+    def _deltaco(command: str, *arguments: Any) -> list[Any]:
+        return [sys.executable, "-m", f"lerobot_deltaco.commands.{command}", *arguments]
+
+    @staticmethod
+    def _lerobot(command: str, arguments: Sequence[str]) -> list[str]:
+        return [sys.executable, "-m", f"lerobot.scripts.lerobot_{command}", *arguments]

@@ -1,0 +1,1 @@
+"""Experiments: the rows of the paper's tables as configuration files, and running one."""

@@ -1,0 +1,92 @@
+"""Rows of the tables, as files: what a row says, over what its folder shares, over what all share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+SHARED = "shared.yaml"
+_SECTIONS = ("data", "demonstrations", "policy", "training", "evaluation")
+
+
+class RowError(ValueError):
+    """There is no such row, or its file is wrong; the message says what is."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table.
+
+    Args:
+        name: Such as "scenario_a/deltaco".
+        data: Arguments of the collection that is trained on, as `CollectionPlan` has them.
+        demonstrations: The same of the collection that shows the test tasks.
+        policy: Options of `--policy`.
+        training: Further options of `deltaco-train`.
+        evaluation: Arguments of the evaluation sets, as `EvaluationPlan` has them.
+        start_from: The row whose last checkpoint, of the same seed, is trained on; None for a new policy.
+    """
+
+    name: str
+    data: Mapping[str, Any]
+    demonstrations: Mapping[str, Any]
+    policy: Mapping[str, Any]
+    training: Mapping[str, Any]
+    evaluation: Mapping[str, Any]
+    start_from: str | None = field(default=None)
+
+
+def row_names(folder: Path) -> list[str]:
+    """The rows in a folder of experiments."""
+    return sorted(
+        path.relative_to(folder).with_suffix("").as_posix()
+        for path in folder.glob("*/*.yaml")
+        if path.name != SHARED
+    )
+
+
+def read_row(folder: Path, name: str) -> Row:
+    """Reads a row.
+
+    Args:
+        folder: Of the experiments.
+        name: Such as "scenario_a/deltaco".
+
+    Raises:
+        RowError: There is no such row, or a file has something in it that is not known.
+    """
+    file = folder / f"{name}.yaml"
+    if name not in row_names(folder):
+        raise RowError(f"There is no row {name!r} in {folder}. There are {', '.join(row_names(folder))}.")
+    merged: dict[str, Any] = {}
+    for path in (folder / SHARED, file.parent / SHARED, file):
+        if path.is_file():
+            merged = _merged(merged, _read(path))
+    sections = {section: merged.get(section, {}) for section in _SECTIONS}
+    return Row(name, **sections, start_from=merged.get("start_from"))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    unknown = set(content) - {*_SECTIONS, "start_from"}
+    if unknown:
+        raise RowError(
+            f"{path} has the unknown section {sorted(unknown)[0]!r}. Valid are {', '.join(_SECTIONS)} and "
+            "start_from."
+        )
+    return content
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of both, those of `above` first."""
+    merged = dict(below)
+    for key, value in above.items():
+        if isinstance(value, Mapping) and isinstance(merged.get(key), Mapping):
+            merged[key] = _merged(merged[key], value)
+        else:
+            merged[key] = value
+    return merged

@@ -1,0 +1,124 @@
+"""Runs a row: collects its data, trains, evaluates every checkpoint. What is done is not done again."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot_deltaco.experiments.rows import Row
+
+LAST = Path("checkpoints", "last", "pretrained_model")
+
+
+class ExperimentError(RuntimeError):
+    """A step of an experiment failed; the message says which."""
+
+
+class Experiment:
+    """A row with a seed, in a folder of experiments' outputs.
+
+    Args:
+        row: The row.
+        seed: Of the training: the weights, the order of the data, the draws.
+        outputs: Where everything goes: `data/` is shared by all rows, `ROW/seed_SEED` is the run's.
+    """
+
+    def __init__(self, row: Row, seed: int, outputs: Path) -> None:
+        self.row = row
+        self.seed = seed
+        self.outputs = outputs
+        self.run = run_folder(outputs, row.name, seed)
+
+    def do(self) -> None:
+        """Everything that is not done yet.
+
+        Raises:
+            ExperimentError: A step failed.
+        """
+        data = self.collect(self.row.data)
+        demonstrations = self.collect(self.row.demonstrations)
+        self.train(data, demonstrations)
+        self.evaluate()
+
+    def collect(self, plan: Mapping[str, Any]) -> Path:
+        """Collects a dataset that other rows may share; gives its folder."""
+        root = self.outputs / "data" / "_".join(f"{key}-{value}" for key, value in sorted(plan.items()))
+        options = [f"--{key.replace('_', '-')}={value}" for key, value in plan.items()]
+        _do("collect", [*options, f"--root={root}"])
+        return root
+
+    def train(self, data: Path, demonstrations: Path) -> None:
+        """Trains, from the last checkpoint if there is one.
+
+        Raises:
+            ExperimentError: The row's `start_from` was not trained with this seed.
+        """
+        last = self.run / LAST / "train_config.json"
+        if last.exists():
+            if _steps_done(self.run) >= self.row.training["steps"]:
+                return
+            _do("train", [f"--config_path={last}", "--resume=true"])
+            return
+        # What an interrupted training left before its first checkpoint.
+        shutil.rmtree(self.run, ignore_errors=True)
+        options = {
+            **{f"policy.{name}": value for name, value in self.row.policy.items() if value is not None},
+            "policy.seed": self.seed,
+            "policy.demo_repo_id": "deltaco/demonstrations",
+            "policy.demo_root": demonstrations,
+            "dataset.repo_id": "deltaco/training",
+            "dataset.root": data,
+            **self.row.training,
+            "seed": self.seed,
+            "job_name": self.row.name,
+            "output_dir": self.run,
+        }
+        if self.row.start_from is None:
+            options = {"policy.type": "deltaco", **options}
+        else:
+            start = run_folder(self.outputs, self.row.start_from, self.seed)
+            if not (start / LAST).exists():
+                raise ExperimentError(
+                    f"{self.row.name} starts from {self.row.start_from}, which was not trained with the seed "
+                    f"{self.seed}. Run that row first."
+                )
+            options = {"policy.path": start / LAST, **options}
+        _do("train", [f"--{name}={_text(value)}" for name, value in options.items()])
+
+    def evaluate(self) -> None:
+        """Evaluates the checkpoints."""
+        options = [f"--{name}={value}" for name, value in self.row.evaluation.items()]
+        _do("evaluate", [str(self.run), *options, f"--experiment={self.row.name}"])
+
+
+def run_folder(outputs: Path, row_name: str, seed: int) -> Path:
+    """Where a row's run with a seed is."""
+    return outputs / row_name / f"seed_{seed}"
+
+
+def _steps_done(run: Path) -> int:
+    state = run / "checkpoints" / "last" / "training_state" / "training_step.json"
+    return int(json.loads(state.read_text())["step"])
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value) if isinstance(value, bool | list) else str(value)
+
+
+def _do(command: str, arguments: list[str]) -> None:
+    """Runs one of this project's commands, with this Python."""
+    sys.stdout.write(f"\ndeltaco-{command} {shlex.join(arguments)}\n")
+    sys.stdout.flush()
+    words = [sys.executable, "-m", f"lerobot_deltaco.commands.{command}", *arguments]
+    code = subprocess.run(words, check=False).returncode
+    if code != 0:
+        raise ExperimentError(
+            f"deltaco-{command} failed (exit status {code}); see above for why. The same command goes on "
+            "from here."
+        )

@@ -1,0 +1,114 @@
+"""The demo: its recipe makes sense, each step is done once, and it leaves a page and a summary."""
+
+import json
+import sys
+from html.parser import HTMLParser
+
+import pytest
+from PIL import Image
+
+from gym_deltaco.tasks import get_task
+from lerobot_deltaco.demo import recipe
+from lerobot_deltaco.demo.page import write_page
+from lerobot_deltaco.demo.steps import Demo, DemoError
+
+
+def test_new_combinations_are_of_trained_objects_and_containers():
+    trained = [get_task(index) for index in recipe.TRAINED_TASKS]
+    assert set(recipe.NEW_COMBINATIONS).isdisjoint(recipe.TRAINED_TASKS)
+    assert len(trained) == 18
+    for index in recipe.NEW_COMBINATIONS:
+        task = get_task(index)
+        assert any(task.row == other.row for other in trained)
+        assert any(task.container == other.container for other in trained)
+
+
+@pytest.fixture
+def demo(tmp_path):
+    return Demo(tmp_path / "demo")
+
+
+def test_a_step_is_done_once(demo, tmp_path, capsys):
+    log = tmp_path / "log"
+    command = [sys.executable, "-c", f"open({str(log)!r}, 'a').write('x')"]
+    for again in (demo, Demo(demo.folder)):
+        again._do("greet", "Greeting", command)
+    assert log.read_text() == "x"
+    assert "Greeting: done before" in capsys.readouterr().out
+    assert demo.seconds()["greet"] > 0
+
+
+def test_a_failed_step_is_named_and_done_again(demo, tmp_path):
+    flag = tmp_path / "flag"
+    command = [sys.executable, "-c", f"import os, sys; sys.exit(0 if os.path.exists({str(flag)!r}) else 3)"]
+    with pytest.raises(DemoError, match="Greeting failed .exit status 3.*goes on from here"):
+        demo._do("greet", "Greeting", command)
+    first = demo.seconds()
+    assert "greet" not in first
+    flag.touch()
+    demo._do("greet", "Greeting", command)
+    # The time of the attempt that failed is counted too.
+    assert demo.seconds()["greet"] > first["greet_so_far"]
+
+
+def test_a_demo_with_other_settings_is_not_mixed_with_this_one(demo):
+    with pytest.raises(DemoError, match="other settings. Move that folder away"):
+        Demo(demo.folder, {"steps": 1})
+
+
+def test_the_number_format_is_chosen_once(demo):
+    chosen = demo.settings["policy"]["dtype"]
+    assert chosen in ("float32", "bfloat16")
+    other = {"float32": "bfloat16", "bfloat16": "float32"}[chosen]
+    file = demo.folder / "settings.json"
+    file.write_text(file.read_text().replace(chosen, other))
+    assert Demo(demo.folder).settings["policy"]["dtype"] == other
+
+
+class Page(HTMLParser):
+    """What a page refers to."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.files = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.files += [value for name, value in attrs if name in ("src", "href")]
+
+
+@pytest.mark.slow
+def test_the_whole_demo_at_a_tiny_size(tmp_path):
+    settings = {
+        "tasks": [34, 36, 82],
+        "new_combinations": [84],
+        "episodes_per_task": 2,
+        "steps": 4,
+        "save_every": 2,
+        "batch_size": 6,
+        "trials": {"trained": 1, "new": 2},
+        "counterfactual_trials": 1,
+    }
+    demo = Demo(tmp_path / "demo", settings)
+    for step in (demo.collect, demo.train, demo.evaluate, demo.ask_otherwise):
+        step()
+    page = write_page(demo)
+    summary = json.loads((demo.folder / "summary.json").read_text())
+    assert set(summary) == {
+        *("success_rate", "success_rate_new_combinations", "chance", "episodes", "minutes")
+    }
+    assert summary["episodes"] == 5
+    assert summary["chance"] == pytest.approx(1 / 6)
+    assert 0 <= summary["success_rate"] <= 1
+    assert summary["minutes"] > 0
+    files = Page(page.read_text()).files
+    assert len(files) == 2 * 4 + 1
+    for name in files:
+        assert (demo.folder / name).is_file()
+        if name.endswith(".png"):
+            assert Image.open(demo.folder / name).width > 600
+    # Everything is done: nothing runs again.
+    before = demo.seconds()
+    for step in (demo.collect, demo.train, demo.evaluate, demo.ask_otherwise):
+        step()
+    assert demo.seconds() == before

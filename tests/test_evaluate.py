@@ -1,0 +1,189 @@
+"""Evaluation sets: which scenes, what the policy is told, and what is recorded."""
+
+import json
+import random
+import sys
+
+import numpy as np
+import pytest
+import torch
+from lerobot.scripts import lerobot_train
+from small_policies import use_fake_encoder
+
+from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.expert import Expert
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.tasks import get_task
+from lerobot_deltaco.commands import collect as collect_command
+from lerobot_deltaco.commands import evaluate as evaluate_command
+from lerobot_deltaco.evaluation.evaluate import EvaluationPlan, evaluate, other_task
+from lerobot_deltaco.evaluation.record import read_record, record_path
+from lerobot_deltaco.evaluation.runs import RunError, checkpoints, load_policy
+from lerobot_deltaco.training.loop import InMemoryTraining
+
+TASKS = (4, 14, 55)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A training run of two steps, with checkpoints of both, on a small set of the expert's episodes."""
+    folder = tmp_path_factory.mktemp("run")
+    root = str(folder / "data")
+    collect_command.main(["--tasks", "4,14,55", "--episodes-per-task", "2", "--root", root, "--workers", "1"])
+    arguments = {
+        "policy.type": "deltaco",
+        "policy.device": "cpu",
+        "policy.backbone": "strided",
+        "policy.demo_repo_id": "test/data",
+        "policy.demo_root": root,
+        "dataset.repo_id": "test/data",
+        "dataset.root": root,
+        "batch_size": "6",
+        "steps": "2",
+        "save_freq": "1",
+        "num_workers": "0",
+        "job_name": "small/deltaco",
+        "seed": "7",
+        "output_dir": str(folder / "training"),
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        use_fake_encoder(patch)
+        patch.setattr(sys, "argv", ["train", *(f"--{key}={value}" for key, value in arguments.items())])
+        with InMemoryTraining().active():
+            lerobot_train.main()
+    return folder / "training"
+
+
+@pytest.fixture
+def loaded(run):
+    return load_policy(checkpoints(run)[-1].folder)
+
+
+def test_an_evaluation_set_is_a_function_of_the_seed_and_the_set(loaded):
+    plan = EvaluationPlan("4,14", trials=2, seed=3)
+    episodes = evaluate(*loaded, plan, set_number=10)
+    assert [(episode.task_id, episode.trial) for episode in episodes] == [(4, 0), (4, 1), (14, 0), (14, 1)]
+    for episode in episodes:
+        assert episode.seed == episode_seed(3, "evaluation", episode.task_id, 10, episode.trial)
+        assert episode.instruction == episode.demonstration == get_task(episode.task_id).instruction
+        env = PickPlaceEnv()
+        _, info = env.reset(seed=episode.seed, options={"task_id": episode.task_id})
+        assert episode.objects == info["objects"].tolist()
+        assert episode.target_object == info["target_object"]
+        assert episode.container_quadrants == info["container_quadrants"].tolist()
+        env.close()
+    again = evaluate(*load_policy_again(loaded), plan, set_number=10)
+    assert again == episodes
+    other = evaluate(*loaded, plan, set_number=11)
+    assert {episode.seed for episode in other}.isdisjoint(episode.seed for episode in episodes)
+
+
+def load_policy_again(loaded):
+    return load_policy(loaded.policy.config.pretrained_path)
+
+
+def test_the_outcome_is_that_of_the_scene_at_the_end(loaded, monkeypatch):
+    # The policy's place is taken by the expert, which succeeds.
+    acting = {}
+    reset = PickPlaceEnv.reset
+
+    def noted(self, **arguments):
+        result = reset(self, **arguments)
+        acting["env"], acting["expert"] = self, Expert(self, np.random.default_rng(0), noise=0.0)
+        return result
+
+    monkeypatch.setattr(PickPlaceEnv, "reset", noted)
+    monkeypatch.setattr(
+        loaded.policy,
+        "select_action",
+        lambda batch: torch.as_tensor(acting["expert"].act(), dtype=torch.float32)[None],
+    )
+    episodes = evaluate(*loaded, EvaluationPlan("4,14,55", trials=1), set_number=0)
+    assert sum(episode.success for episode in episodes) >= 2
+    for episode in episodes:
+        if episode.success:
+            assert episode.object_containers[episode.target_object] == episode.target_container
+            assert episode.right_object
+            assert episode.right_container
+
+
+@pytest.mark.parametrize("changed", ["demo", "instruction"])
+def test_a_counterfactual_changes_one_of_both(loaded, changed):
+    plan = EvaluationPlan("4,14,55", trials=2, counterfactual=changed)
+    for episode in evaluate(*loaded, plan, set_number=0):
+        own = get_task(episode.task_id).instruction
+        told = {"demo": episode.demonstration, "instruction": episode.instruction}
+        assert told.pop(changed) != own
+        assert list(told.values()) == [own]
+    assert loaded.policy.shown_as == {}
+
+
+def test_the_other_task_asks_for_another_object_of_the_scene_and_the_other_container():
+    # Objects 4, 14 and 20; the green container is meant, which stands at the right back.
+    info = {
+        "objects": np.array([4, 14, 20]),
+        "target_object": 0,
+        "target_container": 0,
+        "container_quadrants": np.array([[0, 0], [1, 1]]),
+    }
+    others = [get_task(index) for index in (5, 14, 64, 55, 214, 100)]
+    chosen = {other_task(others, info, random.Random(seed)).index for seed in range(30)}
+    # 64: object 14 into red. 214 is object 14 into left, which is where the red container stands.
+    assert chosen == {64, 214}
+    # Without such a task, at least the container is another.
+    assert other_task([get_task(5), get_task(55)], info, random.Random(0)).index == 55
+    with pytest.raises(ValueError, match="at least two tasks"):
+        other_task([], info, random.Random(0))
+
+
+def test_the_command_writes_a_record_of_each_checkpoint_once(run, capsys, monkeypatch):
+    arguments = [str(run), "--tasks", "4,14", "--trials", "1"]
+    evaluate_command.main(arguments)
+    paths = [record_path(run, step) for step in (1, 2)]
+    record = read_record(paths[-1])
+    assert (record.experiment, record.method, record.run_seed) == ("small/deltaco", "deltaco", 7)
+    assert (record.step, record.tasks, record.trials, len(record.episodes)) == (2, "4,14", 1, 2)
+    assert record.versions["benchmark"] == "gym_deltaco/PickPlace-v0"
+    assert record.command == f"deltaco-evaluate {run} --tasks 4,14 --trials 1"
+    assert capsys.readouterr().out.count("succeeded") == 2
+
+    def must_not_run(*arguments):
+        raise AssertionError("evaluated again")
+
+    monkeypatch.setattr(evaluate_command, "evaluate", must_not_run)
+    evaluate_command.main(arguments)
+    assert capsys.readouterr().out.count("was there already") == 2
+
+
+def test_records_of_other_evaluations_are_not_taken_for_this_one(run, capsys):
+    evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "1", "--steps", "last"])
+    with pytest.raises(SystemExit):
+        evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "2", "--steps", "last"])
+    assert "is of another evaluation" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--tasks", "301"], "301"),
+        (["--trials", "0"], "`trials` must be at least 1"),
+        (["--steps", "5"], "no checkpoint of step 5. There are 1, 2"),
+        (["--steps", "first"], "must be 'all', 'last' or steps"),
+    ],
+)
+def test_wrong_arguments_are_explained(run, capsys, arguments, message):
+    with pytest.raises(SystemExit):
+        evaluate_command.main([str(run), *arguments])
+    assert message in capsys.readouterr().err
+
+
+def test_a_folder_without_checkpoints_is_refused(tmp_path, capsys):
+    with pytest.raises(RunError, match="has no checkpoints.*--output_dir"):
+        checkpoints(tmp_path)
+
+
+def test_the_record_is_plain_json(run):
+    evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "1", "--steps", "last"])
+    content = json.loads(record_path(run, 2).read_text())
+    assert content["policy"]["backbone"] == "strided"
+    assert "input_features" not in content["policy"]

@@ -1,0 +1,123 @@
+"""The rows of the tables: each builds its policy and takes a training step; all that they name is valid."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.configs.train import TrainPipelineConfig
+from small_policies import TASKS, batch_of, small_policy, use_fake_encoder, write_dataset
+
+from lerobot_deltaco.commands import experiment as experiment_command
+from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.evaluation.authors import AUTHORS_RATES
+from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
+from lerobot_deltaco.experiments import run as experiments_run
+from lerobot_deltaco.experiments.rows import RowError, read_row, row_names
+from lerobot_deltaco.experiments.run import Experiment, ExperimentError
+
+FOLDER = Path(__file__).parents[1] / "experiments"
+ROWS = row_names(FOLDER)
+TRAINING_OPTIONS = {field.name for field in dataclasses.fields(TrainPipelineConfig)}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    episodes = [task for task in TASKS for _ in range(2)]
+    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_builds_its_policy_and_takes_a_training_step(dataset, monkeypatch, name):
+    use_fake_encoder(monkeypatch)
+    row = read_row(FOLDER, name)
+    options = {key: value for key, value in row.policy.items() if value is not None}
+    policy, before, _ = small_policy(dataset, **{**options, "device": "cpu", "dtype": "float32"})
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    weights = [parameter.clone() for parameter in policy.parameters()]
+    loss, _ = policy(before(batch_of(dataset, [0, 9, 12, 20])))
+    loss.backward()
+    optimizer.step()
+    assert torch.isfinite(loss)
+    assert any(not torch.equal(old, new) for old, new in zip(weights, policy.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_what_a_row_names_is_valid(name):
+    row = read_row(FOLDER, name)
+    plan, shown = CollectionPlan(**row.data), CollectionPlan(**row.demonstrations)
+    evaluation = EvaluationPlan(**row.evaluation)
+    assert plan.split == "train"
+    assert shown.split == "validation"
+    assert plan.ambiguity == shown.ambiguity == evaluation.ambiguity
+    assert set(row.training) <= TRAINING_OPTIONS
+    assert row.training["batch_size"] % row.policy["tasks_per_batch"] == 0
+    if row.start_from is not None:
+        assert row.start_from in ROWS
+
+
+def test_the_papers_rows_are_there():
+    left_out = ("clip", "r3m", "finetuned_0")
+    expected = {name for name in AUTHORS_RATES if not any(word in name for word in left_out)}
+    assert expected <= set(ROWS)
+
+
+def test_rows_share_what_their_folders_say(tmp_path):
+    (tmp_path / "one").mkdir()
+    (tmp_path / "shared.yaml").write_text("policy: {seed: 1, dtype: float32}\ntraining: {steps: 5}\n")
+    (tmp_path / "one" / "shared.yaml").write_text("policy: {seed: 2}\ndata: {tasks: '4'}\n")
+    (tmp_path / "one" / "row.yaml").write_text("policy: {method: one_hot}\n")
+    row = read_row(tmp_path, "one/row")
+    assert row.policy == {"seed": 2, "dtype": "float32", "method": "one_hot"}
+    assert (row.training, row.data, row.evaluation) == ({"steps": 5}, {"tasks": "4"}, {})
+
+
+def test_unknown_rows_and_sections_are_refused(tmp_path):
+    with pytest.raises(RowError, match="no row 'scenario_c/deltaco'.*scenario_a/deltaco"):
+        read_row(FOLDER, "scenario_c/deltaco")
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "row.yaml").write_text("model: {}\n")
+    with pytest.raises(RowError, match="unknown section 'model'. Valid are data"):
+        read_row(tmp_path, "one/row")
+
+
+def test_a_row_that_starts_from_another_needs_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(experiments_run, "_do", lambda command, arguments: None)
+    row = read_row(FOLDER, "scenario_a/demo_only_finetuned_10")
+    with pytest.raises(ExperimentError, match="starts from scenario_a/demo_only.*Run that row first"):
+        Experiment(row, 3, tmp_path).do()
+
+
+def test_rows_share_their_data(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(experiments_run, "_do", lambda command, arguments: calls.append((command, arguments)))
+    for name in ("scenario_a/deltaco", "scenario_a/language_only"):
+        Experiment(read_row(FOLDER, name), 0, tmp_path).do()
+    first, second = calls[:4], calls[4:]
+    assert [command for command, _ in first] == ["collect", "collect", "train", "evaluate"]
+    assert first[:2] == second[:2]
+    assert f"--output_dir={tmp_path}/scenario_a/deltaco/seed_0" in first[2][1]
+    assert "--policy.method=language_only" in second[2][1]
+
+
+@pytest.mark.slow
+def test_a_row_runs_from_its_data_to_its_evaluation_and_goes_on(tmp_path, capsys):
+    folder = tmp_path / "experiments" / "tiny"
+    folder.mkdir(parents=True)
+    (folder / "deltaco.yaml").write_text(
+        """
+data: {tasks: "4,14,55", episodes_per_task: 2}
+demonstrations: {tasks: "4,14", split: validation, episodes_per_task: 1}
+policy: {language_encoder: all-MiniLM-L6-v2, backbone: strided, device: cpu, tasks_per_batch: 3}
+training: {batch_size: 6, steps: 4, save_freq: 2}
+evaluation: {tasks: "4,14", trials: 1}
+"""
+    )
+    out = tmp_path / "out"
+    arguments = ["tiny/deltaco", "--experiments", str(folder.parent), "--out", str(out), "--seed", "3"]
+    experiment_command.main(arguments)
+    records = sorted((out / "tiny/deltaco/seed_3/evaluations").glob("*.json"))
+    assert [path.stem for path in records] == ["0000002", "0000004"]
+    times = [path.stat().st_mtime_ns for path in records]
+    experiment_command.main(arguments)
+    assert [path.stat().st_mtime_ns for path in records] == times
