@@ -10,7 +10,7 @@ from small_policies import TASKS, batch_of, small_policy, use_fake_encoder, writ
 
 from lerobot_deltaco.commands import experiment as experiment_command
 from lerobot_deltaco.data.collection_plan import CollectionPlan
-from lerobot_deltaco.evaluation.authors import AUTHORS_RATES
+from lerobot_deltaco.evaluation.authors import PUBLISHED
 from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
 from lerobot_deltaco.experiments import run as experiments_run
 from lerobot_deltaco.experiments.rows import RowError, read_row, row_names
@@ -58,7 +58,7 @@ def test_what_a_row_names_is_valid(name):
 
 def test_the_papers_rows_are_there():
     left_out = ("clip", "r3m", "finetuned_0")
-    expected = {name for name in AUTHORS_RATES if not any(word in name for word in left_out)}
+    expected = {name for name in PUBLISHED if not any(word in name for word in left_out)}
     assert expected <= set(ROWS)
 
 
