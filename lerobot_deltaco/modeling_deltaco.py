@@ -387,8 +387,8 @@ class DeltacoPolicy(PreTrainedPolicy):
     def _encode_demo(self, shown: DemonstrationSet, rows: Tensor, generator: torch.Generator) -> Tensor:
         """Unit embeddings of demonstrations, (batch, embedding)."""
         frames = shown.pictures(rows, self.config.n_demo_frames, generator)
-        if self.training and self.config.crop_padding:
-            frames = random_crop(frames, self.config.crop_padding, generator)
+        if self.training and self.config.demo_crop_padding:
+            frames = random_crop(frames, self.config.demo_crop_padding, generator)
         return self.demo_encoder(frame_array(frames, self.config.demo_rows))
 
     def _split(self, action: Tensor) -> tuple[Tensor, Tensor | None]:

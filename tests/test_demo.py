@@ -16,7 +16,7 @@ from lerobot_deltaco.demo.steps import Demo, DemoError
 def test_new_combinations_are_of_trained_objects_and_containers():
     trained = [get_task(index) for index in recipe.TRAINED_TASKS]
     assert set(recipe.NEW_COMBINATIONS).isdisjoint(recipe.TRAINED_TASKS)
-    assert len(trained) == 18
+    assert len(trained) == 9
     for index in recipe.NEW_COMBINATIONS:
         task = get_task(index)
         assert any(task.row == other.row for other in trained)
@@ -41,7 +41,7 @@ def test_a_step_is_done_once(demo, tmp_path, capsys):
 def test_a_failed_step_is_named_and_done_again(demo, tmp_path):
     flag = tmp_path / "flag"
     command = [sys.executable, "-c", f"import os, sys; sys.exit(0 if os.path.exists({str(flag)!r}) else 3)"]
-    with pytest.raises(DemoError, match="Greeting failed .exit status 3.*goes on from here"):
+    with pytest.raises(DemoError, match="(?s)Greeting failed .exit status 3.*goes on from here"):
         demo._do("greet", "Greeting", command)
     first = demo.seconds()
     assert "greet" not in first

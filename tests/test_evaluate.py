@@ -59,7 +59,7 @@ def loaded(run):
     return load_policy(checkpoints(run)[-1].folder)
 
 
-def test_an_evaluation_set_is_a_function_of_the_seed_and_the_set(loaded):
+def test_an_evaluation_set_is_a_function_of_the_seed_and_the_set(run, loaded):
     plan = EvaluationPlan("4,14", trials=2, seed=3)
     episodes = evaluate(*loaded, plan, set_number=10)
     assert [(episode.task_id, episode.trial) for episode in episodes] == [(4, 0), (4, 1), (14, 0), (14, 1)]
@@ -72,14 +72,10 @@ def test_an_evaluation_set_is_a_function_of_the_seed_and_the_set(loaded):
         assert episode.target_object == info["target_object"]
         assert episode.container_quadrants == info["container_quadrants"].tolist()
         env.close()
-    again = evaluate(*load_policy_again(loaded), plan, set_number=10)
+    again = evaluate(*load_policy(checkpoints(run)[-1].folder), plan, set_number=10)
     assert again == episodes
     other = evaluate(*loaded, plan, set_number=11)
     assert {episode.seed for episode in other}.isdisjoint(episode.seed for episode in episodes)
-
-
-def load_policy_again(loaded):
-    return load_policy(loaded.policy.config.pretrained_path)
 
 
 def test_the_outcome_is_that_of_the_scene_at_the_end(loaded, monkeypatch):

@@ -138,7 +138,6 @@ def test_the_strided_backbone_has_maps_of_half_the_size():
     assert strided.backbone(torch.rand(1, 3, 48, 48), torch.rand(1, 8)).shape == (1, 64, 12, 12)
 
 
-
 # Pictures
 
 

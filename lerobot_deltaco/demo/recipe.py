@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-# Six colors, of 15 of the 32 objects, each into four of the six containers' words.
+# Six colors, of 15 of the 32 objects, each into the green and into the red container.
 COLORS = {"black and white": 32, "blue": 34, "white": 36, "red": 37, "orange": 38, "yellow": 39}
-CONTAINERS = {"green": 0, "red": 1, "left": 4, "right": 5}
-# Each color is trained with three of the words; the fourth combination is new.
-NEW_COMBINATIONS = (32, 38, 84, 89, 236, 287)
+CONTAINERS = {"green": 0, "red": 1}
+# Half of the colors are trained with one of the containers only; the other combination is new.
+NEW_COMBINATIONS = (32, 39, 86)
 TRAINED_TASKS = tuple(
     task
     for column in CONTAINERS.values()
@@ -15,16 +15,16 @@ TRAINED_TASKS = tuple(
 )
 ALL_TASKS = (*TRAINED_TASKS, *NEW_COMBINATIONS)
 
-EPISODES_PER_TASK = 100
+EPISODES_PER_TASK = 200
 # A demonstration of each task, new combinations included: what the policy is shown.
 DEMONSTRATIONS_PER_TASK = 1
 # The expert is done by then, in the median after 11 of 30 steps.
 DROPPED_FRAMES = 16
-STEPS = 5500
-SAVE_EVERY = 500
+STEPS = 4800
+SAVE_EVERY = 400
 BATCH_SIZE = 48
-TRIALS = {"trained": 8, "new": 16}
-COUNTERFACTUAL_TRIALS = 2
+TRIALS = {"trained": 12, "new": 20}
+COUNTERFACTUAL_TRIALS = 4
 CHANCE = 1 / 6
 
 POLICY_OPTIONS = {
@@ -37,7 +37,7 @@ POLICY_OPTIONS = {
     "optimizer_lr": 1e-3,
     "optimizer_weight_decay": 1e-2,
     "scheduler_name": "cosine",
-    "scheduler_warmup_steps": 100,
+    "scheduler_warmup_steps": 200,
     "device": "cpu",
 }
 
