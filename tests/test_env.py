@@ -134,8 +134,9 @@ def test_the_info_is_the_documented_one(env):
     for info in (env.reset(seed=0)[1], env.step(STAY_OPEN)[-1]):
         assert set(info) == set(documented)
         for key, text in documented.items():
-            if match := re.match(r"\((\d+),\) (\w+):", text):
-                assert (info[key].shape, info[key].dtype.name) == ((int(match[1]),), match[2])
+            if match := re.match(r"\(([\d, ]+)\) (\w+):", text):
+                shape = tuple(int(size) for size in match[1].split(",") if size.strip())
+                assert (info[key].shape, info[key].dtype.name) == (shape, match[2])
             elif text.startswith("whether"):
                 assert type(info[key]) is bool
             else:
