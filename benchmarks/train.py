@@ -1,9 +1,9 @@
 """Speed of training: `python benchmarks/train.py [--json FILE]` prints a table.
 
-Side by side, in one run: stock `lerobot-train`, which reads each frame from the disk, and `deltaco-train`.
-For both: samples per second of the data path alone and of training, and where the time of a training goes. The
-dataset, of random pictures, is made beforehand in a temporary folder. Times are of one machine; compare
-figures of one run. Run it while nothing else uses the processor.
+Side by side: stock `lerobot-train`, which reads each frame from the disk, and `deltaco-train`. For both:
+samples per second of the data path alone and of training, and where the time of a training goes. The dataset,
+of random pictures, is made beforehand in a temporary folder. Times are of one machine; compare figures of one
+run. Run it while nothing else uses the processor.
 """
 
 from __future__ import annotations
