@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ class Row:
     policy: Mapping[str, Any]
     training: Mapping[str, Any]
     evaluation: Mapping[str, Any]
-    start_from: str | None = field(default=None)
+    start_from: str | None = None
 
 
 def row_names(folder: Path) -> list[str]:

@@ -63,7 +63,6 @@ class FramesInMemory:
         self._task_of = self.columns["task_index"].reshape(-1).tolist()
         for camera in cameras:
             self.columns[camera] = _pictures(dataset, camera, image_size, self.held_on)
-        self._dataset = dataset
         # Where each episode lies here: rows of an episode follow one another.
         episodes = self.columns["episode_index"].reshape(-1).cpu().numpy()
         numbers, first = np.unique(episodes, return_index=True)
