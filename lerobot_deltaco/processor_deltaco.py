@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline, make_default_pre_post_processors
 
+import lerobot_deltaco.thread_safe_steps  # noqa: F401
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 
 

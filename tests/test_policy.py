@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import sys
 import threading
 
 import pytest
@@ -275,6 +276,28 @@ def test_both_encoders_run_once_an_episode(make, dataset, monkeypatch):
         assert len(calls) == n_episodes
 
 
+@pytest.fixture
+def eager_threads():
+    """Threads that take turns as often as they can."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(interval)
+
+
+def test_threads_share_the_steps_of_a_processor_but_not_what_they_process(make, dataset):
+    _, before, _ = make()
+    processed = before.to_transition(before(observation(dataset, [TASKS[0]])))
+    keeps_it = [step for step in before.steps if step._current_transition is not None]
+    assert keeps_it
+    other = threading.Thread(target=before, args=(observation(dataset, [TASKS[1]]),))
+    other.start()
+    other.join()
+    for step in keeps_it:
+        assert step.transition["complementary_data"]["task"] == processed["complementary_data"]["task"]
+
+
+@pytest.mark.usefixtures("eager_threads")
 def test_threads_do_not_mix_their_tasks_up(make, dataset):
     policy, before, _ = make()
     policy(before(batch_of(dataset, [0])))
