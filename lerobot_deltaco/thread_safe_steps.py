@@ -1,8 +1,8 @@
 """Lets threads share the steps of LeRobot's processors, as `lerobot-eval` does with several tasks at a time.
 
 A step of LeRobot 0.6 keeps what it is processing in an attribute: it sets it and reads it again. With
-`--eval.max_parallel_tasks` above 1, a thread could so get the observation and the instruction of another. Importing
-this module gives each thread an attribute of its own.
+`--eval.max_parallel_tasks` above 1, a thread could so get the observation and the instruction of another.
+Importing this module gives each thread an attribute of its own.
 """
 
 from __future__ import annotations
