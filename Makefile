@@ -12,10 +12,15 @@ ARGS ?=
 # A row of the paper's tables, a file in experiments/, and the seed of its training
 ROW ?= scenario_a/deltaco
 SEED ?= 0
+# Of the training of scenario A on a GPU, and further settings: SETTINGS="--set data.episodes_per_task=50"
+STEPS ?= 100000
+SAVE_EVERY ?= $(shell expr $(STEPS) / 10)
+DEVICE ?= cuda
+SETTINGS ?=
 
 export UV_PYTHON_DOWNLOADS := never
 
-.PHONY: help install demo experiment test test-slow lint benchmark-env benchmark-policy benchmark-train
+.PHONY: help install demo experiment gpu-scenario-a test test-slow lint benchmark-env benchmark-policy benchmark-train
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 22
@@ -27,6 +32,12 @@ demo: $(INSTALLED) ## Collect, train and evaluate on a few tasks, in a quarter o
 
 experiment: $(INSTALLED) ## Run a row of the tables: make experiment ROW=scenario_a/deltaco SEED=0
 	$(BIN)/deltaco-experiment $(ROW) --seed $(SEED)
+
+gpu-scenario-a: $(INSTALLED) ## Scenario A in full, on a GPU: make gpu-scenario-a STEPS=100000 SEED="0 1 2"
+	$(BIN)/deltaco-experiment scenario_a/deltaco scenario_a/language_only scenario_a/demo_only --seed $(SEED) \
+		--set training.steps=$(STEPS) --set training.save_freq=$(SAVE_EVERY) --set policy.device=$(DEVICE) \
+		--set policy.compile=true --set policy.demos_per_task=2 $(SETTINGS) \
+		--out outputs/scenario_a --report results/scenario_a
 
 test: $(INSTALLED) ## Run the default tests: a few minutes, no network, no GPU
 	$(BIN)/python -m pytest $(ARGS)

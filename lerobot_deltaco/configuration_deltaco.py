@@ -40,16 +40,17 @@ ENCODER_LOSSES = ("contrastive", "cosine", "none")
 
 
 class Backbone(NamedTuple):
-    """What differs between the policy's convolutional networks."""
+    """What differs between the convolutional networks."""
 
     channels: tuple[int, ...]  # of the residual blocks
     stem_stride: int  # of the first convolution
+    demo_stride: int  # of the demonstration encoder's first convolution
 
 
 BACKBONES = MappingProxyType(
     {
-        "paper": Backbone((16, 16, 32, 32, 64, 64, 128, 128), stem_stride=1),
-        "strided": Backbone((16, 32, 64, 64), stem_stride=2),
+        "paper": Backbone((16, 16, 32, 32, 64, 64, 128, 128), stem_stride=1, demo_stride=1),
+        "strided": Backbone((16, 32, 64, 64), stem_stride=2, demo_stride=2),
     }
 )
 DEMO_ENCODERS = ("cnn",)
@@ -65,7 +66,7 @@ class DeltacoConfig(PreTrainedConfig):
 
     The defaults are the paper's (appendix B), for pictures of 48 x 48 pixels. On a small machine, choose
     `backbone=strided`: half of the residual blocks, with up to 64 channels, on maps of half the size, for a
-    seventeenth of the arithmetic.
+    seventeenth of the arithmetic, and a demonstration encoder on maps of half the size.
 
     Args:
         method: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
@@ -75,6 +76,9 @@ class DeltacoConfig(PreTrainedConfig):
         language_encoder: A frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'),
             all-distilroberta-v1, distilbert-base-uncased, or all-MiniLM-L6-v2, which the extra `offline`
             brings along.
+        instruction_embeddings: A file with embeddings of instructions, which are then not computed: a
+            checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no language
+            model.
         demo_encoder: cnn.
         demo_rows: m, rows of the array of a demonstration's frames.
         demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
@@ -89,6 +93,9 @@ class DeltacoConfig(PreTrainedConfig):
         crop_padding: Pixels by which observations are shifted at random in training, 0 for none.
         demo_crop_padding: The same for demonstrations. Without it, the encoder soon knows those of a small
             dataset by heart, and misreads new ones.
+        demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at least 2,
+            so that none is shown its own episode; 0 for one drawn anew for every sample. Sharing saves most of
+            the demonstration encoder's time.
         demo_repo_id: Dataset that shows the tasks at evaluation; at least one episode of each.
         demo_root: Its folder, if it is not in LeRobot's cache.
         demo_episode: Its one episode that shows the task whatever the instruction; for paraphrases and for
@@ -116,6 +123,7 @@ class DeltacoConfig(PreTrainedConfig):
     concat: str | None = None
     encoder_loss: str | None = None
     language_encoder: str = "paraphrase-MiniLM-L3-v2"
+    instruction_embeddings: str | None = None
     demo_encoder: str = "cnn"
     demo_rows: int = 1
     demo_columns: int = 2
@@ -128,6 +136,7 @@ class DeltacoConfig(PreTrainedConfig):
     temperature: float = 0.1
     crop_padding: int = 4
     demo_crop_padding: int = 4
+    demos_per_task: int = 0
     demo_repo_id: str | None = None
     demo_root: str | None = None
     demo_episode: int | None = None
@@ -181,6 +190,7 @@ class DeltacoConfig(PreTrainedConfig):
             ("encoder_loss_weight", 0),
             ("crop_padding", 0),
             ("demo_crop_padding", 0),
+            ("demos_per_task", 0),
             ("drop_n_last_frames", 0),
             ("tasks_per_batch", 0),
             ("seed", 0),
@@ -193,6 +203,11 @@ class DeltacoConfig(PreTrainedConfig):
         for name in ("temperature", "optimizer_lr"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"`{name}` must be greater than 0. Got {getattr(self, name)}.")
+        if self.demos_per_task == 1:
+            raise ValueError(
+                "`demos_per_task` cannot be 1: the sample from the one episode would be shown itself. Choose 2 or "
+                "more, or 0 for a demonstration of each sample's own."
+            )
         if self.n_demo_frames < 2:
             raise ValueError(
                 "A demonstration has its first and its last frame: `demo_rows` * `demo_columns` must be "

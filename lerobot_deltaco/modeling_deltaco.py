@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
+from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.language import InstructionTable
 from lerobot_deltaco.policy.losses import (
     contrastive_logits,
@@ -48,6 +49,7 @@ class _Told(NamedTuple):
     tasks: tuple[str, ...]
     film: Tensor  # (batch, film_dim)
     concat: Tensor | None  # (batch, concatenated embeddings)
+    network: nn.Module  # that acts on it
 
 
 class DeltacoPolicy(PreTrainedPolicy):
@@ -81,6 +83,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         self._meta = dataset_meta
         config.resolve(dataset_meta.features if dataset_meta else None)
         self.instructions = InstructionTable(config.language_encoder)
+        if config.instruction_embeddings is not None:
+            self.instructions.read(Path(config.instruction_embeddings))
         self.shown: DemonstrationSet | None = None  # for evaluation
         self.trained_on: DemonstrationSet | None = None  # for training; read when the first batch comes
         self.shown_as: dict[str, str] = {}
@@ -99,6 +103,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             "language_or_demo": config.embedding_dim,
             "one_hot": len(config.one_hot_tasks),
         }
+        backbone = BACKBONES[config.backbone]
         state = config.robot_state_feature
         action_dim = config.action_feature.shape[0]
         self.policy = ConditionedPolicy(
@@ -107,13 +112,15 @@ class DeltacoPolicy(PreTrainedPolicy):
             concat_dim=dims[concat] + (state.shape[0] if state else 0),
             motion_dim=action_dim - (config.gripper_index is not None),
             has_gripper=config.gripper_index is not None,
-            **BACKBONES[config.backbone]._asdict(),
+            channels=backbone.channels,
+            stem_stride=backbone.stem_stride,
         )
         self.demo_encoder = (
             DemoEncoder(
                 config.demo_rows * config.image_size,
                 config.demo_columns * config.image_size,
                 config.embedding_dim,
+                backbone.demo_stride,
             )
             if config.uses_demo
             else None
@@ -128,6 +135,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             for network in (self.policy, self.demo_encoder):
                 if network is not None:
                     network.compile()
+        self._folded = FoldedPolicy(self.policy)
         self._told: dict[int, _Told] = {}
         self._n_episodes: dict[str, int] = {}  # of each task
         self.reset()
@@ -160,10 +168,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         if self.training and self.config.crop_padding:
             images = random_crop(images, self.config.crop_padding, generator)
         demo = language = None
-        if self.config.uses_demo:
-            demo = self._encode_demo(*self._draw(batch["episode_index"], tasks, generator), generator)
         distinct = {task: n for n, task in enumerate(dict.fromkeys(tasks))}
         column = torch.tensor([distinct[task] for task in tasks], device=device)
+        if self.config.uses_demo:
+            demo = self._show(batch["episode_index"], tasks, column, generator)
         if self.config.uses_language:
             known = self.instructions(list(distinct), device)  # (distinct, embedding)
             language = known[column]  # (batch, embedding)
@@ -217,10 +225,23 @@ class DeltacoPolicy(PreTrainedPolicy):
         self.trained_on = demonstrations
         self._knows_all_episodes = True
 
-    def _draw(
-        self, episodes: Tensor, tasks: Sequence[str], generator: torch.Generator
-    ) -> tuple[DemonstrationSet, Tensor]:
-        """The demonstrations, and the row of each sample's."""
+    def _show(
+        self, episodes: Tensor, tasks: Sequence[str], column: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        """Embeddings of demonstrations for samples, (batch, embedding); `column` numbers their tasks."""
+        shown = self._training_demonstrations(episodes.device)
+        if not self.training:
+            rows = shown.others(episodes, generator, tasks=tasks)
+            return self._encode_demo(shown, rows, generator)
+        check = not self._knows_all_episodes
+        if not self.config.demos_per_task:
+            return self._encode_demo(shown, shown.others(episodes, generator, check), generator)
+        rows, which = shown.shared(
+            episodes, column, len(set(tasks)), self.config.demos_per_task, generator, check
+        )
+        return self._encode_demo(shown, rows, generator)[which]
+
+    def _training_demonstrations(self, device: torch.device) -> DemonstrationSet:
         if self.trained_on is None:
             if self._meta is None:
                 raise ValueError("Only a policy that was made with a dataset's metadata can be trained.")
@@ -230,12 +251,8 @@ class DeltacoPolicy(PreTrainedPolicy):
                     "`deltaco-train`, which takes the same arguments."
                 )
             chosen = self.config.demo_episodes or training_episodes(self._meta)
-            self.trained_on = self._load(self._meta.repo_id, self._meta.root, chosen).to(episodes.device)
-        if self.training:
-            rows = self.trained_on.others(episodes, generator, check=not self._knows_all_episodes)
-        else:
-            rows = self.trained_on.others(episodes, generator, tasks=tasks)
-        return self.trained_on, rows
+            self.trained_on = self._load(self._meta.repo_id, self._meta.root, chosen).to(device)
+        return self.trained_on
 
     def _generator(self) -> torch.Generator:
         rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
@@ -252,6 +269,10 @@ class DeltacoPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Begins an episode (of this thread, if several evaluate tasks at the same time)."""
         self._told.pop(threading.get_ident(), None)
+
+    def begin_evaluation(self) -> None:
+        """Forgets how many episodes each task has had, so that its demonstrations begin with the first again."""
+        self._n_episodes.clear()
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
@@ -272,7 +293,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             told = self._told.get(threading.get_ident())
             if told is None or told.tasks != tasks:
                 told = self._told[threading.get_ident()] = self._tell(tasks, images.device)
-            mean, gripper = self.policy(images, told.film, self._concatenated(batch, told.concat))
+            mean, gripper = told.network(images, told.film, self._concatenated(batch, told.concat))
         return self._joined(mean.float(), None if gripper is None else torch.sigmoid(gripper.float()))
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
@@ -292,10 +313,13 @@ class DeltacoPolicy(PreTrainedPolicy):
         if self.config.method == "mcil":
             # The trials of a task use the language and the demonstration in turn.
             by_language = torch.tensor(trials, device=device) % 2 == 0
-            return _Told(
-                tasks, torch.where(by_language[:, None], self.project_language(language), demo), None
-            )
-        return _Told(tasks, *self._told_by(tasks, demo, language))
+            film = torch.where(by_language[:, None], self.project_language(language), demo)
+            return _Told(tasks, film, None, self._acting())
+        return _Told(tasks, *self._told_by(tasks, demo, language), self._acting())
+
+    def _acting(self) -> nn.Module:
+        """The network that acts: a quicker copy, unless it is compiled or in training mode."""
+        return self.policy if self.config.compile or self.training else self._folded.network()
 
     def _count(self, tasks: tuple[str, ...]) -> list[int]:
         """The number of each sample's episode among those of its task, from 0, whichever thread runs them."""
@@ -423,18 +447,17 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         # What was read from the datasets is saved; the next user may name others.
-        source = self.config.demo_repo_id, self.config.demo_root
-        self.config.demo_repo_id = self.config.demo_root = None
+        sources = ("demo_repo_id", "demo_root", "instruction_embeddings")
+        given = {name: getattr(self.config, name) for name in sources}
         try:
+            for name in sources:
+                setattr(self.config, name, None)
             super()._save_pretrained(save_directory, state_dict)
         finally:
-            self.config.demo_repo_id, self.config.demo_root = source
-        tensors = {"embeddings": self.instructions.embeddings.cpu().contiguous()}
-        known = {
-            "language_encoder": self.instructions.encoder_name,
-            "instructions": json.dumps(list(self.instructions.rows)),
-        }
-        if self.shown is not None:
+            for name, value in given.items():
+                setattr(self.config, name, value)
+        tensors, known = self.instructions.state()
+        if self.shown is not None and self.config.uses_demo:
             tensors |= {"frames": self.shown.frames.cpu(), "episodes": self.shown.episodes.cpu()}
             known["tasks"] = json.dumps(self.shown.tasks)
         save_file(tensors, save_directory / TASKS_FILE, metadata=known)
@@ -449,8 +472,10 @@ class DeltacoPolicy(PreTrainedPolicy):
             names = ("revision", "cache_dir", "token", "local_files_only", "force_download")
             options = {name: kwargs[name] for name in names if name in kwargs}
             path = Path(hf_hub_download(str(pretrained_name_or_path), TASKS_FILE, **options))
-        if kwargs.get("config") is not None:
-            _check_language_encoder(path, kwargs["config"])
+        config = kwargs.get("config")
+        if config is not None:
+            # Before its weights turn out not to fit.
+            InstructionTable(config.language_encoder).read(path)
         policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
         policy._read_tasks(path)
         return policy
@@ -470,23 +495,12 @@ class DeltacoPolicy(PreTrainedPolicy):
         return model_card(self.config, shown, n_known, dataset_repo_id, license, tags, cfg, dataset_meta)
 
     def _read_tasks(self, path: Path) -> None:
+        self.instructions.read(path)
         with safe_open(path, framework="pt") as file:
             known = file.metadata()
             names = set(file.keys())
-            self.instructions.put(json.loads(known["instructions"]), file.get_tensor("embeddings"))
             # Demonstrations named on the command line come before those of the checkpoint.
             if self.shown is None and "frames" in names:
                 self.shown = DemonstrationSet(
                     file.get_tensor("frames"), json.loads(known["tasks"]), file.get_tensor("episodes")
                 ).to(self.config.device)
-
-
-def _check_language_encoder(path: Path, config: DeltacoConfig) -> None:
-    """Refuses another encoder than the checkpoint's, before its weights turn out not to fit."""
-    with safe_open(path, framework="pt") as file:
-        name = file.metadata()["language_encoder"]
-    if name != config.language_encoder:
-        raise ValueError(
-            f"The checkpoint was made with the language encoder {name}. `language_encoder` cannot be "
-            f"{config.language_encoder}."
-        )

@@ -6,9 +6,12 @@ from html.parser import HTMLParser
 
 import pytest
 from PIL import Image
+from small_policies import REPO_ID, TASKS, use_fake_encoder, write_dataset
 
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.demo import recipe
+from lerobot_deltaco.demo import steps as demo_steps
+from lerobot_deltaco.demo.machine import seconds_per_step
 from lerobot_deltaco.demo.page import write_page
 from lerobot_deltaco.demo.steps import Demo, DemoError
 
@@ -65,6 +68,22 @@ def test_the_number_format_is_chosen_once(demo):
     assert Demo(demo.folder).settings["policy"]["dtype"] == other
 
 
+@pytest.mark.parametrize(
+    ("seconds", "steps"), [(0.1, 5200), (9.0, recipe.LEAST_STEPS), (1e-3, recipe.MOST_STEPS)]
+)
+def test_the_number_of_training_steps_fits_the_machine_and_is_chosen_once(demo, monkeypatch, seconds, steps):
+    done = []
+    monkeypatch.setattr(Demo, "_do", lambda self, name, what, command: done.append(command))
+    monkeypatch.setattr(demo_steps, "seconds_per_step", lambda *arguments: seconds)
+    demo.train()
+    monkeypatch.setattr(demo_steps, "seconds_per_step", lambda *arguments: 12345.0)
+    again = Demo(demo.folder)
+    again.train()
+    assert again.settings["steps"] == steps
+    assert done[0] == done[1]
+    assert f"--steps={steps}" in done[0]
+
+
 class Page(HTMLParser):
     """What a page refers to."""
 
@@ -75,6 +94,13 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.files += [value for name, value in attrs if name in ("src", "href")]
+
+
+def test_a_step_of_the_training_is_timed(tmp_path, monkeypatch):
+    use_fake_encoder(monkeypatch)
+    dataset = write_dataset(tmp_path / "data", [task for task in TASKS for _ in range(2)])
+    options = {"type": "deltaco", "device": "cpu", "image_size": 16, "backbone": "strided"}
+    assert 0 < seconds_per_step(REPO_ID, dataset.root, options, 6) < 60
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 import random
+import shutil
 import sys
 
 import numpy as np
@@ -30,6 +31,11 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     root = str(folder / "data")
     collect_command.main(["--tasks", "4,14,55", "--episodes-per-task", "2", "--root", root, "--workers", "1"])
+    train(root, folder / "training")
+    return folder / "training"
+
+
+def train(root, folder, **more):
     arguments = {
         "policy.type": "deltaco",
         "policy.device": "cpu",
@@ -44,14 +50,14 @@ def run(tmp_path_factory):
         "num_workers": "0",
         "job_name": "small/deltaco",
         "seed": "7",
-        "output_dir": str(folder / "training"),
+        "output_dir": str(folder),
+        **more,
     }
     with pytest.MonkeyPatch.context() as patch:
         use_fake_encoder(patch)
         patch.setattr(sys, "argv", ["train", *(f"--{key}={value}" for key, value in arguments.items())])
         with InMemoryTraining().active():
             lerobot_train.main()
-    return folder / "training"
 
 
 @pytest.fixture
@@ -183,3 +189,17 @@ def test_the_record_is_plain_json(run):
     content = json.loads(record_path(run, 2).read_text())
     assert content["policy"]["backbone"] == "strided"
     assert "input_features" not in content["policy"]
+
+
+def test_evaluations_in_training_leave_the_records_that_evaluations_afterwards_do(run, tmp_path):
+    environment = {"env.type": "deltaco", "env.task": "4,14", "env_eval_freq": "1", "eval.n_episodes": "2"}
+    train(str(run.parent / "data"), tmp_path / "run", **environment)
+    during = [read_record(record_path(tmp_path / "run", step)) for step in (1, 2)]
+    shutil.rmtree(tmp_path / "run" / "evaluations")
+    evaluate_command.main([str(tmp_path / "run"), "--tasks", "4,14"])
+    for record in during:
+        after = read_record(record_path(tmp_path / "run", record.step))
+        assert record.episodes == after.episodes
+        assert len(record.episodes) == 4
+        assert (record.experiment, record.run_seed, record.tasks) == ("small/deltaco", 7, "4,14")
+        assert record.policy == after.policy

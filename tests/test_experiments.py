@@ -81,6 +81,25 @@ def test_unknown_rows_and_sections_are_refused(tmp_path):
         read_row(tmp_path, "one/row")
 
 
+def test_settings_come_before_the_files():
+    row = read_row(FOLDER, "scenario_a/bc_z", ["training.steps=7", "policy.device=cuda", "data.tasks=4,14"])
+    assert (row.training["steps"], row.policy["device"], row.data["tasks"]) == (7, "cuda", "4,14")
+    assert row.policy["method"] == "bc_z"
+    for wrong in ("steps=7", "training.steps", "model.size=3", "training=7"):
+        with pytest.raises(RowError, match="SECTION.NAME=VALUE"):
+            read_row(FOLDER, "scenario_a/bc_z", [wrong])
+
+
+def test_a_run_does_not_go_on_with_other_settings(tmp_path, monkeypatch):
+    monkeypatch.setattr(experiments_run, "_do", lambda command, arguments: None)
+    Experiment(read_row(FOLDER, "scenario_a/deltaco"), 0, tmp_path).do()
+    other = read_row(FOLDER, "scenario_a/deltaco", ["training.steps=7"])
+    with pytest.raises(ExperimentError, match="begun with other settings: training was.*'steps': 800000"):
+        Experiment(other, 0, tmp_path).do()
+    Experiment(other, 1, tmp_path).do()
+    Experiment(read_row(FOLDER, "scenario_a/deltaco"), 0, tmp_path).do()
+
+
 def test_a_row_that_starts_from_another_needs_it(tmp_path, monkeypatch):
     monkeypatch.setattr(experiments_run, "_do", lambda command, arguments: None)
     row = read_row(FOLDER, "scenario_a/demo_only_finetuned_10")
@@ -109,15 +128,17 @@ def test_a_row_runs_from_its_data_to_its_evaluation_and_goes_on(tmp_path, capsys
 data: {tasks: "4,14,55", episodes_per_task: 2}
 demonstrations: {tasks: "4,14", split: validation, episodes_per_task: 1}
 policy: {language_encoder: all-MiniLM-L6-v2, backbone: strided, device: cpu, tasks_per_batch: 3}
-training: {batch_size: 6, steps: 4, save_freq: 2}
+training: {batch_size: 6, steps: 9, save_freq: 2}
 evaluation: {tasks: "4,14", trials: 1}
 """
     )
     out = tmp_path / "out"
     arguments = ["tiny/deltaco", "--experiments", str(folder.parent), "--out", str(out), "--seed", "3"]
+    arguments += ["--set", "training.steps=4", "--report", str(tmp_path / "report")]
     experiment_command.main(arguments)
     records = sorted((out / "tiny/deltaco/seed_3/evaluations").glob("*.json"))
     assert [path.stem for path in records] == ["0000002", "0000004"]
+    assert "tiny/deltaco" in (tmp_path / "report" / "report.md").read_text()
     times = [path.stat().st_mtime_ns for path in records]
     experiment_command.main(arguments)
     assert [path.stat().st_mtime_ns for path in records] == times

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 
 from lerobot_deltaco.configuration_deltaco import BACKBONES
+from lerobot_deltaco.policy.inference import folded
 from lerobot_deltaco.policy.losses import (
     contrastive_logits,
     contrastive_loss,
@@ -134,8 +135,35 @@ def test_cameras_are_seen_apart():
 
 
 def test_the_strided_backbone_has_maps_of_half_the_size():
-    strided = ConditionedPolicy(1, 8, 8, 3, True, **BACKBONES["strided"]._asdict())
+    backbone = BACKBONES["strided"]
+    strided = ConditionedPolicy(1, 8, 8, 3, True, backbone.channels, backbone.stem_stride)
     assert strided.backbone(torch.rand(1, 3, 48, 48), torch.rand(1, 8)).shape == (1, 64, 12, 12)
+    assert DemoEncoder(48, 96, 384, backbone.demo_stride).layers[0].in_features == 4608 / 4
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 96), (25, 50), (26, 19)])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_demonstrations_of_any_size_are_encoded(height, width, stride):
+    encoder = DemoEncoder(height, width, 12, stride)
+    assert encoder(torch.rand(2, 3, height, width)).shape == (2, 12)
+
+
+@pytest.mark.parametrize("film_dim", [0, 6])
+def test_folding_the_batch_norms_changes_nothing_but_their_number(film_dim):
+    network = ConditionedPolicy(2, film_dim, 3, 4, True, channels=(8, 8, 16), stem_stride=2)
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.uniform_(-1, 1)
+            module.running_var.uniform_(0.5, 2)
+            torch.nn.init.uniform_(module.weight, 0.5, 2)
+            torch.nn.init.uniform_(module.bias, -1, 1)
+    network.eval()
+    quick = folded(network)
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in quick.modules())
+    film = torch.randn(5, film_dim) if film_dim else None
+    inputs = torch.rand(5, 2, 3, 24, 24), film, torch.randn(5, 3)
+    for expected, actual in zip(network(*inputs), quick(*inputs), strict=True):
+        torch.testing.assert_close(actual, expected, atol=1e-5, rtol=1e-4)
 
 
 # Pictures

@@ -20,8 +20,11 @@ from small_policies import (
     write_dataset,
 )
 
+from lerobot_deltaco.commands import embed as embed_command
 from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet
+from lerobot_deltaco.policy.language import LanguageEncoderError
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
 
@@ -78,6 +81,7 @@ def test_the_defaults_are_the_papers():
         ({"backbone": "vit"}, "`backbone` must be one of paper, strided"),
         ({"dtype": "int8"}, "`dtype` must be one of float32, bfloat16"),
         ({"demo_columns": 1}, "at least 2. Got 1"),
+        ({"demos_per_task": 1}, "`demos_per_task` cannot be 1"),
         ({"temperature": 0.0}, "`temperature` must be greater than 0"),
         ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
         ({"film": "none", "concat": "none"}, "would not know its task"),
@@ -171,6 +175,41 @@ def test_a_demonstration_is_another_episode_of_the_task(make, dataset):
     assert drawn == {0: {1, 2}, 1: {0, 2}, 2: {0, 1}, 3: {4}, 4: {3}, 5: {5}}
 
 
+def test_samples_of_a_task_can_share_demonstrations():
+    tasks = ["a"] * 5 + ["b"] * 2 + ["c"] + ["d"] * 3
+    shown = DemonstrationSet(torch.zeros(11, 2, 3, 4, 4, dtype=torch.uint8), tasks, range(100, 111))
+    episodes = torch.tensor([107, 100, 104, 101, 105, 106, 101, 102, 103, 105])
+    column = torch.tensor([2, 0, 0, 0, 1, 1, 0, 0, 0, 1])
+    generator = torch.Generator().manual_seed(0)
+    used = set()
+    for _ in range(50):
+        rows, which = shown.shared(episodes, column, 3, 2, generator)
+        assert [tasks[row] for row in rows] == ["a", "a", "b", "b", "c", "c"]
+        assert rows[0] != rows[1]
+        assert rows[2] != rows[3]
+        demonstration = 100 + rows[which]
+        own = demonstration == episodes
+        assert own.tolist() == [True] + 9 * [False]  # the only episode of c demonstrates itself
+        assert [tasks[row] for row in rows[which]] == [tasks[episode - 100] for episode in episodes]
+        used.update(zip(episodes.tolist(), demonstration.tolist(), strict=True))
+    assert {demonstration for own, demonstration in used if own == 102} == {100, 101, 103, 104}
+    with pytest.raises(ValueError, match="Episode 500 is trained on"):
+        shown.shared(torch.tensor([500]), torch.tensor([0]), 1, 2, generator)
+
+
+def test_shared_demonstrations_are_encoded_once(make, dataset, monkeypatch):
+    policy, before, _ = make(demos_per_task=2)
+    encoded = []
+    monkeypatch.setattr(
+        policy, "_encode_demo", lambda shown, rows, _: encoded.append(rows) or torch.zeros(len(rows), 384)
+    )
+    policy(before(batch_of(dataset, [0, 1, 2, 3, 5, 6, 7, 15, 16, 20])))
+    assert len(encoded[0]) == 4
+    policy.eval()
+    policy(before(batch_of(dataset, [0, 1, 2])))
+    assert len(encoded[1]) == 3
+
+
 def test_demonstrations_are_the_first_and_the_last_frame(make, dataset):
     policy, before, _ = make()
     policy(before(batch_of(dataset, [0])))
@@ -215,6 +254,30 @@ def test_instructions_are_embedded_once(make, dataset):
         policy(before(batch_of(dataset, [0, 3, 7, 20])))
     assert fake_encoder.calls == [["stack the cups", "pour the tea"]]
     assert not any("instruction" in name for name, _ in policy.named_parameters())
+
+
+def test_instructions_can_be_embedded_elsewhere(make, dataset, tmp_path):
+    (tmp_path / "sentences.txt").write_text("\n".join([*TASKS, "", TASKS[0]]))
+    file = tmp_path / "new" / "embeddings.safetensors"
+    options = ["--tasks", "4,14", "--instructions", str(tmp_path / "sentences.txt"), "--out", str(file)]
+    embed_command.main(options)
+    fake_encoder.calls = []
+    policy, before, _ = make(instruction_embeddings=str(file))
+    policy(before(batch_of(dataset, [0, 15, 25])))
+    assert fake_encoder.calls == []
+    assert len(policy.instructions.rows) == 2 + len(TASKS)
+    computed, _, _ = make()
+    for policies in (policy, computed):
+        policies.instructions.add(TASKS)
+    assert torch.equal(policy.instructions(TASKS, "cpu"), computed.instructions(TASKS, "cpu"))
+    policy.save_pretrained(tmp_path / "policy")
+    assert str(tmp_path) not in (tmp_path / "policy" / "config.json").read_text()
+
+    with pytest.raises(ValueError, match="made with the language encoder paraphrase-MiniLM-L3-v2"):
+        make(instruction_embeddings=str(file), language_encoder="all-MiniLM-L6-v2")
+    for wrong in (tmp_path / "missing", tmp_path / "sentences.txt", tmp_path / "policy/model.safetensors"):
+        with pytest.raises(LanguageEncoderError, match="no embeddings of instructions"):
+            make(instruction_embeddings=str(wrong))
 
 
 def test_bfloat16_trains(make, dataset):
@@ -274,6 +337,27 @@ def test_both_encoders_run_once_an_episode(make, dataset, monkeypatch):
         for _ in range(4):
             policy.select_action(batch)
         assert len(calls) == n_episodes
+
+
+def test_what_acts_is_what_was_trained_last(make, dataset):
+    policy, before, _ = make(optimizer_lr=0.01)
+    batch, seen = before(batch_of(dataset, [0, 1, 7, 8])), before(observation(dataset, [TASKS[0]]))
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    acted = []
+    for _ in range(3):
+        policy.train()
+        policy(batch)[0].backward()
+        optimizer.step()
+        policy.eval()
+        policy.begin_evaluation()
+        policy.reset()
+        acted.append(policy.select_action(seen))
+        told = policy._told[threading.get_ident()]
+        concatenated = policy._concatenated(seen, told.concat)
+        mean, gripper = policy.policy(policy._images(seen), told.film, concatenated)
+        expected = policy._joined(mean, gripper.sigmoid())
+        torch.testing.assert_close(acted[-1], expected, atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(acted[1], acted[2], atol=1e-4)
 
 
 @pytest.fixture

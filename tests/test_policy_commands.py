@@ -101,6 +101,27 @@ def test_a_resumed_training_ends_as_one_that_was_not_interrupted(folder, trained
 
 
 @pytest.mark.slow
+def test_two_processes_train_alike_from_the_disk_and_from_memory(folder):
+    together = ("-m", "torch.distributed.run", "--nproc_per_node=2", "--master_port=0")
+    for name, module in (
+        ("disk", "lerobot.scripts.lerobot_train"),
+        ("memory", "lerobot_deltaco.commands.train"),
+    ):
+        arguments = training(folder, name, "--steps=3", "--save_freq=3", "--env_eval_freq=0")
+        said = run(*together, "-m", module, *arguments, folder=folder)
+        assert "effective batch size: 6" in said
+    disk, memory = (checkpoint(folder, name, 3) for name in ("disk", "memory"))
+    assert_same_tensors(
+        disk / "pretrained_model/model.safetensors", memory / "pretrained_model/model.safetensors"
+    )
+    alone = training(folder, "alone", "--steps=3", "--save_freq=3", "--env_eval_freq=0")
+    run("-m", "lerobot_deltaco.commands.train", *alone, folder=folder)
+    one = load_file(checkpoint(folder, "alone", 3) / "pretrained_model/model.safetensors")
+    two = load_file(memory / "pretrained_model/model.safetensors")
+    assert any(not value.equal(two[name]) for name, value in one.items())
+
+
+@pytest.mark.slow
 def test_a_checkpoint_is_evaluated_by_itself(folder, trained):
     # Nothing but the checkpoint is left.
     moved = shutil.copytree(trained, folder / "moved")

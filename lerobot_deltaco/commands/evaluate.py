@@ -5,23 +5,20 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 
-import draccus
-
 from gym_deltaco.layout import AMBIGUITIES
-from lerobot_deltaco.evaluation.evaluate import EvaluationPlan, evaluate, versions
+from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
 from lerobot_deltaco.evaluation.record import (
     COUNTERFACTUALS,
     EvaluationRecord,
     RecordError,
     read_record,
     record_path,
-    write_record,
 )
 from lerobot_deltaco.evaluation.runs import Checkpoint, RunError, checkpoints, describe, load_policy
+from lerobot_deltaco.evaluation.sets import run_set
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -79,37 +76,18 @@ def _evaluate(
     description = describe(checkpoint)
     overrides = [f"--device={options.device}"] if options.device else []
     policy, preprocessor, postprocessor = load_policy(checkpoint.folder, overrides)
-    start = time.monotonic()
-    episodes = evaluate(policy, preprocessor, postprocessor, plan, checkpoint.step)
-    seconds = time.monotonic() - start
-    record = EvaluationRecord(
+    record = run_set(
+        run,
+        checkpoint.step,
+        policy,
+        preprocessor,
+        postprocessor,
+        plan,
         experiment=options.experiment or description.experiment,
-        method=policy.config.method,
         run_seed=description.seed,
-        step=checkpoint.step,
-        evaluation_seed=plan.seed,
-        counterfactual=plan.counterfactual,
-        ambiguity=plan.ambiguity,
-        tasks=plan.tasks,
-        trials=plan.trials,
-        episodes=episodes,
-        policy=_plain(policy.config),
-        versions=versions(policy),
         command=command,
-        seconds=seconds,
     )
-    write_record(record, path)
-    sys.stdout.write(_text(run, record, f"{seconds:.0f} s"))
-
-
-def _plain(config: object) -> dict[str, object]:
-    """The policy's configuration as JSON knows it, less what is found out from the data."""
-    encoded = draccus.encode(config)
-    return {
-        name: value
-        for name, value in encoded.items()
-        if name not in ("input_features", "output_features", "one_hot_tasks", "demo_episodes")
-    }
+    sys.stdout.write(_text(run, record, f"{record.seconds:.0f} s"))
 
 
 def _text(run: Path, record: EvaluationRecord, remark: str) -> str:

@@ -31,6 +31,7 @@ GREEN, RED = (20, 117, 44), (164, 22, 26)
 STEP_NAMES = {
     "collect": "collecting the episodes to train on",
     "demonstrate": "collecting the demonstrations",
+    "measure": "measuring this machine's speed",
     "train": "training",
     "evaluate_trained": "evaluation in new scenes",
     "evaluate_new": "evaluation on new combinations",
@@ -66,7 +67,9 @@ def write_page(demo: Demo) -> Path:
     """
     trained, new = (_results(demo, name) for name in ("trained", "new"))
     seconds = demo.seconds()
-    steps = [{"name": text, "minutes": seconds[name] / 60} for name, text in STEP_NAMES.items()]
+    steps = [
+        {"name": text, "minutes": seconds[name] / 60} for name, text in STEP_NAMES.items() if name in seconds
+    ]
     summary = {
         "success_rate": _rate(trained).rate,
         "success_rate_new_combinations": _rate(new).rate,
@@ -77,6 +80,7 @@ def write_page(demo: Demo) -> Path:
     settings = demo.settings
     values = {
         "n_episodes": len(settings["tasks"]) * settings["episodes_per_task"],
+        "n_steps": settings["steps"],
         "n_trained": len(trained),
         "n_new": len(new),
         "trained": _rate(trained),

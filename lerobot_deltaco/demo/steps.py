@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_deltaco.demo import recipe
-from lerobot_deltaco.demo.machine import fast_dtype
+from lerobot_deltaco.demo.machine import fast_dtype, seconds_per_step
 
 TRAINING_SET = "deltaco/demo"
 DEMONSTRATIONS = "deltaco/demo_demonstrations"
@@ -45,7 +45,7 @@ class Demo:
             "tasks": list(recipe.TRAINED_TASKS),
             "new_combinations": list(recipe.NEW_COMBINATIONS),
             "episodes_per_task": recipe.EPISODES_PER_TASK,
-            "steps": recipe.STEPS,
+            "steps": None,  # as many as this machine does in the time for it
             "save_every": recipe.SAVE_EVERY,
             "batch_size": recipe.BATCH_SIZE,
             "trials": dict(recipe.TRIALS),
@@ -55,7 +55,9 @@ class Demo:
         }
         file = folder / "settings.json"
         there = json.loads(file.read_text()) if file.exists() else None
-        # Once chosen, it stays, also if the folder is moved to another machine.
+        # Once chosen, they stay, also if the folder is moved to another machine.
+        if there is not None and self.settings["steps"] is None:
+            self.settings["steps"] = there.get("steps")
         if there is not None and "dtype" not in self.settings["policy"]:
             self.settings["policy"]["dtype"] = there.get("policy", {}).get("dtype")
         elif "dtype" not in self.settings["policy"]:
@@ -65,7 +67,13 @@ class Demo:
                 f"{folder} has a demo with other settings. Move that folder away, and run the demo again."
             )
         folder.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(self.settings, indent=2) + "\n")
+        self._write_settings()
+
+    def _write_settings(self) -> None:
+        file = self.folder / "settings.json"
+        unfinished = file.with_suffix(".unfinished")
+        unfinished.write_text(json.dumps(self.settings, indent=2) + "\n")
+        unfinished.replace(file)
 
     @property
     def run(self) -> Path:
@@ -112,6 +120,9 @@ class Demo:
 
     def train(self) -> None:
         """Trains with `lerobot-train`, from the last checkpoint if there is one."""
+        if self.settings["steps"] is None:
+            self.settings["steps"] = self._affordable_steps()
+            self._write_settings()
         steps = self.settings["steps"]
         last = self.checkpoint / "train_config.json"
         if last.exists():
@@ -128,7 +139,7 @@ class Demo:
                 "dataset.root": self.folder / "dataset",
                 "batch_size": self.settings["batch_size"],
                 "steps": steps,
-                "save_freq": self.settings["save_every"],
+                "save_freq": min(self.settings["save_every"], steps),
                 "log_freq": 100,
                 "num_workers": 0,
                 "job_name": "demo",
@@ -136,6 +147,18 @@ class Demo:
             }
             arguments = [f"--{name}={value}" for name, value in options.items()]
         self._do("train", f"Training for {steps} steps", self._lerobot("train", arguments))
+
+    def _affordable_steps(self) -> int:
+        """How many training steps this machine does in the time for them."""
+        sys.stdout.write("\n[demo] Measuring how many training steps this machine does in the time.\n")
+        sys.stdout.flush()
+        start = time.monotonic()
+        seconds = seconds_per_step(
+            TRAINING_SET, self.folder / "dataset", self.settings["policy"], self.settings["batch_size"]
+        )
+        self._note("measure", time.monotonic() - start)
+        steps = round(recipe.TRAINING_SECONDS / seconds, -2)
+        return int(min(max(steps, recipe.LEAST_STEPS), recipe.MOST_STEPS))
 
     def evaluate(self) -> None:
         """Evaluates with `lerobot-eval`, on new scenes of trained tasks and of new combinations."""

@@ -89,6 +89,7 @@ def evaluate(
     envs = make_task_vector_envs(ENV_ID, gym_kwargs, task_ids, n_envs)
     identity: PolicyProcessorPipeline = PolicyProcessorPipeline(steps=[])
     results = []
+    policy.begin_evaluation()
     try:
         for env in tqdm(envs, desc=f"Evaluating step {set_number}", unit="task"):
             for trials in _chunks(range(plan.trials), n_envs):

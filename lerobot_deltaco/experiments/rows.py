@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,15 +49,16 @@ def row_names(folder: Path) -> list[str]:
     )
 
 
-def read_row(folder: Path, name: str) -> Row:
+def read_row(folder: Path, name: str, settings: Sequence[str] = ()) -> Row:
     """Reads a row.
 
     Args:
         folder: Of the experiments.
         name: Such as "scenario_a/deltaco".
+        settings: What differs from the files: "training.steps=2000", "policy.device=cuda".
 
     Raises:
-        RowError: There is no such row, or a file has something in it that is not known.
+        RowError: There is no such row, a file has something in it that is not known, or a setting has.
     """
     file = folder / f"{name}.yaml"
     if name not in row_names(folder):
@@ -66,6 +67,8 @@ def read_row(folder: Path, name: str) -> Row:
     for path in (folder / SHARED, file.parent / SHARED, file):
         if path.is_file():
             merged = _merged(merged, _read(path))
+    for setting in settings:
+        merged = _merged(merged, _parsed(setting))
     sections = {section: merged.get(section, {}) for section in _SECTIONS}
     return Row(name, **sections, start_from=merged.get("start_from"))
 
@@ -79,6 +82,18 @@ def _read(path: Path) -> dict[str, Any]:
             "start_from."
         )
     return content
+
+
+def _parsed(setting: str) -> dict[str, dict[str, Any]]:
+    """A setting as a file would have it."""
+    key, equals, value = setting.partition("=")
+    section, _, name = key.partition(".")
+    if section not in _SECTIONS or not name or not equals:
+        raise RowError(
+            f"A setting is SECTION.NAME=VALUE, such as training.steps=2000. The sections are "
+            f"{', '.join(_SECTIONS)}. Got {setting!r}."
+        )
+    return {section: {name: yaml.safe_load(value)}}
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

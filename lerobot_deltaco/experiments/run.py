@@ -39,12 +39,35 @@ class Experiment:
         """Everything that is not done yet.
 
         Raises:
-            ExperimentError: A step failed.
+            ExperimentError: A step failed, or the run was begun with other settings.
         """
+        self._check_settings()
         data = self.collect(self.row.data)
         demonstrations = self.collect(self.row.demonstrations)
         self.train(data, demonstrations)
         self.evaluate()
+
+    def _check_settings(self) -> None:
+        """Keeps the settings beside the run, and refuses others for it."""
+        file = self.run.with_name(f"{self.run.name}.json")
+        settings = {
+            "data": dict(self.row.data),
+            "demonstrations": dict(self.row.demonstrations),
+            "policy": dict(self.row.policy),
+            "training": dict(self.row.training),
+            "start_from": self.row.start_from,
+        }
+        there = json.loads(file.read_text()) if file.exists() else settings
+        for section, values in settings.items():
+            if there[section] != values:
+                raise ExperimentError(
+                    f"{self.run} was begun with other settings: {section} was {there[section]}, and now is "
+                    f"{values}. Ask for the same, name another --out, or move the run and {file.name} away."
+                )
+        file.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = file.with_suffix(".unfinished")
+        unfinished.write_text(json.dumps(settings, indent=2) + "\n")
+        unfinished.replace(file)
 
     def collect(self, plan: Mapping[str, Any]) -> Path:
         """Collects a dataset that other rows may share; gives its folder."""

@@ -87,22 +87,76 @@ class DemonstrationSet(torch.nn.Module):
             ValueError: An episode is not in the set, or no episode of its task.
         """
         draws = torch.rand(len(episodes), generator=generator).to(self.frames.device)
-        known = episodes < len(self._row_of_episode)
-        rows = torch.where(known, self._row_of_episode[episodes.clamp(max=len(self._row_of_episode) - 1)], -1)
+        rows = self._rows(episodes)
         held_back = rows < 0
         if tasks is not None and held_back.any():
             rows = torch.where(held_back, self._any_rows(tasks, held_back), rows)
-        elif check and held_back.any():
-            raise ValueError(
-                f"Episode {int(episodes[rows < 0][0])} is trained on, but is not among those that "
-                "demonstrations are drawn from. Name all of them in `demo_episodes`."
-            )
+        elif check:
+            self._check(episodes, rows)
         own, count = self._place[rows].unbind(dim=1)
         place = (draws * (count - 1)).long()  # one of the count - 1 others
         place = torch.where(count > 1, place + (place >= own), own)
         if tasks is not None:
             place = torch.where(held_back, (draws * count).long(), place)
         return self._order[self._start[rows] + place]
+
+    def shared(
+        self,
+        episodes: Tensor,
+        column: Tensor,
+        n_tasks: int,
+        n_each: int,
+        generator: torch.Generator,
+        check: bool = True,
+    ) -> tuple[Tensor, Tensor]:
+        """Draws a few episodes of each task, and for each sample one of them that is not its own.
+
+        Args:
+            episodes: The samples' own, (batch,), as indices of the dataset.
+            column: The samples' tasks, (batch,), numbered from 0.
+            n_tasks: How many tasks they are.
+            n_each: How many episodes of each task are drawn, at least 2.
+            generator: Source of the draws, on the CPU.
+            check: Whether to look if the episodes are all in the set, for which a GPU is waited for.
+
+        Returns:
+            Rows, (tasks * n_each,), and the place of each sample's among them, (batch,). An episode is drawn twice
+            only for a task that has fewer.
+
+        Raises:
+            ValueError: An episode is not in the set.
+        """
+        n_samples, device = len(episodes), self.frames.device
+        longest = max(map(len, self.rows.values()))
+        priorities = torch.rand(n_tasks, longest, generator=generator).to(device)
+        start = torch.randint(n_each, (n_samples,), generator=generator).to(device)
+        rows = self._rows(episodes)
+        if check:
+            self._check(episodes, rows)
+        first = torch.full((n_tasks,), n_samples, device=device).scatter_reduce(
+            0, column, torch.arange(n_samples, device=device), "amin"
+        )
+        count = self._place[rows[first], 1]  # (tasks,)
+        late = torch.arange(longest, device=device) >= count[:, None]
+        order = priorities.masked_fill(late, 2).argsort(dim=1)  # (tasks, longest)
+        turn = torch.arange(n_each, device=device) % count[:, None]  # (tasks, n_each)
+        place = order.gather(1, turn)
+        drawn = self._order[self._start[rows[first], None] + place]  # (tasks, n_each)
+        own = drawn[column, start] == rows
+        which = column * n_each + torch.where(own, (start + 1) % n_each, start)
+        return drawn.flatten(), which
+
+    def _rows(self, episodes: Tensor) -> Tensor:
+        """Rows of episodes, (batch,); -1 of those that are not in the set."""
+        known = episodes < len(self._row_of_episode)
+        return torch.where(known, self._row_of_episode[episodes.clamp(max=len(self._row_of_episode) - 1)], -1)
+
+    def _check(self, episodes: Tensor, rows: Tensor) -> None:
+        if (rows < 0).any():
+            raise ValueError(
+                f"Episode {int(episodes[rows < 0][0])} is trained on, but is not among those that "
+                "demonstrations are drawn from. Name all of them in `demo_episodes`."
+            )
 
     def _any_rows(self, tasks: Sequence[str], wanted: Tensor) -> Tensor:
         """A row of each sample's task, (batch,); -1 where none is wanted."""

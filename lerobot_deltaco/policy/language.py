@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 BATCH_SIZE = 64
@@ -142,6 +144,36 @@ class InstructionTable:
             n_known = len(self.embeddings)
             self.embeddings = torch.cat([self.embeddings, embeddings.to(self.embeddings)])
             self.rows |= {text: n_known + i for i, text in enumerate(instructions)}
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, str]]:
+        """What is known, as tensors and metadata of a safetensors file."""
+        with _LOCK:
+            known = {"language_encoder": self.encoder_name, "instructions": json.dumps(list(self.rows))}
+            return {"embeddings": self.embeddings.cpu().contiguous()}, known
+
+    def read(self, path: Path) -> None:
+        """Adds what `state` gave, from a file.
+
+        Raises:
+            LanguageEncoderError: The file is missing, or is no such file.
+            ValueError: It is of another language encoder.
+        """
+        try:
+            with safe_open(path, framework="pt") as file:
+                known, embeddings = file.metadata() or {}, file.get_tensor("embeddings")
+                name, instructions = known["language_encoder"], json.loads(known["instructions"])
+        except (OSError, SafetensorError, KeyError) as error:
+            raise LanguageEncoderError(
+                f"{path} has no embeddings of instructions ({error}). Name a checkpoint's tasks.safetensors, or a "
+                "file that deltaco-embed wrote."
+            ) from error
+        if name != self.encoder_name:
+            raise ValueError(
+                f"{path} was made with the language encoder {name}. `language_encoder` cannot be "
+                f"{self.encoder_name}."
+            )
+        new = [n for n, text in enumerate(instructions) if text not in self.rows]
+        self.put([instructions[n] for n in new], embeddings[new])
 
     def __call__(self, instructions: Sequence[str], device: torch.device | str) -> Tensor:
         """Embeddings of instructions, (instructions, embedding)."""

@@ -199,6 +199,7 @@ class DemoEncoder(nn.Module):
         height: Of the array of frames, px.
         width: Of the array of frames, px.
         embedding_dim: Size of the embedding: the language encoder's.
+        stride: Of the first convolution.
         channels: Of the convolutions.
         hidden_dims: Of the fully connected layers.
     """
@@ -208,12 +209,13 @@ class DemoEncoder(nn.Module):
         height: int,
         width: int,
         embedding_dim: int,
+        stride: int = 1,
         channels: int = 16,
         hidden_dims: Sequence[int] = (1024, 512, 256),
     ) -> None:
         super().__init__()
         self.convolutions = nn.Sequential(
-            nn.Conv2d(3, channels, 3, padding=1),
+            nn.Conv2d(3, channels, 3, stride, padding=1),
             nn.ReLU(inplace=True),
             nn.MaxPool2d(2),
             nn.Conv2d(channels, channels, 3, padding=1),
@@ -223,7 +225,9 @@ class DemoEncoder(nn.Module):
             nn.ReLU(inplace=True),
             nn.Flatten(),
         )
-        flat_dim = channels * (height // 4) * (width // 4)
+        # The first convolution rounds up, the poolings down.
+        rows, columns = (math.ceil(size / stride) // 4 for size in (height, width))
+        flat_dim = channels * rows * columns
         self.layers = multilayer_perceptron([flat_dim, *hidden_dims, embedding_dim])
 
     def forward(self, demonstrations: Tensor) -> Tensor:

@@ -1,16 +1,20 @@
 """LeRobot's own training loop, over frames in memory.
 
-LeRobot has no hook for the dataset and the sampler. So while a training runs, four names in the module of its
-loop stand for others: the function that makes the datasets, the sampler, the iterator over batches, and the
-function that makes the policy. All else, from the arguments to the checkpoints, is LeRobot's.
+LeRobot has no hook for the dataset, the sampler and the evaluation. So while a training runs, some names in the
+module of its loop stand for others: the function that makes the datasets, the sampler, the iterator over
+batches, the function that makes the policy, and, on the benchmark, the evaluation. All else, from the arguments to
+the checkpoints, is LeRobot's.
 """
 
 from __future__ import annotations
 
 import logging
 import re
+import shlex
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -23,6 +27,9 @@ from lerobot.scripts import lerobot_train
 from torch import Tensor
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.configuration_env import DeltacoEnv
+from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
+from lerobot_deltaco.evaluation.sets import run_set
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.training.frames import FramesInMemory
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
@@ -55,6 +62,8 @@ class InMemoryTraining:
         self._make_datasets = lerobot_train.make_train_eval_datasets
         self._make_policy = lerobot_train.make_policy
         self._cycle = lerobot_train.cycle
+        self._make_envs = lerobot_train._make_eval_envs
+        self._evaluate = lerobot_train.eval_policy_all
 
     @contextmanager
     def active(self) -> Iterator[None]:
@@ -65,6 +74,8 @@ class InMemoryTraining:
             make_policy=self.make_policy,
             EpisodeAwareSampler=self.make_sampler,
             cycle=self.batches,
+            _make_eval_envs=self.make_envs,
+            eval_policy_all=self.evaluate,
         ):
             yield
 
@@ -140,6 +151,46 @@ class InMemoryTraining:
         places: Tensor
         for places in self._cycle(loader):
             yield self._frames.batch(places)
+
+    @contextmanager
+    def make_envs(self, config: TrainPipelineConfig) -> Iterator[dict[str, Any]]:
+        """LeRobot's environments for an evaluation, or none if they are not needed."""
+        if self._records(config):
+            yield {}
+        else:
+            with self._make_envs(config) as envs:
+                yield envs
+
+    def evaluate(self, **arguments: Any) -> dict[str, Any]:
+        """An evaluation in training: on the benchmark, an evaluation set with a record of every episode."""
+        config = self._config
+        assert config is not None
+        if not self._records(config):
+            return self._evaluate(**arguments)
+        # The folder for films is all that knows the step.
+        step = int(arguments["videos_dir"].name.rsplit("_", 1)[1])
+        policy: DeltacoPolicy = arguments["policy"]
+        policy.eval()
+        record = run_set(
+            Path(config.output_dir),
+            step,
+            policy,
+            arguments["preprocessor"],
+            arguments["postprocessor"],
+            EvaluationPlan(config.env.task, arguments["n_episodes"], ambiguity=config.env.ambiguity),
+            experiment=config.job_name,
+            run_seed=config.seed if config.seed is not None else 0,
+            command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        )
+        rate = record.success_rate
+        # Rewards are not in the record.
+        overall = {"avg_sum_reward": float("nan"), "pc_success": 100 * rate, "eval_s": record.seconds}
+        return {"overall": overall}
+
+    @staticmethod
+    def _records(config: TrainPipelineConfig) -> bool:
+        # With wandb, LeRobot's own evaluation, since its films are sent there.
+        return isinstance(config.env, DeltacoEnv) and not config.wandb.enable
 
     @staticmethod
     def _device(config: DeltacoConfig) -> torch.device:

@@ -1,0 +1,77 @@
+"""Evaluation sets of a training run's checkpoints, as records in its folder."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import draccus
+from lerobot.processor import PolicyProcessorPipeline
+
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.evaluation.evaluate import EvaluationPlan, evaluate, versions
+from lerobot_deltaco.evaluation.record import EvaluationRecord, record_path, write_record
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+
+
+def run_set(
+    run: Path,
+    step: int,
+    policy: DeltacoPolicy,
+    preprocessor: PolicyProcessorPipeline,
+    postprocessor: PolicyProcessorPipeline,
+    plan: EvaluationPlan,
+    *,
+    experiment: str,
+    run_seed: int,
+    command: str,
+) -> EvaluationRecord:
+    """Runs an evaluation set, and writes its record.
+
+    Args:
+        run: Folder of the training run.
+        step: How many steps the policy has trained; it also numbers the set.
+        policy: In evaluation mode, on its device.
+        preprocessor: The policy's.
+        postprocessor: The policy's.
+        plan: What is run.
+        experiment: What was trained, for the record; runs of one name differ in their seeds alone.
+        run_seed: Seed of the training run, for the record.
+        command: What was typed, for the record.
+
+    Returns:
+        The record.
+
+    Raises:
+        ValueError: A task has no demonstration.
+    """
+    start = time.monotonic()
+    episodes = evaluate(policy, preprocessor, postprocessor, plan, step)
+    record = EvaluationRecord(
+        experiment=experiment,
+        method=policy.config.method,
+        run_seed=run_seed,
+        step=step,
+        evaluation_seed=plan.seed,
+        counterfactual=plan.counterfactual,
+        ambiguity=plan.ambiguity,
+        tasks=plan.tasks,
+        trials=plan.trials,
+        episodes=episodes,
+        policy=_plain(policy.config),
+        versions=versions(policy),
+        command=command,
+        seconds=time.monotonic() - start,
+    )
+    write_record(record, record_path(run, step, plan.counterfactual))
+    return record
+
+
+def _plain(config: DeltacoConfig) -> dict[str, object]:
+    """The policy's configuration as JSON knows it, less what is found out from the data."""
+    encoded = draccus.encode(config)
+    return {
+        name: value
+        for name, value in encoded.items()
+        if name not in ("input_features", "output_features", "one_hot_tasks", "demo_episodes")
+    }
