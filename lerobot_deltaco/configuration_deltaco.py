@@ -77,8 +77,8 @@ class DeltacoConfig(PreTrainedConfig):
             all-distilroberta-v1, distilbert-base-uncased, or all-MiniLM-L6-v2, which the extra `offline`
             brings along.
         instruction_embeddings: A file with embeddings of instructions, which are then not computed: a
-            checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no language
-            model.
+            checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
+            language model.
         demo_encoder: cnn.
         demo_rows: m, rows of the array of a demonstration's frames.
         demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
@@ -93,9 +93,9 @@ class DeltacoConfig(PreTrainedConfig):
         crop_padding: Pixels by which observations are shifted at random in training, 0 for none.
         demo_crop_padding: The same for demonstrations. Without it, the encoder soon knows those of a small
             dataset by heart, and misreads new ones.
-        demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at least 2,
-            so that none is shown its own episode; 0 for one drawn anew for every sample. Sharing saves most of
-            the demonstration encoder's time.
+        demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at
+            least 2, so that none is shown its own episode; 0 for one drawn anew for every sample. Sharing
+            saves most of the demonstration encoder's time.
         demo_repo_id: Dataset that shows the tasks at evaluation; at least one episode of each.
         demo_root: Its folder, if it is not in LeRobot's cache.
         demo_episode: Its one episode that shows the task whatever the instruction; for paraphrases and for
@@ -205,8 +205,8 @@ class DeltacoConfig(PreTrainedConfig):
                 raise ValueError(f"`{name}` must be greater than 0. Got {getattr(self, name)}.")
         if self.demos_per_task == 1:
             raise ValueError(
-                "`demos_per_task` cannot be 1: the sample from the one episode would be shown itself. Choose 2 or "
-                "more, or 0 for a demonstration of each sample's own."
+                "`demos_per_task` cannot be 1: the sample from the one episode would be shown itself. Choose "
+                "2 or more, or 0 for a demonstration of each sample's own."
             )
         if self.n_demo_frames < 2:
             raise ValueError(

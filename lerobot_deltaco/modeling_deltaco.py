@@ -271,7 +271,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         self._told.pop(threading.get_ident(), None)
 
     def begin_evaluation(self) -> None:
-        """Forgets how many episodes each task has had, so that its demonstrations begin with the first again."""
+        """Forgets how many episodes each task has had: its demonstrations begin with the first again."""
         self._n_episodes.clear()
 
     @torch.no_grad()

@@ -152,7 +152,7 @@ def test_the_command_writes_a_record_of_each_checkpoint_once(run, capsys, monkey
     def must_not_run(*arguments):
         raise AssertionError("evaluated again")
 
-    monkeypatch.setattr(evaluate_command, "evaluate", must_not_run)
+    monkeypatch.setattr(evaluate_command, "run_set", must_not_run)
     evaluate_command.main(arguments)
     assert capsys.readouterr().out.count("was there already") == 2
 

@@ -36,7 +36,8 @@ def main(arguments: list[str] | None = None) -> None:
         parser.exit(1, f"{parser.prog}: {error}\n")
     sys.stdout.write(
         f"{options.out}: {len(table.rows)} instructions. Train with "
-        f"--policy.language_encoder={options.language_encoder} --policy.instruction_embeddings={options.out}.\n"
+        f"--policy.instruction_embeddings={options.out} "
+        f"--policy.language_encoder={options.language_encoder}.\n"
     )
 
 

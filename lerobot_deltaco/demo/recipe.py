@@ -18,8 +18,8 @@ ALL_TASKS = (*TRAINED_TASKS, *NEW_COMBINATIONS)
 EPISODES_PER_TASK = 200
 # A demonstration of each task, new combinations included: what the policy is shown.
 DEMONSTRATIONS_PER_TASK = 1
-# The expert is done after 10 of 30 steps in the median, and then holds still over what it has placed, which looks as
-# if it were about to grasp it. A policy that learned much of that hovers.
+# The expert is done after 10 of 30 steps in the median, and then holds still over what it has placed, which
+# looks as if it were about to grasp it. A policy that learned much of that hovers.
 DROPPED_FRAMES = 19
 # As many steps as the machine does in this time, within bounds.
 TRAINING_SECONDS = 520

@@ -68,10 +68,7 @@ def run_set(
 
 
 def _plain(config: DeltacoConfig) -> dict[str, object]:
-    """The policy's configuration as JSON knows it, less what is found out from the data."""
-    encoded = draccus.encode(config)
-    return {
-        name: value
-        for name, value in encoded.items()
-        if name not in ("input_features", "output_features", "one_hot_tasks", "demo_episodes")
-    }
+    """The policy's configuration as JSON knows it, less what comes from the data, and where they were."""
+    left_out = {"input_features", "output_features", "one_hot_tasks", "demo_episodes"}
+    left_out |= {"demo_repo_id", "demo_root", "instruction_embeddings"}
+    return {name: value for name, value in draccus.encode(config).items() if name not in left_out}

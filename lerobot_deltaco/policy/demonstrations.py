@@ -120,8 +120,8 @@ class DemonstrationSet(torch.nn.Module):
             check: Whether to look if the episodes are all in the set, for which a GPU is waited for.
 
         Returns:
-            Rows, (tasks * n_each,), and the place of each sample's among them, (batch,). An episode is drawn twice
-            only for a task that has fewer.
+            Rows, (tasks * n_each,), and the place of each sample's among them, (batch,). An episode is drawn
+            twice only for a task that has fewer.
 
         Raises:
             ValueError: An episode is not in the set.

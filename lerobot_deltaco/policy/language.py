@@ -164,8 +164,8 @@ class InstructionTable:
                 name, instructions = known["language_encoder"], json.loads(known["instructions"])
         except (OSError, SafetensorError, KeyError) as error:
             raise LanguageEncoderError(
-                f"{path} has no embeddings of instructions ({error}). Name a checkpoint's tasks.safetensors, or a "
-                "file that deltaco-embed wrote."
+                f"{path} has no embeddings of instructions ({error}). Name a checkpoint's tasks.safetensors, "
+                "or a file that deltaco-embed wrote."
             ) from error
         if name != self.encoder_name:
             raise ValueError(

@@ -1,9 +1,9 @@
 """LeRobot's own training loop, over frames in memory.
 
-LeRobot has no hook for the dataset, the sampler and the evaluation. So while a training runs, some names in the
-module of its loop stand for others: the function that makes the datasets, the sampler, the iterator over
-batches, the function that makes the policy, and, on the benchmark, the evaluation. All else, from the arguments to
-the checkpoints, is LeRobot's.
+LeRobot has no hook for the dataset, the sampler and the evaluation. So while a training runs, some names in
+the module of its loop stand for others: the function that makes the datasets, the sampler, the iterator over
+batches, the function that makes the policy, and, on the benchmark, the evaluation. All else, from the
+arguments to the checkpoints, is LeRobot's.
 """
 
 from __future__ import annotations
