@@ -14,9 +14,11 @@ ROW ?= scenario_a/deltaco
 SEED ?= 0
 # Of the training of scenario A on a GPU, and further settings: SETTINGS="--set data.episodes_per_task=50"
 STEPS ?= 100000
-SAVE_EVERY ?= $(shell expr $(STEPS) / 10)
+EVALUATE_EVERY ?= $(shell expr $(STEPS) / 10)
 DEVICE ?= cuda
 SETTINGS ?=
+OUT ?= outputs/scenario_a
+REPORT ?= results/scenario_a
 
 export UV_PYTHON_DOWNLOADS := never
 
@@ -35,9 +37,9 @@ experiment: $(INSTALLED) ## Run a row of the tables: make experiment ROW=scenari
 
 gpu-scenario-a: $(INSTALLED) ## Scenario A in full, on a GPU: make gpu-scenario-a STEPS=100000 SEED="0 1 2"
 	$(BIN)/deltaco-experiment scenario_a/deltaco scenario_a/language_only scenario_a/demo_only --seed $(SEED) \
-		--set training.steps=$(STEPS) --set training.save_freq=$(SAVE_EVERY) --set policy.device=$(DEVICE) \
+		--set training.steps=$(STEPS) --set training.env_eval_freq=$(EVALUATE_EVERY) --set policy.device=$(DEVICE) \
 		--set policy.compile=true --set policy.demos_per_task=2 $(SETTINGS) \
-		--out outputs/scenario_a --report results/scenario_a
+		--out $(OUT) --report $(REPORT)
 
 test: $(INSTALLED) ## Run the default tests: a few minutes, no network, no GPU
 	$(BIN)/python -m pytest $(ARGS)

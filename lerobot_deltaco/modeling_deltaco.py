@@ -318,8 +318,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         return _Told(tasks, *self._told_by(tasks, demo, language), self._acting())
 
     def _acting(self) -> nn.Module:
-        """The network that acts: a quicker copy, unless it is compiled or in training mode."""
-        return self.policy if self.config.compile or self.training else self._folded.network()
+        """The network that acts: a copy that is quicker for small batches, unless in training mode."""
+        return self.policy if self.training else self._folded.network()
 
     def _count(self, tasks: tuple[str, ...]) -> list[int]:
         """The number of each sample's episode among those of its task, from 0, whichever thread runs them."""

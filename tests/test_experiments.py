@@ -1,6 +1,8 @@
 """The rows of the tables: each builds its policy and takes a training step; all that they name is valid."""
 
 import dataclasses
+import os
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -128,8 +130,8 @@ def test_a_row_runs_from_its_data_to_its_evaluation_and_goes_on(tmp_path, capsys
 data: {tasks: "4,14,55", episodes_per_task: 2}
 demonstrations: {tasks: "4,14", split: validation, episodes_per_task: 1}
 policy: {language_encoder: all-MiniLM-L6-v2, backbone: strided, device: cpu, tasks_per_batch: 3}
-training: {batch_size: 6, steps: 9, save_freq: 2}
-evaluation: {tasks: "4,14", trials: 1}
+training: {batch_size: 6, steps: 9, save_freq: 2, env_eval_freq: 1}
+evaluation: {tasks: "4,14", trials: 1, seed: 0}
 """
     )
     out = tmp_path / "out"
@@ -137,8 +139,39 @@ evaluation: {tasks: "4,14", trials: 1}
     arguments += ["--set", "training.steps=4", "--report", str(tmp_path / "report")]
     experiment_command.main(arguments)
     records = sorted((out / "tiny/deltaco/seed_3/evaluations").glob("*.json"))
-    assert [path.stem for path in records] == ["0000002", "0000004"]
+    assert [path.stem for path in records] == ["0000001", "0000002", "0000003", "0000004"]
     assert "tiny/deltaco" in (tmp_path / "report" / "report.md").read_text()
     times = [path.stat().st_mtime_ns for path in records]
     experiment_command.main(arguments)
     assert [path.stat().st_mtime_ns for path in records] == times
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (FOLDER.parent / ".venv/.installed").exists(), reason="not the environment of `make`")
+def test_the_command_for_a_gpu_runs_without_one_at_a_tiny_size(tmp_path):
+    settings = {
+        "data.tasks": "4,14",
+        "data.episodes_per_task": 2,
+        "demonstrations.tasks": "4,14",
+        "demonstrations.split": "validation",
+        "policy.compile": "false",
+        "policy.backbone": "strided",
+        "policy.language_encoder": "all-MiniLM-L6-v2",
+        "policy.tasks_per_batch": 2,
+        "training.batch_size": 4,
+        "evaluation.tasks": "4,14",
+        "evaluation.trials": 1,
+    }
+    variables = {
+        "STEPS": 2,
+        "EVALUATE_EVERY": 1,
+        "DEVICE": "cpu",
+        "OUT": tmp_path / "out",
+        "REPORT": tmp_path / "report",
+        "SETTINGS": " ".join(f"--set {name}={value}" for name, value in settings.items()),
+    }
+    arguments = [f"{name}={value}" for name, value in variables.items()]
+    command = ["make", "-C", str(FOLDER.parent), "gpu-scenario-a", *arguments]
+    subprocess.run(command, check=True, env={**os.environ, "HF_HUB_OFFLINE": "1"}, timeout=900)
+    report = (tmp_path / "report" / "report.md").read_text()
+    assert all(f"scenario_a/{row}" in report for row in ("deltaco", "language_only", "demo_only"))

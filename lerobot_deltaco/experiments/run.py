@@ -102,6 +102,13 @@ class Experiment:
             "job_name": self.row.name,
             "output_dir": self.run,
         }
+        if self.row.training.get("env_eval_freq"):
+            options |= {
+                "env.type": "deltaco",
+                "env.task": self.row.evaluation["tasks"],
+                "env.ambiguity": self.row.evaluation.get("ambiguity", "container"),
+                "eval.n_episodes": self.row.evaluation["trials"],
+            }
         if self.row.start_from is None:
             options = {"policy.type": "deltaco", **options}
         else:
@@ -115,7 +122,7 @@ class Experiment:
         _do("train", [f"--{name}={_text(value)}" for name, value in options.items()])
 
     def evaluate(self) -> None:
-        """Evaluates the checkpoints."""
+        """Evaluates the checkpoints that were not evaluated in training."""
         options = [f"--{name}={value}" for name, value in self.row.evaluation.items()]
         _do("evaluate", [str(self.run), *options, f"--experiment={self.row.name}"])
 
