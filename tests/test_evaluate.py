@@ -203,3 +203,4 @@ def test_evaluations_in_training_leave_the_records_that_evaluations_afterwards_d
         assert len(record.episodes) == 4
         assert (record.experiment, record.run_seed, record.tasks) == ("small/deltaco", 7, "4,14")
         assert record.policy == after.policy
+        assert record.command.startswith("deltaco-train --policy.type=deltaco")

@@ -180,7 +180,7 @@ class InMemoryTraining:
             EvaluationPlan(config.env.task, arguments["n_episodes"], ambiguity=config.env.ambiguity),
             experiment=config.job_name,
             run_seed=config.seed if config.seed is not None else 0,
-            command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+            command=shlex.join(["deltaco-train", *sys.argv[1:]]),
         )
         rate = record.success_rate
         # Rewards are not in the record.
