@@ -193,6 +193,9 @@ def test_samples_of_a_task_can_share_demonstrations():
         assert [tasks[row] for row in rows[which]] == [tasks[episode - 100] for episode in episodes]
         used.update(zip(episodes.tolist(), demonstration.tolist(), strict=True))
     assert {demonstration for own, demonstration in used if own == 102} == {100, 101, 103, 104}
+    for _ in range(20):  # more than some tasks have
+        rows, which = shown.shared(episodes, column, 3, 3, generator)
+        assert (100 + rows[which] == episodes).tolist() == [True] + 9 * [False]
     with pytest.raises(ValueError, match="Episode 500 is trained on"):
         shown.shared(torch.tensor([500]), torch.tensor([0]), 1, 2, generator)
 

@@ -142,8 +142,10 @@ class DemonstrationSet(torch.nn.Module):
         turn = torch.arange(n_each, device=device) % count[:, None]  # (tasks, n_each)
         place = order.gather(1, turn)
         drawn = self._order[self._start[rows[first], None] + place]  # (tasks, n_each)
+        n_distinct = count.clamp(max=n_each)[column]  # (batch,)
+        start = start % n_distinct
         own = drawn[column, start] == rows
-        which = column * n_each + torch.where(own, (start + 1) % n_each, start)
+        which = column * n_each + torch.where(own, (start + 1) % n_distinct, start)
         return drawn.flatten(), which
 
     def _rows(self, episodes: Tensor) -> Tensor:
