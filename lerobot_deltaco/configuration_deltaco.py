@@ -53,7 +53,7 @@ BACKBONES = MappingProxyType(
         "strided": Backbone((16, 32, 64, 64), stem_stride=2, demo_stride=2),
     }
 )
-DEMO_ENCODERS = ("cnn",)
+DEMO_ENCODERS = ("cnn", "attention")
 GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
 SCHEDULERS = ("constant", "cosine")
 DTYPES = ("float32", "bfloat16")
@@ -79,11 +79,14 @@ class DeltacoConfig(PreTrainedConfig):
         instruction_embeddings: A file with embeddings of instructions, which are then not computed: a
             checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
             language model.
-        demo_encoder: cnn.
+        demo_encoder: cnn (the paper's), or attention (ours), which reads what changed wherever it is, and
+            understands demonstrations of new tasks better.
         demo_rows: m, rows of the array of a demonstration's frames.
         demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
         image_size: Height and width to which pictures are scaled, if they differ.
         backbone: paper or strided.
+        motion_modes: Gaussians of the motion's distribution. The paper has one, whose mean is between two
+            motions where either would do; of several, the likeliest acts.
         gripper: Which dimension of the action is the gripper: an index, "auto" (the last one whose name
             contains "gripper", if any) or "none".
         gripper_loss: squared_error, or cross_entropy (ours).
@@ -129,6 +132,7 @@ class DeltacoConfig(PreTrainedConfig):
     demo_columns: int = 2
     image_size: int = 48
     backbone: str = "paper"
+    motion_modes: int = 1
     gripper: str = "auto"
     gripper_loss: str = "squared_error"
     gripper_weight: float | None = None
@@ -186,6 +190,7 @@ class DeltacoConfig(PreTrainedConfig):
             ("demo_rows", 1),
             ("demo_columns", 1),
             ("image_size", 16),
+            ("motion_modes", 1),
             ("gripper_weight", 0),
             ("encoder_loss_weight", 0),
             ("crop_padding", 0),

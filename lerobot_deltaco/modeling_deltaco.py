@@ -22,6 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
+from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.language import InstructionTable
@@ -29,11 +30,12 @@ from lerobot_deltaco.policy.losses import (
     contrastive_logits,
     contrastive_loss,
     cosine_loss,
-    gaussian_negative_log_likelihood,
     gripper_loss,
+    mixture_negative_log_likelihood,
 )
+from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.model_card import model_card
-from lerobot_deltaco.policy.networks import ConditionedPolicy, DemoEncoder, frame_array, random_crop
+from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
 from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
@@ -114,23 +116,17 @@ class DeltacoPolicy(PreTrainedPolicy):
             has_gripper=config.gripper_index is not None,
             channels=backbone.channels,
             stem_stride=backbone.stem_stride,
+            motion_modes=config.motion_modes,
         )
-        self.demo_encoder = (
-            DemoEncoder(
-                config.demo_rows * config.image_size,
-                config.demo_columns * config.image_size,
-                config.embedding_dim,
-                backbone.demo_stride,
-            )
-            if config.uses_demo
-            else None
-        )
+        self.demo_encoder = self._make_demo_encoder() if config.uses_demo else None
         # MCIL brings both modalities into one space.
         self.project_language = (
             nn.Linear(config.embedding_dim, config.embedding_dim) if config.method == "mcil" else None
         )
         # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
+        if dataset_meta is not None and config.device == "cpu":
+            keep_freed_memory()
         if config.compile:
             for network in (self.policy, self.demo_encoder):
                 if network is not None:
@@ -139,6 +135,13 @@ class DeltacoPolicy(PreTrainedPolicy):
         self._told: dict[int, _Told] = {}
         self._n_episodes: dict[str, int] = {}  # of each task
         self.reset()
+
+    def _make_demo_encoder(self) -> nn.Module:
+        config = self.config
+        if config.demo_encoder == "attention":
+            return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
+        size, stride = config.image_size, BACKBONES[config.backbone].demo_stride
+        return ArrayEncoder(size, size, config.demo_rows, config.demo_columns, config.embedding_dim, stride)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """All weights; the language encoder is not among them."""
@@ -204,11 +207,14 @@ class DeltacoPolicy(PreTrainedPolicy):
         self, batch: dict[str, Any], images: Tensor, film: Tensor, concat: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """L_pi of each sample, (batch,), and its parts."""
-        mean, gripper = self.policy(images, film, self._concatenated(batch, concat))
+        predicted, gripper = self.policy(images, film, self._concatenated(batch, concat))
         action = batch[ACTION].float()
         motion, target = self._split(action)
-        likelihood = gaussian_negative_log_likelihood(mean.float(), self.policy.log_std.float(), motion)
-        logged = {"motion_nll": likelihood.mean(), "motion_mse": (mean.float() - motion).square().mean()}
+        likelihood = mixture_negative_log_likelihood(
+            predicted.means.float(), predicted.logits.float(), self.policy.log_std.float(), motion
+        )
+        error = (predicted.mean.float() - motion).square()
+        logged = {"motion_nll": likelihood.mean(), "motion_mse": error.mean()}
         if gripper is None:
             return likelihood, logged
         error = gripper_loss(gripper.float(), target, self.config.gripper_loss)
@@ -276,7 +282,7 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """The mean action.
+        """The mean action, of the likeliest mode if there are several.
 
         Args:
             batch: As in `forward`, without actions and indices.
@@ -293,8 +299,8 @@ class DeltacoPolicy(PreTrainedPolicy):
             told = self._told.get(threading.get_ident())
             if told is None or told.tasks != tasks:
                 told = self._told[threading.get_ident()] = self._tell(tasks, images.device)
-            mean, gripper = told.network(images, told.film, self._concatenated(batch, told.concat))
-        return self._joined(mean.float(), None if gripper is None else torch.sigmoid(gripper.float()))
+            motion, gripper = told.network(images, told.film, self._concatenated(batch, told.concat))
+        return self._joined(motion.mean.float(), None if gripper is None else torch.sigmoid(gripper.float()))
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The mean action as a chunk of one, (batch, 1, action)."""
@@ -413,7 +419,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         frames = shown.pictures(rows, self.config.n_demo_frames, generator)
         if self.training and self.config.demo_crop_padding:
             frames = random_crop(frames, self.config.demo_crop_padding, generator)
-        return self.demo_encoder(frame_array(frames, self.config.demo_rows))
+        return self.demo_encoder(frames)
 
     def _split(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
         """An action's motion, and its gripper in 0..1."""

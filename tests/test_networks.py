@@ -7,21 +7,22 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 
 from lerobot_deltaco.configuration_deltaco import BACKBONES
+from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder, frame_array
 from lerobot_deltaco.policy.inference import folded
 from lerobot_deltaco.policy.losses import (
     contrastive_logits,
     contrastive_loss,
     cosine_loss,
     gaussian_negative_log_likelihood,
+    mixture_negative_log_likelihood,
 )
 from lerobot_deltaco.policy.networks import (
     INITIAL_LOG_STD,
     ConditionedPolicy,
-    DemoEncoder,
     Film,
     FilmBlock,
+    Motion,
     SpatialSoftmax,
-    frame_array,
     random_crop,
 )
 
@@ -39,6 +40,26 @@ def test_the_likelihood_is_that_of_torchs_normal_distribution():
     log_std = torch.tensor([-1.0, -0.3, -4.0])
     expected = -torch.distributions.Normal(mean, log_std.exp()).log_prob(target).sum(dim=-1)
     torch.testing.assert_close(gaussian_negative_log_likelihood(mean, log_std, target), expected)
+
+
+def test_the_likelihood_of_several_modes_is_that_of_torchs_mixture():
+    means, logits, target = torch.randn(5, 4, 3), torch.randn(5, 4), torch.randn(5, 3)
+    log_std = torch.randn(4, 3)
+    modes = torch.distributions.Independent(torch.distributions.Normal(means, log_std.exp()), 1)
+    mixture = torch.distributions.MixtureSameFamily(torch.distributions.Categorical(logits=logits), modes)
+    loss = mixture_negative_log_likelihood(means, logits, log_std, target)
+    torch.testing.assert_close(loss, -mixture.log_prob(target))
+
+
+def test_a_single_mode_is_the_papers_gaussian():
+    mean, log_std, target = torch.randn(5, 3), torch.randn(3), torch.randn(5, 3)
+    loss = mixture_negative_log_likelihood(mean[:, None], torch.zeros(5, 1), log_std, target)
+    torch.testing.assert_close(loss, gaussian_negative_log_likelihood(mean, log_std, target))
+
+
+def test_the_likeliest_mode_acts():
+    means = torch.tensor([[[1.0], [2.0]], [[3.0], [4.0]]])
+    assert Motion(means, torch.tensor([[0.0, 1.0], [1.0, 0.0]])).mean.tolist() == [[2.0], [3.0]]
 
 
 def test_the_contrastive_loss_of_repeated_tasks_by_hand():
@@ -111,12 +132,12 @@ def test_the_papers_networks_have_the_papers_shapes():
         3,
     ]
     assert policy.motion[0].in_features == 256 + 394
-    mean, gripper = policy(torch.rand(2, 1, 3, 48, 48), torch.randn(2, 384), torch.randn(2, 394))
-    assert mean.shape == (2, 3)
+    motion, gripper = policy(torch.rand(2, 1, 3, 48, 48), torch.randn(2, 384), torch.randn(2, 394))
+    assert motion.mean.shape == (2, 3)
     assert gripper.shape == (2,)
-    encoder = DemoEncoder(48, 96, 384)
+    encoder = ArrayEncoder(48, 48, 1, 2, 384)
     assert encoder.layers[0].in_features == 4608
-    embedding = encoder(torch.rand(5, 3, 48, 96))
+    embedding = encoder(torch.rand(5, 2, 3, 48, 48))
     torch.testing.assert_close(embedding.norm(dim=-1), torch.ones(5))
 
 
@@ -131,21 +152,45 @@ def test_the_log_standard_deviation_stays_within_its_limits():
 def test_cameras_are_seen_apart():
     policy = ConditionedPolicy(2, 4, 0, 3, False, channels=(8,) * 8).eval()
     images, film = torch.rand(3, 2, 3, 24, 24), torch.randn(3, 4)
-    assert not torch.allclose(policy(images, film, None)[0], policy(images.flip(1), film, None)[0])
+    first, second = (policy(pictures, film, None)[0].mean for pictures in (images, images.flip(1)))
+    assert not torch.allclose(first, second)
 
 
 def test_the_strided_backbone_has_maps_of_half_the_size():
     backbone = BACKBONES["strided"]
     strided = ConditionedPolicy(1, 8, 8, 3, True, backbone.channels, backbone.stem_stride)
     assert strided.backbone(torch.rand(1, 3, 48, 48), torch.rand(1, 8)).shape == (1, 64, 12, 12)
-    assert DemoEncoder(48, 96, 384, backbone.demo_stride).layers[0].in_features == 4608 / 4
+    assert ArrayEncoder(48, 48, 1, 2, 384, backbone.demo_stride).layers[0].in_features == 4608 / 4
 
 
-@pytest.mark.parametrize(("height", "width"), [(48, 96), (25, 50), (26, 19)])
+@pytest.mark.parametrize(("height", "width"), [(48, 48), (25, 25), (26, 19)])
 @pytest.mark.parametrize("stride", [1, 2])
-def test_demonstrations_of_any_size_are_encoded(height, width, stride):
-    encoder = DemoEncoder(height, width, 12, stride)
-    assert encoder(torch.rand(2, 3, height, width)).shape == (2, 12)
+@pytest.mark.parametrize(("rows", "columns"), [(1, 2), (2, 2)])
+def test_demonstrations_of_any_size_are_encoded(height, width, stride, rows, columns):
+    encoder = ArrayEncoder(height, width, rows, columns, 12, stride)
+    assert encoder(torch.rand(2, rows * columns, 3, height, width)).shape == (2, 12)
+
+
+@pytest.mark.parametrize(("n_frames", "height", "width"), [(2, 48, 48), (4, 25, 19)])
+def test_attention_encodes_demonstrations_of_any_size_as_unit_vectors(n_frames, height, width):
+    embedding = AttentionEncoder(n_frames, 12)(torch.rand(3, n_frames, 3, height, width))
+    torch.testing.assert_close(embedding.norm(dim=-1), torch.ones(3))
+
+
+def test_attention_takes_the_same_from_wherever_it_is():
+    encoder = AttentionEncoder(2, 12).eval()
+    frames = torch.zeros(1, 2, 3, 48, 48)
+    frames[:, 0, 0, 16:20, 16:20] = 1  # an object that is gone in the second frame
+    moved = frames.roll((8, 8), dims=(-2, -1))
+    # The last fully connected layers see, beside what is there, only 16 numbers that say where.
+    positions = torch.zeros(encoder.layers[0].in_features)
+    positions[-16:] = 1
+    with torch.no_grad():
+        encoder.layers[0].weight.mul_(1 - positions)
+        shift = (encoder(moved) - encoder(frames)).abs().max()
+        other_color = (encoder(frames.flip(2)) - encoder(frames)).abs().max()
+    assert shift < 1e-6
+    assert other_color > 1e-4
 
 
 @pytest.mark.parametrize("film_dim", [0, 6])

@@ -54,6 +54,7 @@ def test_the_defaults_are_the_papers():
     assert (config.language_encoder, config.embedding_dim) == ("paraphrase-MiniLM-L3-v2", 384)
     assert (config.demo_encoder, config.demo_rows, config.demo_columns) == ("cnn", 1, 2)
     assert (config.image_size, config.crop_padding, config.backbone) == (48, 4, "paper")
+    assert config.motion_modes == 1
     assert (config.gripper_weight, config.encoder_loss_weight, config.temperature) == (30, 10, 0.1)
     optimizer = config.get_optimizer_preset()
     assert (optimizer.type, optimizer.lr, optimizer.weight_decay, optimizer.grad_clip_norm) == (
@@ -81,6 +82,7 @@ def test_the_defaults_are_the_papers():
         ({"backbone": "vit"}, "`backbone` must be one of paper, strided"),
         ({"dtype": "int8"}, "`dtype` must be one of float32, bfloat16"),
         ({"demo_columns": 1}, "at least 2. Got 1"),
+        ({"motion_modes": 0}, "`motion_modes` must be at least 1"),
         ({"demos_per_task": 1}, "`demos_per_task` cannot be 1"),
         ({"temperature": 0.0}, "`temperature` must be greater than 0"),
         ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
@@ -119,6 +121,9 @@ def test_a_gripper_that_is_not_there_is_refused(make):
         {"encoder_loss": "cosine"},
         {"encoder_loss": "none"},
         {"demo_rows": 2},
+        {"demo_encoder": "attention"},
+        {"demo_encoder": "attention", "demo_rows": 2},
+        {"motion_modes": 3},
         {"gripper": "none"},
         {"language_encoder": "all-distilroberta-v1"},
     ],
@@ -149,8 +154,9 @@ def test_the_loss_is_the_papers_sum(make, dataset):
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_one_batch_can_be_learned_by_heart(make, dataset):
-    policy, before, _ = make(crop_padding=0)
+@pytest.mark.parametrize("options", [{}, {"demo_encoder": "attention", "motion_modes": 3}], ids=str)
+def test_one_batch_can_be_learned_by_heart(make, dataset, options):
+    policy, before, _ = make(crop_padding=0, **options)
     batch = before(batch_of(dataset, [1, 6, 11, 16, 21, 26]))
     optimizer = torch.optim.Adam(policy.get_optim_params(), lr=1e-3)
     first = policy(batch)[1]
@@ -357,8 +363,8 @@ def test_what_acts_is_what_was_trained_last(make, dataset):
         acted.append(policy.select_action(seen))
         told = policy._told[threading.get_ident()]
         concatenated = policy._concatenated(seen, told.concat)
-        mean, gripper = policy.policy(policy._images(seen), told.film, concatenated)
-        expected = policy._joined(mean, gripper.sigmoid())
+        motion, gripper = policy.policy(policy._images(seen), told.film, concatenated)
+        expected = policy._joined(motion.mean, gripper.sigmoid())
         torch.testing.assert_close(acted[-1], expected, atol=1e-5, rtol=1e-4)
     assert not torch.allclose(acted[1], acted[2], atol=1e-4)
 
@@ -425,8 +431,9 @@ def test_mcils_trials_use_language_and_demonstration_in_turn(make, dataset):
 # Checkpoints
 
 
-def test_a_checkpoint_is_complete_and_equal_to_the_bit(make, dataset, shown, tmp_path):
-    policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(shown.root))
+@pytest.mark.parametrize("options", [{}, {"demo_encoder": "attention", "motion_modes": 3}], ids=str)
+def test_a_checkpoint_is_complete_and_equal_to_the_bit(make, dataset, shown, tmp_path, options):
+    policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(shown.root), **options)
     policy(before(batch_of(dataset, [0, 7])))
     policy.eval()
     batch = before(observation(dataset, ["juggle", "wave"]))

@@ -4,6 +4,7 @@ import json
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
@@ -89,6 +90,29 @@ def test_frames_equal_those_that_lerobot_reads(dataset, episodes):
             assert found[name].dtype == value.dtype
         else:
             assert found[name] == value
+
+
+def test_features_of_any_shape_are_held(tmp_path):
+    features = {
+        "observation.pose": {"dtype": "float32", "shape": (2, 3), "names": None},
+        "observation.flag": {"dtype": "bool", "shape": (1,), "names": None},
+        "action": {"dtype": "float64", "shape": (2,), "names": None},
+        "note": {"dtype": "string", "shape": (1,), "names": None},
+    }
+    written = LeRobotDataset.create("test/shapes", 10, features, root=tmp_path / "shapes", use_videos=False)
+    rng = np.random.default_rng(0)
+    for number in range(6):
+        pose, action = rng.normal(size=(2, 3)).astype(np.float32), rng.normal(size=2)
+        flag, note = np.array([number % 2 == 0]), f"frame {number}"
+        frame = {"observation.pose": pose, "observation.flag": flag, "action": action, "note": note}
+        written.add_frame({**frame, "task": "wave"})
+    written.save_episode()
+    written.finalize()
+    read = LeRobotDataset("test/shapes", root=written.root)
+    expected, found = batch_of(read, [4, 0, 5]), FramesInMemory(read).batch(torch.tensor([4, 0, 5]))
+    assert found["note"] == expected["note"]
+    for name in ("observation.pose", "observation.flag", "action"):
+        torch.testing.assert_close(found[name], expected[name], rtol=0, atol=0)
 
 
 def test_demonstrations_equal_those_that_are_read(dataset):

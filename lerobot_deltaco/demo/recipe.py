@@ -22,7 +22,7 @@ DEMONSTRATIONS_PER_TASK = 1
 # looks as if it were about to grasp it. A policy that learned much of that hovers.
 DROPPED_FRAMES = 19
 # As many steps as the machine does in this time, within bounds. A short measurement may be 40 % too good.
-TRAINING_SECONDS = 380
+TRAINING_SECONDS = 420
 LEAST_STEPS, MOST_STEPS = 2000, 12000
 SAVE_EVERY = 400
 BATCH_SIZE = 48
@@ -34,6 +34,8 @@ POLICY_OPTIONS = {
     "type": "deltaco",
     "language_encoder": "all-MiniLM-L6-v2",
     "backbone": "strided",
+    "demo_encoder": "attention",
+    "motion_modes": 5,
     "gripper_loss": "cross_entropy",
     "crop_padding": 0,
     "drop_n_last_frames": DROPPED_FRAMES,

@@ -13,15 +13,31 @@ def gaussian_negative_log_likelihood(mean: Tensor, log_std: Tensor, target: Tens
     """-log N(target; mean, std²), summed over the dimensions of an action.
 
     Args:
-        mean: (batch, dims).
-        log_std: (dims,), the same for all samples.
+        mean: (..., dims).
+        log_std: (..., dims), to be broadcast.
+        target: (..., dims), to be broadcast.
+
+    Returns:
+        (...).
+    """
+    scaled = (target - mean) * torch.exp(-log_std)
+    return (0.5 * scaled.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(dim=-1)
+
+
+def mixture_negative_log_likelihood(means: Tensor, logits: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
+    """-log of a mixture of Gaussians at a target.
+
+    Args:
+        means: (batch, modes, dims).
+        logits: Of the modes, (batch, modes).
+        log_std: (dims,) or (modes, dims), the same for all samples.
         target: (batch, dims).
 
     Returns:
         (batch,).
     """
-    scaled = (target - mean) * torch.exp(-log_std)
-    return (0.5 * scaled.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(dim=-1)
+    each = gaussian_negative_log_likelihood(means, log_std, target[:, None])  # (batch, modes)
+    return -torch.logsumexp(logits.log_softmax(dim=1) - each, dim=1)
 
 
 def gripper_loss(logit: Tensor, target: Tensor, kind: str) -> Tensor:

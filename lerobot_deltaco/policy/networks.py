@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -31,6 +32,21 @@ from torch import Tensor, nn
 FILM_INITIAL_STD = 1e-3
 MIN_LOG_STD, MAX_LOG_STD = -6.0, 0.0
 INITIAL_LOG_STD = -1.0  # ours: of the order of the first errors, so that the first gradients are moderate
+
+
+class Motion(NamedTuple):
+    """A distribution of motions: Gaussian modes, of which the paper has one."""
+
+    means: Tensor  # (batch, modes, dims)
+    logits: Tensor  # (batch, modes); their softmax is how likely each mode is
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean of the likeliest mode, (batch, dims)."""
+        if self.means.shape[1] == 1:
+            return self.means[:, 0]
+        likeliest = self.logits.argmax(dim=1)
+        return self.means[torch.arange(len(likeliest), device=likeliest.device), likeliest]
 
 
 class ConditionedPolicy(nn.Module):
@@ -47,6 +63,7 @@ class ConditionedPolicy(nn.Module):
         hidden_dims: Of the fully connected layers.
         gripper_hidden_dim: Of the gripper's hidden layer.
         spatial_softmax_temperature: Divides the activations.
+        motion_modes: Gaussians of the motion's distribution.
     """
 
     def __init__(
@@ -61,26 +78,30 @@ class ConditionedPolicy(nn.Module):
         hidden_dims: Sequence[int] = (1024, 512, 256),
         gripper_hidden_dim: int = 32,
         spatial_softmax_temperature: float = 1.0,
+        motion_modes: int = 1,
     ) -> None:
         super().__init__()
         self.backbone = FilmResNet(film_dim, channels, stem_stride)
         self.spatial_softmax = SpatialSoftmax(spatial_softmax_temperature)
         feature_dim = n_cameras * 2 * channels[-1] + concat_dim
-        self.motion = multilayer_perceptron([feature_dim, *hidden_dims, motion_dim])
+        self.motion_dim, self.motion_modes = motion_dim, motion_modes
+        n_outputs = motion_modes * motion_dim + (motion_modes if motion_modes > 1 else 0)
+        self.motion = multilayer_perceptron([feature_dim, *hidden_dims, n_outputs])
         # After the authors' code: independent of the observation.
         share = (INITIAL_LOG_STD - MIN_LOG_STD) / (MAX_LOG_STD - MIN_LOG_STD)
-        self.raw_log_std = nn.Parameter(torch.full((motion_dim,), math.log(share / (1 - share))))
+        stds = (motion_dim,) if motion_modes == 1 else (motion_modes, motion_dim)
+        self.raw_log_std = nn.Parameter(torch.full(stds, math.log(share / (1 - share))))
         # After the authors' code: on the concatenated features (the paper's figure: after the layers above).
         self.gripper = multilayer_perceptron([feature_dim, gripper_hidden_dim, 1]) if has_gripper else None
 
     @property
     def log_std(self) -> Tensor:
-        """Of the motion, (motion_dim,), strictly between -6 and 0."""
+        """Of the motion, (motion_dim,) or (motion_modes, motion_dim), strictly between -6 and 0."""
         return MIN_LOG_STD + (MAX_LOG_STD - MIN_LOG_STD) * torch.sigmoid(self.raw_log_std)
 
     def forward(
         self, images: Tensor, film: Tensor | None, concat: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
+    ) -> tuple[Motion, Tensor | None]:
         """Predicts an action.
 
         Args:
@@ -89,8 +110,7 @@ class ConditionedPolicy(nn.Module):
             concat: (batch, concat_dim), None if it is 0.
 
         Returns:
-            Mean of the motion, (batch, motion_dim), and the gripper's logit, (batch,), or None. (Its sigmoid
-            is the gripper in 0..1.)
+            The motion, and the gripper's logit, (batch,), or None. (Its sigmoid is the gripper in 0..1.)
         """
         n_cameras = images.shape[1]
         if film is not None:
@@ -101,7 +121,12 @@ class ConditionedPolicy(nn.Module):
         points = rearrange(self.spatial_softmax(maps), "(b n) p -> b (n p)", n=n_cameras)
         features = points if concat is None else torch.cat([points, concat], dim=-1)  # (batch, feature_dim)
         gripper = None if self.gripper is None else self.gripper(features).squeeze(-1)
-        return self.motion(features), gripper
+        outputs = self.motion(features)
+        means = rearrange(
+            outputs[:, : self.motion_modes * self.motion_dim], "b (m d) -> b m d", d=self.motion_dim
+        )
+        logits = outputs[:, self.motion_modes * self.motion_dim :]
+        return Motion(means, logits if self.motion_modes > 1 else torch.zeros_like(means[..., 0])), gripper
 
 
 class FilmResNet(nn.Module):
@@ -184,56 +209,32 @@ class SpatialSoftmax(nn.Module):
 
     def forward(self, maps: Tensor) -> Tensor:
         """From (batch, channels, h, w) to (batch, 2 channels): all x (to the right), then all y (down)."""
-        height, width = maps.shape[-2:]
-        weights = rearrange(maps / self.temperature, "b c h w -> b c (h w)").float().softmax(dim=-1)
-        weights = rearrange(weights, "b c (h w) -> b c h w", h=height)
-        x = torch.linspace(-1, 1, width, device=maps.device)
-        y = torch.linspace(-1, 1, height, device=maps.device)
-        return torch.cat([(weights.sum(dim=2) * x).sum(-1), (weights.sum(dim=3) * y).sum(-1)], dim=-1)
+        return torch.cat(mean_position(spatial_weights(maps / self.temperature)), dim=-1)
 
 
-class DemoEncoder(nn.Module):
-    """From the frames of a demonstration to a unit embedding.
+def attend(logits: Tensor, maps: Tensor) -> tuple[Tensor, Tensor]:
+    """Attention: the softmax of (batch, heads, h, w) over places, and the means of maps under it.
 
-    Args:
-        height: Of the array of frames, px.
-        width: Of the array of frames, px.
-        embedding_dim: Size of the embedding: the language encoder's.
-        stride: Of the first convolution.
-        channels: Of the convolutions.
-        hidden_dims: Of the fully connected layers.
+    Returns:
+        Weights, (batch, heads, h, w), and means, (batch, heads, channels) for (batch, channels, h, w).
     """
+    weights = spatial_weights(logits)
+    return weights, torch.einsum("bkhw,bchw->bkc", weights.to(maps.dtype), maps)
 
-    def __init__(
-        self,
-        height: int,
-        width: int,
-        embedding_dim: int,
-        stride: int = 1,
-        channels: int = 16,
-        hidden_dims: Sequence[int] = (1024, 512, 256),
-    ) -> None:
-        super().__init__()
-        self.convolutions = nn.Sequential(
-            nn.Conv2d(3, channels, 3, stride, padding=1),
-            nn.ReLU(inplace=True),
-            nn.MaxPool2d(2),
-            nn.Conv2d(channels, channels, 3, padding=1),
-            nn.ReLU(inplace=True),
-            nn.MaxPool2d(2),
-            nn.Conv2d(channels, channels, 3, padding=1),
-            nn.ReLU(inplace=True),
-            nn.Flatten(),
-        )
-        # The first convolution rounds up, the poolings down.
-        rows, columns = (math.ceil(size / stride) // 4 for size in (height, width))
-        flat_dim = channels * rows * columns
-        self.layers = multilayer_perceptron([flat_dim, *hidden_dims, embedding_dim])
 
-    def forward(self, demonstrations: Tensor) -> Tensor:
-        """From (batch, 3, height, width) in 0..1 to unit vectors (batch, embedding_dim)."""
-        maps = self.convolutions(demonstrations.contiguous(memory_format=torch.channels_last))
-        return F.normalize(self.layers(maps), dim=-1)
+def spatial_weights(maps: Tensor) -> Tensor:
+    """The softmax of each map over its places, of the same shape, (batch, channels, h, w), as float32."""
+    weights = rearrange(maps, "b c h w -> b c (h w)").float().softmax(dim=-1)
+    return rearrange(weights, "b c (h w) -> b c h w", h=maps.shape[-2])
+
+
+def mean_position(weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Of (batch, channels, h, w) weights: x (to the right) and y (down), each (batch, channels) in -1..1."""
+    height, width = weights.shape[-2:]
+    # Sums of products, since mixed precision would round the factors of a matrix product.
+    x = torch.linspace(-1, 1, width, device=weights.device)
+    y = torch.linspace(-1, 1, height, device=weights.device)
+    return (weights.sum(dim=2) * x).sum(-1), (weights.sum(dim=3) * y).sum(-1)
 
 
 def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:
@@ -242,19 +243,6 @@ def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:
     for in_dim, out_dim in zip(dims[:-1], dims[1:], strict=True):
         layers += [nn.Linear(in_dim, out_dim), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
-
-
-def frame_array(frames: Tensor, rows: int) -> Tensor:
-    """Lays the frames of demonstrations out in raster order (appendix B).
-
-    Args:
-        frames: (batch, rows * columns, 3, H, W).
-        rows: Number of rows.
-
-    Returns:
-        (batch, 3, rows * H, columns * W).
-    """
-    return rearrange(frames, "b (r c) d h w -> b d (r h) (c w)", r=rows)
 
 
 def random_crop(images: Tensor, padding: int, generator: torch.Generator | None = None) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,16 +9,18 @@ from typing import Any
 
 import numpy as np
 import psutil
+import pyarrow as pa
 import torch
 from lerobot.datasets import LeRobotDataset
-from PIL import Image
+from numpy.typing import NDArray
 from torch import Tensor
+from torchvision.io import ImageReadMode, decode_image
 from tqdm import tqdm
 
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, as_bytes, kept_frames, scaled_pictures
 
-# Rows that are decoded at a time.
-CHUNK = 1024
+# Rows that are decoded at a time, and those of them that a thread takes at a time.
+CHUNK, PART = 1024, 32
 # Of a memory's free bytes, the share that frames may take: the rest is for training.
 GREATEST_SHARE = {"cuda": 0.6, "cpu": 0.8}
 
@@ -47,14 +48,13 @@ class FramesInMemory:
             )
         self.device = torch.device(device)
         self.held_on = self._choose_device(dataset, image_size)
-        table = dataset.hf_dataset.with_format("numpy")
         cameras = dataset.meta.camera_keys
         self.columns: dict[str, Tensor] = {}
         self.texts: dict[str, list[str]] = {}
-        for name in table.column_names:
+        for name in dataset.hf_dataset.column_names:
             if name in cameras:
                 continue
-            values = np.asarray(table[name])
+            values = _column(dataset, name)
             if values.dtype.kind in "OUS":
                 self.texts[name] = [str(value) for value in values]
             else:
@@ -142,6 +142,25 @@ def needed_bytes(dataset: LeRobotDataset, image_size: int | None = None) -> int:
     return per_frame * dataset.num_frames
 
 
+def _column(dataset: LeRobotDataset, name: str) -> NDArray[Any]:
+    """All values of a feature, (frames, ...)."""
+    table = dataset.hf_dataset.select_columns([name])
+    values = table.with_format("arrow")[:][name].combine_chunks()
+    if isinstance(values, pa.ExtensionArray):  # of more than one dimension
+        return np.array(table.with_format("numpy")[:][name])
+    n_frames = len(values)
+    depth = 0
+    while pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type):
+        # Row by row, `datasets` takes ten seconds for a hundred thousand.
+        values = values.flatten()
+        depth += 1
+    array = values.to_numpy(zero_copy_only=False)
+    shape = (n_frames, *dataset.meta.features[name]["shape"]) if depth else (n_frames,)
+    # LeRobot gives every number with a fraction as a float32.
+    dtype = np.float32 if array.dtype == np.float64 else array.dtype
+    return array.reshape(shape).astype(dtype, copy=True)
+
+
 def _pictures(dataset: LeRobotDataset, camera: str, image_size: int | None, device: torch.device) -> Tensor:
     """Pictures of a camera, (frames, 3, H, W) uint8."""
     is_image = dataset.meta.features[camera]["dtype"] == "image"
@@ -154,7 +173,8 @@ def _pictures(dataset: LeRobotDataset, camera: str, image_size: int | None, devi
     ):
         for start in range(0, n_frames, CHUNK):
             rows = range(start, min(start + CHUNK, n_frames))
-            chunk = torch.stack(list(threads.map(read(rows), range(len(rows)))))
+            parts = [range(first, min(first + PART, len(rows))) for first in range(0, len(rows), PART)]
+            chunk = torch.cat(list(threads.map(read(rows), parts)))
             if image_size is not None:
                 chunk = scaled_pictures(chunk, image_size)
             if pictures is None:
@@ -165,21 +185,23 @@ def _pictures(dataset: LeRobotDataset, camera: str, image_size: int | None, devi
     return pictures
 
 
-Reader = Callable[[range], Callable[[int], Tensor]]
+# For rows of a dataset, a function that gives the pictures of some of them, (pictures, 3, H, W) uint8.
+Reader = Callable[[range], Callable[[range], Tensor]]
 
 
 def _stored_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
     """Reads pictures of an `image` feature: the stored files are decoded."""
     table = dataset.hf_dataset.with_format("arrow")
 
-    def read(rows: range) -> Callable[[int], Tensor]:
+    def read(rows: range) -> Callable[[range], Tensor]:
         files = table[rows.start : rows.stop][camera].to_pylist()
 
         def decode(number: int) -> Tensor:
-            picture = np.array(Image.open(io.BytesIO(files[number]["bytes"])).convert("RGB"))
-            return torch.from_numpy(picture).permute(2, 0, 1)
+            # Unlike Pillow's, torchvision's decoder leaves Python to the other threads.
+            file = torch.frombuffer(bytearray(files[number]["bytes"]), dtype=torch.uint8)
+            return decode_image(file, ImageReadMode.RGB)
 
-        return decode
+        return lambda part: torch.stack([decode(number) for number in part])
 
     return read
 
@@ -187,9 +209,9 @@ def _stored_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
 def _read_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
     """Reads pictures of a `video` feature, as LeRobot does."""
 
-    def read(rows: range) -> Callable[[int], Tensor]:
+    def read(rows: range) -> Callable[[range], Tensor]:
         # One after another: a decoder is not to be shared by threads.
         pictures = [as_bytes(dataset[row][camera]) for row in rows]
-        return pictures.__getitem__
+        return lambda part: torch.stack([pictures[number] for number in part])
 
     return read

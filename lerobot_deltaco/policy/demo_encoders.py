@@ -1,0 +1,123 @@
+"""Demonstration encoders: from a few frames of an episode to a task embedding, a unit vector."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from einops import rearrange
+from torch import Tensor, nn
+
+from lerobot_deltaco.policy.networks import attend, mean_position, multilayer_perceptron
+
+
+class ArrayEncoder(nn.Module):
+    """The paper's (appendix B): a convolutional network on an array of frames, as if it were one picture.
+
+    Args:
+        height: Of a frame, px.
+        width: Of a frame, px.
+        rows: Of the array.
+        columns: Of the array.
+        embedding_dim: Size of the embedding: the language encoder's.
+        stride: Of the first convolution.
+        channels: Of the convolutions.
+        hidden_dims: Of the fully connected layers.
+    """
+
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        rows: int,
+        columns: int,
+        embedding_dim: int,
+        stride: int = 1,
+        channels: int = 16,
+        hidden_dims: Sequence[int] = (1024, 512, 256),
+    ) -> None:
+        super().__init__()
+        self.rows = rows
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(3, channels, 3, stride, padding=1),
+            nn.ReLU(inplace=True),
+            nn.MaxPool2d(2),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.MaxPool2d(2),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.Flatten(),
+        )
+        # The first convolution rounds up, the poolings down.
+        sides = (math.ceil(size / stride) // 4 for size in (rows * height, columns * width))
+        flat_dim = channels * math.prod(sides)
+        self.layers = multilayer_perceptron([flat_dim, *hidden_dims, embedding_dim])
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """From (batch, rows * columns, 3, height, width) in 0..1 to unit vectors (batch, embedding_dim)."""
+        array = frame_array(frames, self.rows)
+        maps = self.convolutions(array.contiguous(memory_format=torch.channels_last))
+        return F.normalize(self.layers(maps), dim=-1)
+
+
+class AttentionEncoder(nn.Module):
+    """Ours: compares the frames at each place, and attends to a few places.
+
+    What a demonstration says is what changed: an object is gone here, and there is one in a container there.
+    The paper's encoder has to learn this anew for each place, since its fully connected layers take the maps
+    as they lie. Here the frames lie upon each other, convolutions see what changed, and attention takes from
+    the maps what is at the places that matter, and where these are. So a demonstration in one corner teaches
+    how to read those in all the others.
+
+    Args:
+        n_frames: Of a demonstration.
+        embedding_dim: Size of the embedding: the language encoder's.
+        channels: Of the convolutions. The first two halve the maps.
+        n_heads: Places that are attended to.
+        hidden_dim: Of the fully connected layer.
+    """
+
+    def __init__(
+        self,
+        n_frames: int,
+        embedding_dim: int,
+        channels: Sequence[int] = (32, 32, 64, 64),
+        n_heads: int = 8,
+        hidden_dim: int = 512,
+    ) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for n, (in_dim, out_dim) in enumerate(zip([3 * n_frames, *channels[:-1]], channels, strict=True)):
+            size, stride = (5, 2) if n == 0 else (3, 2) if n == 1 else (3, 1)
+            layers += [
+                nn.Conv2d(in_dim, out_dim, size, stride, padding=size // 2, bias=False),
+                nn.BatchNorm2d(out_dim),
+                nn.ReLU(inplace=True),
+            ]
+        self.convolutions = nn.Sequential(*layers)
+        self.attention = nn.Conv2d(channels[-1], n_heads, 1)
+        self.layers = multilayer_perceptron([n_heads * (channels[-1] + 2), hidden_dim, embedding_dim])
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """From (batch, n_frames, 3, height, width) in 0..1 to unit vectors (batch, embedding_dim)."""
+        stacked = frames.flatten(1, 2)  # (batch, 3 n_frames, height, width)
+        maps = self.convolutions(stacked.contiguous(memory_format=torch.channels_last))
+        weights, found = attend(self.attention(maps), maps)
+        x, y = mean_position(weights)
+        return F.normalize(self.layers(torch.cat([found.flatten(1), x, y], dim=-1)), dim=-1)
+
+
+def frame_array(frames: Tensor, rows: int) -> Tensor:
+    """Lays the frames of demonstrations out in raster order (appendix B).
+
+    Args:
+        frames: (batch, rows * columns, 3, H, W).
+        rows: Number of rows.
+
+    Returns:
+        (batch, 3, rows * H, columns * W).
+    """
+    return rearrange(frames, "b (r c) d h w -> b d (r h) (c w)", r=rows)
