@@ -32,5 +32,5 @@ def test_freed_memory_is_used_again_without_the_system():
         keep: int(subprocess.check_output([sys.executable, "-c", SCRIPT.format(keep=keep)], text=True))
         for keep in (False, True)
     }
-    # 64 MB in pages of 4 kB, five times, against what little happens beside.
-    assert faults[True] < 0.1 * faults[False]
+    # 64 MB in pages of 4 kB, five times; kept memory may be asked for once more, where it has gaps.
+    assert faults[True] < 0.5 * faults[False]
