@@ -189,6 +189,15 @@ def test_an_ablation_is_named(dataset):
     assert "ablation" not in foreign_card(dataset)[0].text
 
 
+def test_what_is_beyond_the_paper_is_named(dataset):
+    ours = words_of(foreign_card(dataset, demo_encoder="attention", motion_modes=5)[0])
+    assert "| encoder of demonstrations | a convolutional network with attention" in ours
+    assert "the likeliest of 5 Gaussians' means" in ours
+    paper = words_of(foreign_card(dataset)[0])
+    assert "| encoder of demonstrations | the paper's convolutional network" in paper
+    assert "beyond the paper" not in paper
+
+
 def test_the_demonstrations_that_it_carries_are_listed(dataset, shown):
     text = words_of(foreign_card(dataset)[0])
     assert "carries no demonstrations" in text

@@ -38,7 +38,7 @@ FILES = (
     REPORT_FILE,
 )
 # Of the policy's configuration: what the report names.
-_NAMED_OPTIONS = ("language_encoder", "demo_encoder", "backbone", "dtype")
+_NAMED_OPTIONS = ("language_encoder", "demo_encoder", "backbone", "motion_modes", "dtype")
 
 
 def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = False) -> Report:

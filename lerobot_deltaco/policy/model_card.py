@@ -54,6 +54,11 @@ _INPUT_TEXTS = {
     "language_or_demo": "the embedding of the instruction (projected) or of the demonstration",
 }
 
+_DEMO_ENCODER_TEXTS = {
+    "cnn": "the paper's convolutional network, on the array of frames",
+    "attention": "a convolutional network with attention, on the frames one upon the other (beyond the paper)",
+}
+
 
 def model_card(
     config: DeltacoConfig,
@@ -117,6 +122,7 @@ def model_card(
         config=config,
         language_repo_id=LANGUAGE_ENCODERS[config.language_encoder].repo_id,
         demo_frames="the first and the last" + (", and random ones between" * (config.n_demo_frames > 2)),
+        demo_encoder=_DEMO_ENCODER_TEXTS[config.demo_encoder],
         shown_tasks=[_one_line(task) for task in shown_tasks],
         max_listed=MAX_TASKS_LISTED,
         n_instructions=n_instructions,
