@@ -44,7 +44,7 @@ class Backbone(NamedTuple):
 
     channels: tuple[int, ...]  # of the residual blocks
     stem_stride: int  # of the first convolution
-    demo_stride: int  # of the demonstration encoder's first convolution
+    demo_stride: int  # of the first convolution of the demonstration encoder `cnn`
 
 
 BACKBONES = MappingProxyType(
@@ -66,7 +66,8 @@ class DeltacoConfig(PreTrainedConfig):
 
     The defaults are the paper's (appendix B), for pictures of 48 x 48 pixels. On a small machine, choose
     `backbone=strided`: half of the residual blocks, with up to 64 channels, on maps of half the size, for a
-    seventeenth of the arithmetic, and a demonstration encoder on maps of half the size.
+    seventeenth of the arithmetic, and, with `demo_encoder=cnn`, a demonstration encoder on maps of half the
+    size.
 
     Args:
         method: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
@@ -79,10 +80,11 @@ class DeltacoConfig(PreTrainedConfig):
         instruction_embeddings: A file with embeddings of instructions, which are then not computed: a
             checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
             language model.
-        demo_encoder: cnn (the paper's), or attention (ours), which reads what changed wherever it is, and
-            understands demonstrations of new tasks better.
+        demo_encoder: cnn (the paper's), or attention (ours), which compares the frames at each place, and
+            attends to a few places.
         demo_rows: m, rows of the array of a demonstration's frames.
         demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
+            (For the attention, which has no array, they are m n frames.)
         image_size: Height and width to which pictures are scaled, if they differ.
         backbone: paper or strided.
         motion_modes: Gaussians of the motion's distribution. The paper has one, whose mean is between two

@@ -125,8 +125,6 @@ class DeltacoPolicy(PreTrainedPolicy):
         )
         # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
-        if dataset_meta is not None and config.device == "cpu":
-            keep_freed_memory()
         if config.compile:
             for network in (self.policy, self.demo_encoder):
                 if network is not None:
@@ -166,6 +164,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         """
         tasks = list(batch["task"])
         device = batch[ACTION].device
+        if self.training and device.type == "cpu":
+            keep_freed_memory()
         generator = self._generator()
         images = self._images(batch)
         if self.training and self.config.crop_padding:
@@ -303,7 +303,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         return self._joined(motion.mean.float(), None if gripper is None else torch.sigmoid(gripper.float()))
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """The mean action as a chunk of one, (batch, 1, action)."""
+        """The action as a chunk of one, (batch, 1, action)."""
         return self.select_action(batch, **kwargs).unsqueeze(1)
 
     def _tell(self, tasks: tuple[str, ...], device: torch.device) -> _Told:

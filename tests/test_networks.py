@@ -193,9 +193,12 @@ def test_attention_takes_the_same_from_wherever_it_is():
     assert other_color > 1e-4
 
 
+@pytest.mark.parametrize("motion_modes", [1, 3])
 @pytest.mark.parametrize("film_dim", [0, 6])
-def test_folding_the_batch_norms_changes_nothing_but_their_number(film_dim):
-    network = ConditionedPolicy(2, film_dim, 3, 4, True, channels=(8, 8, 16), stem_stride=2)
+def test_folding_the_batch_norms_changes_nothing_but_their_number(film_dim, motion_modes):
+    network = ConditionedPolicy(
+        2, film_dim, 3, 4, True, channels=(8, 8, 16), stem_stride=2, motion_modes=motion_modes
+    )
     for module in network.modules():
         if isinstance(module, torch.nn.BatchNorm2d):
             module.running_mean.uniform_(-1, 1)

@@ -77,6 +77,8 @@ FORBIDDEN = {
     "lerobot_deltaco/policy": {"gym_deltaco", "pybullet", "lerobot_deltaco.data"},
     "lerobot_deltaco/policy/networks.py": {"lerobot", "lerobot_deltaco"},
     "lerobot_deltaco/policy/losses.py": {"lerobot", "lerobot_deltaco"},
+    "lerobot_deltaco/policy/demo_encoders.py": {"lerobot", "lerobot_deltaco.modeling_deltaco"},
+    "lerobot_deltaco/policy/memory.py": {"lerobot", "lerobot_deltaco"},
     # Reports are quick, and need no machine that could train.
     **{
         f"lerobot_deltaco/evaluation/{name}.py": {"torch", "lerobot", "pybullet"}

@@ -39,6 +39,10 @@ def dataset(tmp_path_factory):
     return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
 
 
+# What is not the paper's, together.
+OURS = {"demo_encoder": "attention", "motion_modes": 3}
+
+
 @pytest.fixture
 def make(dataset):
     """Makes a small policy and its processors."""
@@ -154,7 +158,7 @@ def test_the_loss_is_the_papers_sum(make, dataset):
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize("options", [{}, {"demo_encoder": "attention", "motion_modes": 3}], ids=str)
+@pytest.mark.parametrize("options", [{}, OURS], ids=str)
 def test_one_batch_can_be_learned_by_heart(make, dataset, options):
     policy, before, _ = make(crop_padding=0, **options)
     batch = before(batch_of(dataset, [1, 6, 11, 16, 21, 26]))
@@ -289,8 +293,9 @@ def test_instructions_can_be_embedded_elsewhere(make, dataset, tmp_path):
             make(instruction_embeddings=str(wrong))
 
 
-def test_bfloat16_trains(make, dataset):
-    policy, before, _ = make(dtype="bfloat16")
+@pytest.mark.parametrize("options", [{}, OURS], ids=str)
+def test_bfloat16_trains(make, dataset, options):
+    policy, before, _ = make(dtype="bfloat16", **options)
     batch = before(batch_of(dataset, [0, 7]))
     with torch.autocast("cpu", torch.bfloat16):
         policy(batch)[0].backward()
@@ -348,8 +353,9 @@ def test_both_encoders_run_once_an_episode(make, dataset, monkeypatch):
         assert len(calls) == n_episodes
 
 
-def test_what_acts_is_what_was_trained_last(make, dataset):
-    policy, before, _ = make(optimizer_lr=0.01)
+@pytest.mark.parametrize("options", [{}, OURS], ids=str)
+def test_what_acts_is_what_was_trained_last(make, dataset, options):
+    policy, before, _ = make(optimizer_lr=0.01, **options)
     batch, seen = before(batch_of(dataset, [0, 1, 7, 8])), before(observation(dataset, [TASKS[0]]))
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     acted = []
@@ -431,7 +437,7 @@ def test_mcils_trials_use_language_and_demonstration_in_turn(make, dataset):
 # Checkpoints
 
 
-@pytest.mark.parametrize("options", [{}, {"demo_encoder": "attention", "motion_modes": 3}], ids=str)
+@pytest.mark.parametrize("options", [{}, OURS], ids=str)
 def test_a_checkpoint_is_complete_and_equal_to_the_bit(make, dataset, shown, tmp_path, options):
     policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(shown.root), **options)
     policy(before(batch_of(dataset, [0, 7])))

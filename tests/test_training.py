@@ -1,5 +1,6 @@
 """`deltaco-train`: LeRobot's loop over frames in memory sees what it would read from the disk."""
 
+import io
 import json
 import sys
 from types import SimpleNamespace
@@ -10,12 +11,13 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.scripts import lerobot_train
+from PIL import Image
 from safetensors.torch import load_file
 from small_policies import REPO_ID, TASKS, batch_of, use_fake_encoder, write_dataset
 
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import load_demonstrations
-from lerobot_deltaco.training.frames import FramesInMemory, needed_bytes
+from lerobot_deltaco.training.frames import FramesInMemory, decoded, needed_bytes
 from lerobot_deltaco.training.loop import InMemoryTraining
 
 EPISODES = [task for task in TASKS for _ in range(4)]
@@ -97,6 +99,9 @@ def test_features_of_any_shape_are_held(tmp_path):
         "observation.pose": {"dtype": "float32", "shape": (2, 3), "names": None},
         "observation.flag": {"dtype": "bool", "shape": (1,), "names": None},
         "action": {"dtype": "float64", "shape": (2,), "names": None},
+        "count": {"dtype": "int32", "shape": (1,), "names": None},
+        "levels": {"dtype": "uint8", "shape": (3,), "names": None},
+        "force": {"dtype": "float16", "shape": (2,), "names": None},
         "note": {"dtype": "string", "shape": (1,), "names": None},
     }
     written = LeRobotDataset.create("test/shapes", 10, features, root=tmp_path / "shapes", use_videos=False)
@@ -104,15 +109,26 @@ def test_features_of_any_shape_are_held(tmp_path):
     for number in range(6):
         pose, action = rng.normal(size=(2, 3)).astype(np.float32), rng.normal(size=2)
         flag, note = np.array([number % 2 == 0]), f"frame {number}"
+        levels, count = rng.integers(0, 255, 3, dtype=np.uint8), np.array([number], np.int32)
         frame = {"observation.pose": pose, "observation.flag": flag, "action": action, "note": note}
-        written.add_frame({**frame, "task": "wave"})
-    written.save_episode()
+        more = {"count": count, "levels": levels, "force": action.astype(np.float16), "task": "wave"}
+        written.add_frame({**frame, **more})
+        if number % 2:
+            written.save_episode()
     written.finalize()
-    read = LeRobotDataset("test/shapes", root=written.root)
-    expected, found = batch_of(read, [4, 0, 5]), FramesInMemory(read).batch(torch.tensor([4, 0, 5]))
+    read = LeRobotDataset("test/shapes", root=written.root, episodes=[0, 2])
+    expected, found = batch_of(read, [3, 0, 2]), FramesInMemory(read).batch(torch.tensor([3, 0, 2]))
     assert found["note"] == expected["note"]
-    for name in ("observation.pose", "observation.flag", "action"):
-        torch.testing.assert_close(found[name], expected[name], rtol=0, atol=0)
+    for name in features.keys() - {"note"}:
+        torch.testing.assert_close(found[name], expected[name], rtol=0, atol=0, msg=name)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "BMP"])
+def test_pictures_of_any_format_are_decoded(kind):
+    picture = np.random.default_rng(0).integers(0, 255, (9, 7, 3), dtype=np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, kind)
+    assert torch.equal(decoded(file.getvalue()), torch.from_numpy(picture).permute(2, 0, 1))
 
 
 def test_demonstrations_equal_those_that_are_read(dataset):

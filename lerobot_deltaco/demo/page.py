@@ -92,7 +92,7 @@ def write_page(demo: Demo) -> Path:
         "followed": _followed(demo),
         "steps": steps,
         "minutes": summary["minutes"],
-        "language_encoder": settings["policy"]["language_encoder"],
+        "policy": settings["policy"],
         "checkpoint": demo.checkpoint.resolve().relative_to(demo.folder.resolve()),
         "command": _command(demo),
     }

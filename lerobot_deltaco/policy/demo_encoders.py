@@ -10,7 +10,7 @@ import torch.nn.functional as F  # noqa: N812
 from einops import rearrange
 from torch import Tensor, nn
 
-from lerobot_deltaco.policy.networks import attend, mean_position, multilayer_perceptron
+from lerobot_deltaco.policy.networks import mean_position, multilayer_perceptron, spatial_weights
 
 
 class ArrayEncoder(nn.Module):
@@ -108,6 +108,16 @@ class AttentionEncoder(nn.Module):
         weights, found = attend(self.attention(maps), maps)
         x, y = mean_position(weights)
         return F.normalize(self.layers(torch.cat([found.flatten(1), x, y], dim=-1)), dim=-1)
+
+
+def attend(logits: Tensor, maps: Tensor) -> tuple[Tensor, Tensor]:
+    """Attention: the softmax of (batch, heads, h, w) over places, and the means of maps under it.
+
+    Returns:
+        Weights, (batch, heads, h, w), and means, (batch, heads, channels) for (batch, channels, h, w).
+    """
+    weights = spatial_weights(logits)
+    return weights, torch.einsum("bkhw,bchw->bkc", weights.to(maps.dtype), maps)
 
 
 def frame_array(frames: Tensor, rows: int) -> Tensor:

@@ -22,7 +22,10 @@ class FoldedPolicy:
         self._version: tuple[tuple[int, int], ...] = ()
 
     def network(self) -> ConditionedPolicy:
-        """The copy, in evaluation mode. It gives what the network does, up to rounding."""
+        """The copy, in evaluation mode. It gives what the network does, up to rounding.
+
+        (Of two modes that are as likely, rounding may choose.)
+        """
         tensors = (*self._network.parameters(), *self._network.buffers())
         version = tuple((tensor.data_ptr(), tensor._version) for tensor in tensors)
         if self._copy is None or version != self._version:

@@ -1,4 +1,4 @@
-"""The losses of the paper (section 4.2 and appendix B), of plain tensors."""
+"""The losses of the paper (section 4.2 and appendix B), and one of several Gaussians, of plain tensors."""
 
 from __future__ import annotations
 

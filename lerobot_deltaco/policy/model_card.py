@@ -56,7 +56,7 @@ _INPUT_TEXTS = {
 
 _DEMO_ENCODER_TEXTS = {
     "cnn": "the paper's convolutional network, on the array of frames",
-    "attention": "a convolutional network with attention, on the frames one upon the other (beyond the paper)",
+    "attention": "a convolutional network with attention, on the frames laid upon each other (ours)",
 }
 
 

@@ -1,18 +1,18 @@
-"""The networks of the paper (figure 3, appendix B): the demonstration encoder, and the policy it conditions.
+"""The policy's network (the paper's figure 3, appendix B), which task embeddings condition.
 
-    demonstration (3, m H, n W)          picture (3, H, W)
-        |                                    |
-    conv 3x3, pool   } 3 of them         conv 7x7, batch norm, pool
-        |            } 2 pools               |
-    fully connected                      residual block  <--- FiLM: gamma and beta, linear in an embedding
-        |                                    |   ... 8 of them
-    unit length                          spatial softmax
-        |                                    |
-    demonstration embedding              feature points, concatenated embeddings, proprioception
-                                             |
-                                         fully connected           |
-                                             |                     |
-                                         mean of the motion    gripper
+    picture (3, H, W)
+        |
+    conv 7x7, batch norm, pool
+        |
+    residual block  <--- FiLM: gamma and beta, linear in an embedding
+        |   ... 8 of them
+    spatial softmax
+        |
+    feature points, concatenated embeddings, proprioception
+        |                         |
+    fully connected           gripper
+        |
+    distribution of the motion
 
 Task embedding: a unit vector that stands for a task, made from a demonstration or an instruction. What goes
 through FiLM and what is concatenated is the caller's to choose.
@@ -210,16 +210,6 @@ class SpatialSoftmax(nn.Module):
     def forward(self, maps: Tensor) -> Tensor:
         """From (batch, channels, h, w) to (batch, 2 channels): all x (to the right), then all y (down)."""
         return torch.cat(mean_position(spatial_weights(maps / self.temperature)), dim=-1)
-
-
-def attend(logits: Tensor, maps: Tensor) -> tuple[Tensor, Tensor]:
-    """Attention: the softmax of (batch, heads, h, w) over places, and the means of maps under it.
-
-    Returns:
-        Weights, (batch, heads, h, w), and means, (batch, heads, channels) for (batch, channels, h, w).
-    """
-    weights = spatial_weights(logits)
-    return weights, torch.einsum("bkhw,bchw->bkc", weights.to(maps.dtype), maps)
 
 
 def spatial_weights(maps: Tensor) -> Tensor:

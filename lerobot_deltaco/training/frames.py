@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +14,7 @@ import pyarrow as pa
 import torch
 from lerobot.datasets import LeRobotDataset
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 from torchvision.io import ImageReadMode, decode_image
 from tqdm import tqdm
@@ -146,19 +148,32 @@ def _column(dataset: LeRobotDataset, name: str) -> NDArray[Any]:
     """All values of a feature, (frames, ...)."""
     table = dataset.hf_dataset.select_columns([name])
     values = table.with_format("arrow")[:][name].combine_chunks()
-    if isinstance(values, pa.ExtensionArray):  # of more than one dimension
-        return np.array(table.with_format("numpy")[:][name])
-    n_frames = len(values)
-    depth = 0
+    array = _flat_numbers(values)
+    if array is None:
+        array = np.array(table.with_format("numpy")[:][name])
+    elif len(array) != len(values):
+        array = array.reshape(len(values), *dataset.meta.features[name]["shape"])
+    elif pa.types.is_nested(values.type):
+        array = array[:, None]
+    # As LeRobot, which makes tensors of Python's numbers.
+    if np.issubdtype(array.dtype, np.floating):
+        return array.astype(np.float32)
+    return array.astype(np.int64) if np.issubdtype(array.dtype, np.integer) else array.copy()
+
+
+def _flat_numbers(values: pa.Array) -> NDArray[Any] | None:
+    """Numbers and vectors of numbers, one after another; None of what is something else.
+
+    `datasets` makes arrays row by row, and takes ten seconds for a hundred thousand.
+    """
     while pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type):
-        # Row by row, `datasets` takes ten seconds for a hundred thousand.
+        if values.null_count:
+            return None
         values = values.flatten()
-        depth += 1
-    array = values.to_numpy(zero_copy_only=False)
-    shape = (n_frames, *dataset.meta.features[name]["shape"]) if depth else (n_frames,)
-    # LeRobot gives every number with a fraction as a float32.
-    dtype = np.float32 if array.dtype == np.float64 else array.dtype
-    return array.reshape(shape).astype(dtype, copy=True)
+    is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
+    if values.null_count or not (is_number or pa.types.is_boolean(values.type)):
+        return None
+    return values.to_numpy(zero_copy_only=False)
 
 
 def _pictures(dataset: LeRobotDataset, camera: str, image_size: int | None, device: torch.device) -> Tensor:
@@ -196,14 +211,21 @@ def _stored_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
     def read(rows: range) -> Callable[[range], Tensor]:
         files = table[rows.start : rows.stop][camera].to_pylist()
 
-        def decode(number: int) -> Tensor:
-            # Unlike Pillow's, torchvision's decoder leaves Python to the other threads.
-            file = torch.frombuffer(bytearray(files[number]["bytes"]), dtype=torch.uint8)
-            return decode_image(file, ImageReadMode.RGB)
-
-        return lambda part: torch.stack([decode(number) for number in part])
+        return lambda part: torch.stack([decoded(files[number]["bytes"]) for number in part])
 
     return read
+
+
+def decoded(file: bytes) -> Tensor:
+    """The picture in a file, (3, H, W) uint8."""
+    try:
+        # Unlike Pillow's, this decoder leaves Python to the other threads; it knows fewer formats.
+        picture = decode_image(torch.frombuffer(bytearray(file), dtype=torch.uint8), ImageReadMode.RGB)
+    except RuntimeError:
+        picture = None
+    if picture is not None and picture.dtype == torch.uint8:
+        return picture
+    return torch.from_numpy(np.array(Image.open(io.BytesIO(file)).convert("RGB"))).permute(2, 0, 1)
 
 
 def _read_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
