@@ -149,6 +149,20 @@ def test_the_log_standard_deviation_stays_within_its_limits():
     torch.testing.assert_close(policy.log_std, torch.tensor([-6.0, -3.0, 0.0]))
 
 
+def test_outputs_are_not_rounded_under_mixed_precision():
+    policy = ConditionedPolicy(1, 0, 0, 3, True, channels=(8,) * 8)
+    hidden = []
+    policy.motion[-1].register_forward_pre_hook(lambda layer, inputs: hidden.append(inputs[0]))
+    with torch.autocast("cpu", torch.bfloat16):
+        motion, gripper = policy(torch.rand(2, 1, 3, 24, 24), None, None)
+    assert hidden[0].dtype == torch.bfloat16  # what comes before is quick
+    last = policy.motion[-1]
+    exact = F.linear(hidden[0].float(), last.weight, last.bias)
+    assert motion.means.dtype == gripper.dtype == torch.float32
+    torch.testing.assert_close(motion.means[:, 0], exact)
+    assert (exact != exact.bfloat16()).any()
+
+
 def test_cameras_are_seen_apart():
     policy = ConditionedPolicy(2, 4, 0, 3, False, channels=(8,) * 8).eval()
     images, film = torch.rand(3, 2, 3, 24, 24), torch.randn(3, 4)

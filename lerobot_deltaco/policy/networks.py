@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -227,12 +228,25 @@ def mean_position(weights: Tensor) -> tuple[Tensor, Tensor]:
     return (weights.sum(dim=2) * x).sum(-1), (weights.sum(dim=3) * y).sum(-1)
 
 
+class FullPrecisionLinear(nn.Linear):
+    """A linear layer that computes in its weights' precision, also under mixed precision.
+
+    For outputs: bfloat16 rounds a number close to 1 to a multiple of 1/256 or 1/128.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        """From (..., in) to (..., out)."""
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.to(self.weight.dtype))
+
+
 def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:
     """Fully connected layers with ReLU between them; `dims` are the sizes from input to output."""
+    *hidden_dims, out_dim = dims
     layers: list[nn.Module] = []
-    for in_dim, out_dim in zip(dims[:-1], dims[1:], strict=True):
-        layers += [nn.Linear(in_dim, out_dim), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers[:-1])
+    for in_dim, hidden_dim in pairwise(hidden_dims):
+        layers += [nn.Linear(in_dim, hidden_dim), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers, FullPrecisionLinear(hidden_dims[-1], out_dim))
 
 
 def random_crop(images: Tensor, padding: int, generator: torch.Generator | None = None) -> Tensor:
