@@ -2,7 +2,10 @@
 
 import dataclasses
 import os
+import re
 import subprocess
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -15,8 +18,10 @@ from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.evaluation.authors import PUBLISHED
 from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
 from lerobot_deltaco.experiments import run as experiments_run
+from lerobot_deltaco.experiments import side_by_side
 from lerobot_deltaco.experiments.rows import RowError, read_row, row_names
 from lerobot_deltaco.experiments.run import Experiment, ExperimentError
+from lerobot_deltaco.experiments.side_by_side import run_side_by_side
 
 FOLDER = Path(__file__).parents[1] / "experiments"
 ROWS = row_names(FOLDER)
@@ -93,7 +98,7 @@ def test_settings_come_before_the_files():
 
 
 def test_a_run_does_not_go_on_with_other_settings(tmp_path, monkeypatch):
-    monkeypatch.setattr(experiments_run, "_do", lambda command, arguments: None)
+    monkeypatch.setattr(experiments_run, "_do", lambda *_: None)
     Experiment(read_row(FOLDER, "scenario_a/deltaco"), 0, tmp_path).do()
     other = read_row(FOLDER, "scenario_a/deltaco", ["training.steps=7"])
     with pytest.raises(ExperimentError, match="begun with other settings: training was.*'steps': 800000"):
@@ -103,7 +108,7 @@ def test_a_run_does_not_go_on_with_other_settings(tmp_path, monkeypatch):
 
 
 def test_a_row_that_starts_from_another_needs_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(experiments_run, "_do", lambda command, arguments: None)
+    monkeypatch.setattr(experiments_run, "_do", lambda *_: None)
     row = read_row(FOLDER, "scenario_a/demo_only_finetuned_10")
     with pytest.raises(ExperimentError, match="starts from scenario_a/demo_only.*Run that row first"):
         Experiment(row, 3, tmp_path).do()
@@ -111,7 +116,7 @@ def test_a_row_that_starts_from_another_needs_it(tmp_path, monkeypatch):
 
 def test_rows_share_their_data(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(experiments_run, "_do", lambda command, arguments: calls.append((command, arguments)))
+    monkeypatch.setattr(experiments_run, "_do", lambda *call: calls.append(call[:2]))
     for name in ("scenario_a/deltaco", "scenario_a/language_only"):
         Experiment(read_row(FOLDER, name), 0, tmp_path).do()
     first, second = calls[:4], calls[4:]
@@ -119,6 +124,100 @@ def test_rows_share_their_data(tmp_path, monkeypatch):
     assert first[:2] == second[:2]
     assert f"--output_dir={tmp_path}/scenario_a/deltaco/seed_0" in first[2][1]
     assert "--policy.method=language_only" in second[2][1]
+
+
+class _Steps:
+    """In the place of the commands: notes which ran, when, and where they would print to."""
+
+    def __init__(self, fails: str = "") -> None:
+        self.fails = fails
+        self.began: list[tuple[str, str]] = []  # command, and the last part of the folder it is about
+        self.places: list[object] = []
+        self.at_once = self.most_at_once = 0
+        self.lock = threading.Lock()
+
+    def __call__(self, command: str, arguments: list[str], place: object = None) -> None:
+        words = "\n".join(arguments)
+        about = re.search(r"(\w+)/seed_\d+$", words, re.M)
+        with self.lock:
+            self.began.append((command, about[1] if about else ""))
+            self.places.append(place)
+            self.at_once += 1
+            self.most_at_once = max(self.most_at_once, self.at_once)
+        time.sleep(0.05)
+        with self.lock:
+            self.at_once -= 1
+        if self.fails and about and about[1] == self.fails:
+            raise ExperimentError(f"{command} failed")
+
+
+@pytest.fixture
+def experiments(tmp_path, monkeypatch):
+    monkeypatch.setattr(side_by_side, "SECONDS_BETWEEN_LOOKS", 0.01)
+    return lambda *names, seeds=(0,): [
+        Experiment(read_row(FOLDER, f"scenario_a/{name}"), seed, tmp_path) for seed in seeds for name in names
+    ]
+
+
+def test_runs_side_by_side_are_all_done_in_their_logs_with_their_share_of_the_cores(
+    tmp_path, monkeypatch, experiments
+):
+    steps, reported = _Steps(), []
+    monkeypatch.setattr(experiments_run, "_do", steps)
+    asked = experiments("deltaco", "language_only", "one_hot", seeds=(0, 1))
+    run_side_by_side(asked, 2, reported.append)
+    commands = [command for command, _ in steps.began]
+    assert commands[:2] == ["collect", "collect"]
+    assert commands.count("collect") == 2
+    assert (commands.count("train"), commands.count("evaluate")) == (6, 6)
+    assert sorted(reported) == sorted(experiment.run for experiment in asked)
+    assert steps.most_at_once == 2
+    logs = {place.log for place in steps.places if place is not None}
+    assert logs == {experiment.log for experiment in asked}
+    assert {place.n_threads for place in steps.places if place is not None} == {
+        max(1, (os.cpu_count() or 1) // 2)
+    }
+
+
+def test_a_row_waits_for_the_one_that_it_starts_from(tmp_path, monkeypatch, experiments):
+    steps = _Steps()
+    monkeypatch.setattr(experiments_run, "_do", steps)
+    monkeypatch.setattr(Experiment, "train_and_evaluate", lambda self, _: steps("run", [str(self.run)]))
+    asked = experiments("demo_only_finetuned_10", "demo_only", "deltaco")
+    run_side_by_side(asked, 3, lambda run: None)
+    order = [about for command, about in steps.began if command == "run"]
+    assert order == ["demo_only", "deltaco", "demo_only_finetuned_10"]
+
+
+def test_after_a_failure_what_has_begun_is_completed_and_nothing_else_begins(
+    tmp_path, monkeypatch, experiments
+):
+    steps, reported = _Steps(fails="language_only"), []
+    monkeypatch.setattr(experiments_run, "_do", steps)
+    asked = experiments("deltaco", "language_only", "one_hot")
+    with pytest.raises(ExperimentError, match="train failed"):
+        run_side_by_side(asked, 2, reported.append)
+    assert asked[0].run in reported
+    assert asked[1].run not in reported
+    assert ("train", "one_hot") not in steps.began
+
+
+def test_the_last_progress_bar_of_a_log_is_found(tmp_path):
+    log = tmp_path / "log"
+    assert side_by_side.last_progress(log) == ""
+    log.write_text("Collecting: 100%|##| 4/4 [00:01<00:00, 4.0it/s]\nno bar here\n")
+    assert side_by_side.last_progress(log) == "100% 4/4 [00:01<00:00, 4.0it/s]"
+    with log.open("a", encoding="utf-8") as file:
+        file.write("x" * 5000 + "\rTraining:  70%|███   | 7/10 [00:20<00:08, 2.8step/s]INFO step:7")
+    assert side_by_side.last_progress(log) == "70% 7/10 [00:20<00:08, 2.8step/s]"
+
+
+def test_a_command_that_fails_names_its_log(tmp_path):
+    experiment = Experiment(read_row(FOLDER, "scenario_a/deltaco", ["data.tasks=none"]), 0, tmp_path)
+    experiment.log.parent.mkdir(parents=True)
+    with pytest.raises(ExperimentError, match=re.escape(str(experiment.log))):
+        experiment.train_and_evaluate(n_threads=1)
+    assert "deltaco-train" in experiment.log.read_text()
 
 
 @pytest.mark.slow

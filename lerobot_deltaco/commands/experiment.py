@@ -10,23 +10,35 @@ from lerobot_deltaco.evaluation.report import write_report
 from lerobot_deltaco.evaluation.series import ReportError
 from lerobot_deltaco.experiments.rows import RowError, read_row
 from lerobot_deltaco.experiments.run import Experiment, ExperimentError
+from lerobot_deltaco.experiments.side_by_side import run_side_by_side
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs what of the row is not done yet."""
     parser = _parser()
     options = parser.parse_args(arguments)
+    if options.jobs < 1:
+        parser.error(f"--jobs must be at least 1. Got {options.jobs}.")
     try:
         rows = [read_row(options.experiments, name, options.settings) for name in options.rows]
     except RowError as error:
         parser.error(str(error))
     try:
         experiments = [Experiment(row, seed, options.out) for seed in options.seed for row in rows]
-        for n_done, experiment in enumerate(experiments, start=1):
-            experiment.do()
+        done: list[Path] = []
+
+        def report(run: Path) -> None:
+            """After each, so that there is a report however far it comes."""
+            done.append(run)
             if options.report is not None:
-                # After each, so that there is a report however far it comes.
-                write_report([done.run for done in experiments[:n_done]], options.report)
+                write_report(done, options.report)
+
+        if options.jobs > 1:
+            run_side_by_side(experiments, options.jobs, report)
+        else:
+            for experiment in experiments:
+                experiment.do()
+                report(experiment.run)
     except (ExperimentError, ReportError, RecordError, OSError) as error:
         parser.exit(1, f"{parser.prog}: {error}\n")
     except KeyboardInterrupt:
@@ -50,6 +62,13 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         metavar="SECTION.NAME=VALUE",
         help="what differs from the rows' files, such as training.steps=2000; may be given several times",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="train and evaluate N runs at a time, which share the processor's cores (%(default)s)",
     )
     parser.add_argument(
         "--report",
