@@ -17,12 +17,15 @@ STEPS ?= 100000
 EVALUATE_EVERY ?= $(shell expr $(STEPS) / 10)
 DEVICE ?= cuda
 SETTINGS ?=
+# Trainings at a time, of scenario A at a small scale
+JOBS ?= 2
 OUT ?= outputs/scenario_a
 REPORT ?= results/scenario_a
 
 export UV_PYTHON_DOWNLOADS := never
 
-.PHONY: help install demo experiment gpu-scenario-a test test-slow lint benchmark-env benchmark-policy benchmark-train
+.PHONY: help install demo experiment gpu-scenario-a small-scenario-a test test-slow lint
+.PHONY: benchmark-env benchmark-policy benchmark-train
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 22
@@ -40,6 +43,12 @@ gpu-scenario-a: $(INSTALLED) ## Scenario A in full, on a GPU: make gpu-scenario-
 		--set training.steps=$(STEPS) --set training.env_eval_freq=$(EVALUATE_EVERY) --set policy.device=$(DEVICE) \
 		--set policy.compile=true --set policy.demos_per_task=2 $(SETTINGS) \
 		--out $(OUT) --report $(REPORT)
+
+small-scenario-a: OUT = outputs/experiments
+small-scenario-a: REPORT = results/small_a
+small-scenario-a: $(INSTALLED) ## Scenario A at a small scale, without a GPU: make small-scenario-a JOBS=2 SEED=0
+	$(BIN)/deltaco-experiment small_a/deltaco small_a/language_only small_a/one_hot small_a/demo_only small_a/oracle \
+		--seed $(SEED) --jobs $(JOBS) $(SETTINGS) --out $(OUT) --report $(REPORT)
 
 test: $(INSTALLED) ## Run the default tests: a few minutes, no network, no GPU
 	$(BIN)/python -m pytest $(ARGS)

@@ -234,12 +234,12 @@ evaluation: {tasks: "4,14", trials: 1, seed: 0}
 """
     )
     out = tmp_path / "out"
-    arguments = ["tiny/deltaco", "--experiments", str(folder.parent), "--out", str(out), "--seed", "3"]
+    arguments = ["tiny/deltaco", "--experiments", str(folder.parent), "--out", str(out), "--seed", "3", "4"]
     arguments += ["--set", "training.steps=4", "--report", str(tmp_path / "report")]
-    experiment_command.main(arguments)
-    records = sorted((out / "tiny/deltaco/seed_3/evaluations").glob("*.json"))
-    assert [path.stem for path in records] == ["0000001", "0000002", "0000003", "0000004"]
-    assert "tiny/deltaco" in (tmp_path / "report" / "report.md").read_text()
+    experiment_command.main([*arguments, "--jobs", "2"])
+    records = sorted((out / "tiny/deltaco").glob("seed_*/evaluations/*.json"))
+    assert [path.stem for path in records] == ["0000001", "0000002", "0000003", "0000004"] * 2
+    assert "| deltaco | 3, 4 |" in (tmp_path / "report" / "report.md").read_text()
     times = [path.stat().st_mtime_ns for path in records]
     experiment_command.main(arguments)
     assert [path.stat().st_mtime_ns for path in records] == times
