@@ -45,7 +45,7 @@ gpu-scenario-a: $(INSTALLED) ## Scenario A in full, on a GPU: make gpu-scenario-
 		--out $(OUT) --report $(REPORT)
 
 small-scenario-a: OUT = outputs/experiments
-small-scenario-a: REPORT = results/small_a
+small-scenario-a: REPORT = outputs/report_small_a
 small-scenario-a: $(INSTALLED) ## Scenario A at a small scale, without a GPU: make small-scenario-a JOBS=2 SEED=0
 	$(BIN)/deltaco-experiment small_a/deltaco small_a/language_only small_a/one_hot small_a/demo_only small_a/oracle \
 		--seed $(SEED) --jobs $(JOBS) $(SETTINGS) --out $(OUT) --report $(REPORT)

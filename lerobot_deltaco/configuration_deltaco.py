@@ -114,7 +114,7 @@ class DeltacoConfig(PreTrainedConfig):
             `upsampled_share` of each batch.
         upsampled_share: See above; the paper's scenario B has 0.5.
         seed: Of the draws of demonstrations and crops, which are a function of it and the step.
-        dtype: float32 or bfloat16, of the networks' arithmetic.
+        dtype: float32 or bfloat16, of the networks' arithmetic; their last layers' is float32.
         compile: Whether the networks are compiled, which pays on a GPU.
         optimizer_lr: Learning rate of Adam.
         optimizer_weight_decay: Of the weights, as in AdamW.

@@ -4,8 +4,10 @@ import dataclasses
 import os
 import re
 import subprocess
+import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -17,10 +19,10 @@ from lerobot_deltaco.commands import experiment as experiment_command
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.evaluation.authors import PUBLISHED
 from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
-from lerobot_deltaco.experiments import run as experiments_run
-from lerobot_deltaco.experiments import side_by_side
+from lerobot_deltaco.experiments import command_runner, side_by_side
+from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
 from lerobot_deltaco.experiments.rows import RowError, read_row, row_names
-from lerobot_deltaco.experiments.run import Experiment, ExperimentError
+from lerobot_deltaco.experiments.run import Experiment
 from lerobot_deltaco.experiments.side_by_side import run_side_by_side
 
 FOLDER = Path(__file__).parents[1] / "experiments"
@@ -98,7 +100,7 @@ def test_settings_come_before_the_files():
 
 
 def test_a_run_does_not_go_on_with_other_settings(tmp_path, monkeypatch):
-    monkeypatch.setattr(experiments_run, "_do", lambda *_: None)
+    monkeypatch.setattr(CommandRunner, "run", lambda *_: None)
     Experiment(read_row(FOLDER, "scenario_a/deltaco"), 0, tmp_path).do()
     other = read_row(FOLDER, "scenario_a/deltaco", ["training.steps=7"])
     with pytest.raises(ExperimentError, match="begun with other settings: training was.*'steps': 800000"):
@@ -108,7 +110,7 @@ def test_a_run_does_not_go_on_with_other_settings(tmp_path, monkeypatch):
 
 
 def test_a_row_that_starts_from_another_needs_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(experiments_run, "_do", lambda *_: None)
+    monkeypatch.setattr(CommandRunner, "run", lambda *_: None)
     row = read_row(FOLDER, "scenario_a/demo_only_finetuned_10")
     with pytest.raises(ExperimentError, match="starts from scenario_a/demo_only.*Run that row first"):
         Experiment(row, 3, tmp_path).do()
@@ -116,7 +118,7 @@ def test_a_row_that_starts_from_another_needs_it(tmp_path, monkeypatch):
 
 def test_rows_share_their_data(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(experiments_run, "_do", lambda *call: calls.append(call[:2]))
+    monkeypatch.setattr(CommandRunner, "run", lambda _, *call: calls.append(call))
     for name in ("scenario_a/deltaco", "scenario_a/language_only"):
         Experiment(read_row(FOLDER, name), 0, tmp_path).do()
     first, second = calls[:4], calls[4:]
@@ -126,98 +128,214 @@ def test_rows_share_their_data(tmp_path, monkeypatch):
     assert "--policy.method=language_only" in second[2][1]
 
 
-class _Steps:
-    """In the place of the commands: notes which ran, when, and where they would print to."""
+# Several at a time
 
-    def __init__(self, fails: str = "") -> None:
-        self.fails = fails
-        self.began: list[tuple[str, str]] = []  # command, and the last part of the folder it is about
-        self.places: list[object] = []
+
+class _Commands:
+    """In the place of the commands: notes which began and ended, and how many there were at once."""
+
+    def __init__(self, fails: str = "", until: threading.Event | None = None) -> None:
+        self.fails = fails  # the row whose commands fail; the others' go on ...
+        self.until = until  # ... until then
+        self.events: list[tuple[str, str, str]] = []  # began or ended, command, row
+        self.runners: dict[str, CommandRunner] = {}  # of each row
         self.at_once = self.most_at_once = 0
         self.lock = threading.Lock()
 
-    def __call__(self, command: str, arguments: list[str], place: object = None) -> None:
-        words = "\n".join(arguments)
-        about = re.search(r"(\w+)/seed_\d+$", words, re.M)
+    def run(self, runner: CommandRunner, command: str, arguments: list[str]) -> None:
+        about = re.search(r"(\w+)/seed_\d+$", "\n".join(arguments), re.M)
+        row = about[1] if about else ""
         with self.lock:
-            self.began.append((command, about[1] if about else ""))
-            self.places.append(place)
+            self.events.append(("began", command, row))
+            self.runners[row] = runner
             self.at_once += 1
             self.most_at_once = max(self.most_at_once, self.at_once)
-        time.sleep(0.05)
+        if row and row == self.fails:
+            raise ExperimentError(f"{command} failed")
+        if row and self.until is not None:
+            assert self.until.wait(60)
+        else:
+            time.sleep(0.05)
         with self.lock:
             self.at_once -= 1
-        if self.fails and about and about[1] == self.fails:
-            raise ExperimentError(f"{command} failed")
+            self.events.append(("ended", command, row))
+
+    def began(self, command: str) -> list[str]:
+        return [row for what, name, row in self.events if (what, name) == ("began", command)]
 
 
 @pytest.fixture
-def experiments(tmp_path, monkeypatch):
+def asked(tmp_path, monkeypatch):
+    """Experiments whose commands are in the hands of a test."""
     monkeypatch.setattr(side_by_side, "SECONDS_BETWEEN_LOOKS", 0.01)
-    return lambda *names, seeds=(0,): [
-        Experiment(read_row(FOLDER, f"scenario_a/{name}"), seed, tmp_path) for seed in seeds for name in names
-    ]
+
+    def asked(commands, *names, seeds=(0,)):
+        monkeypatch.setattr(CommandRunner, "run", lambda self, *call: commands.run(self, *call))
+        rows = [read_row(FOLDER, f"scenario_a/{name}") for name in names]
+        return [Experiment(row, seed, tmp_path) for seed in seeds for row in rows]
+
+    return asked
 
 
-def test_runs_side_by_side_are_all_done_in_their_logs_with_their_share_of_the_cores(
-    tmp_path, monkeypatch, experiments
-):
-    steps, reported = _Steps(), []
-    monkeypatch.setattr(experiments_run, "_do", steps)
-    asked = experiments("deltaco", "language_only", "one_hot", seeds=(0, 1))
-    run_side_by_side(asked, 2, reported.append)
-    commands = [command for command, _ in steps.began]
-    assert commands[:2] == ["collect", "collect"]
-    assert commands.count("collect") == 2
-    assert (commands.count("train"), commands.count("evaluate")) == (6, 6)
-    assert sorted(reported) == sorted(experiment.run for experiment in asked)
-    assert steps.most_at_once == 2
-    logs = {place.log for place in steps.places if place is not None}
-    assert logs == {experiment.log for experiment in asked}
-    assert {place.n_threads for place in steps.places if place is not None} == {
-        max(1, (os.cpu_count() or 1) // 2)
-    }
+def test_runs_side_by_side_are_all_done_in_their_logs_with_their_share_of_the_cores(asked):
+    commands, reported = _Commands(), []
+    experiments = asked(commands, "deltaco", "language_only", "one_hot", seeds=(0, 1))
+    run_side_by_side(experiments, 2, reported.append)
+    assert [event[:2] for event in commands.events[:4]] == [("began", "collect"), ("ended", "collect")] * 2
+    assert len(commands.began("collect")) == 2  # all share their data
+    assert len(commands.began("train")) == len(commands.began("evaluate")) == 6
+    assert sorted(reported) == sorted(experiment.run for experiment in experiments)
+    assert commands.most_at_once == 2
+    for row in ("deltaco", "language_only", "one_hot"):
+        assert commands.runners[row].log.parent.name == row
+        assert commands.runners[row].n_threads == max(1, side_by_side.available_cores() // 2)
 
 
-def test_a_row_waits_for_the_one_that_it_starts_from(tmp_path, monkeypatch, experiments):
-    steps = _Steps()
-    monkeypatch.setattr(experiments_run, "_do", steps)
-    monkeypatch.setattr(Experiment, "train_and_evaluate", lambda self, _: steps("run", [str(self.run)]))
-    asked = experiments("demo_only_finetuned_10", "demo_only", "deltaco")
-    run_side_by_side(asked, 3, lambda run: None)
-    order = [about for command, about in steps.began if command == "run"]
-    assert order == ["demo_only", "deltaco", "demo_only_finetuned_10"]
+def test_fewer_runs_than_jobs_take_all_cores(asked):
+    commands = _Commands()
+    run_side_by_side(asked(commands, "deltaco"), 100, lambda run: None)
+    assert commands.runners["deltaco"].n_threads == side_by_side.available_cores()
 
 
-def test_after_a_failure_what_has_begun_is_completed_and_nothing_else_begins(
-    tmp_path, monkeypatch, experiments
-):
-    steps, reported = _Steps(fails="language_only"), []
-    monkeypatch.setattr(experiments_run, "_do", steps)
-    asked = experiments("deltaco", "language_only", "one_hot")
+def test_a_row_waits_for_the_one_that_it_starts_from(asked, monkeypatch):
+    commands = _Commands()
+    experiments = asked(commands, "demo_only_finetuned_10", "demo_only", "deltaco")
+    monkeypatch.setattr(
+        Experiment,
+        "train_and_evaluate",
+        lambda self, runner: commands.run(runner, "train", [f"--output_dir={self.run}"]),
+    )
+    run_side_by_side(experiments, 3, lambda run: None)
+    began = commands.events.index(("began", "train", "demo_only_finetuned_10"))
+    assert commands.events.index(("ended", "train", "demo_only")) < began
+
+
+def test_after_a_failure_what_has_begun_is_completed_and_nothing_else_begins(asked, monkeypatch):
+    said = threading.Event()
+    commands, reported = _Commands("language_only", until=said), []
+    experiments = asked(commands, "deltaco", "language_only", "one_hot")
+
+    def write(text):
+        if "language_only 0: train failed" in text:
+            said.set()
+
+    monkeypatch.setattr(side_by_side._Progress, "write", staticmethod(write))
     with pytest.raises(ExperimentError, match="train failed"):
-        run_side_by_side(asked, 2, reported.append)
-    assert asked[0].run in reported
-    assert asked[1].run not in reported
-    assert ("train", "one_hot") not in steps.began
+        run_side_by_side(experiments, 2, reported.append)
+    assert reported == [experiments[0].run]
+    assert sorted(commands.began("train")) == ["deltaco", "language_only"]
+    # What never began may be asked for with other settings.
+    other = read_row(FOLDER, "scenario_a/one_hot", ["training.steps=7"])
+    Experiment(other, 0, experiments[0].outputs).check_settings()
+
+
+def test_a_report_that_fails_does_not_take_the_other_runs_along(asked):
+    commands = _Commands()
+
+    def report(run):
+        raise OSError("no space")
+
+    with pytest.raises(OSError, match="no space"):
+        run_side_by_side(asked(commands, "deltaco", "language_only"), 2, report)
+    assert sorted(commands.began("evaluate")) == ["deltaco", "language_only"]
+
+
+def test_an_interrupt_stops_what_runs(asked, monkeypatch):
+    stopped = threading.Event()
+    commands = _Commands(until=stopped)
+    experiments = asked(commands, "deltaco", "language_only")
+    monkeypatch.setattr(CommandRunner, "stop", lambda self: stopped.set())
+
+    def show(self, running):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(side_by_side._Progress, "show", show)
+    with pytest.raises(KeyboardInterrupt):
+        run_side_by_side(experiments, 2, lambda run: None)
+    assert stopped.is_set()
+
+
+def test_a_row_that_is_named_twice_is_run_once(asked, tmp_path):
+    commands = _Commands()
+    asked(commands)
+    experiment_command.main(
+        ["scenario_a/deltaco"] * 2
+        + ["--seed", "0", "0", "--jobs", "2", "--experiments", str(FOLDER), "--out", str(tmp_path)]
+    )
+    assert commands.began("train") == ["deltaco"]
+
+
+@pytest.mark.parametrize("jobs", ["0", "-1"])
+def test_there_is_at_least_one_job(jobs, capsys):
+    with pytest.raises(SystemExit):
+        experiment_command.main(["scenario_a/deltaco", "--jobs", jobs])
+    assert "--jobs must be at least 1" in capsys.readouterr().err
 
 
 def test_the_last_progress_bar_of_a_log_is_found(tmp_path):
     log = tmp_path / "log"
     assert side_by_side.last_progress(log) == ""
     log.write_text("Collecting: 100%|##| 4/4 [00:01<00:00, 4.0it/s]\nno bar here\n")
-    assert side_by_side.last_progress(log) == "100% 4/4 [00:01<00:00, 4.0it/s]"
+    assert side_by_side.last_progress(log) == "100%, 00:00 left"
     with log.open("a", encoding="utf-8") as file:
-        file.write("x" * 5000 + "\rTraining:  70%|███   | 7/10 [00:20<00:08, 2.8step/s]INFO step:7")
-    assert side_by_side.last_progress(log) == "70% 7/10 [00:20<00:08, 2.8step/s]"
+        file.write("x" * 5000 + "\rTraining:  70%|███   | 7/10 [00:20<1:00:08, 2.8step/s]INFO step:7")
+    assert side_by_side.last_progress(log) == "70%, 1:00:08 left"
+    log.write_text("Training:   0%|   | 0/10 [00:00<?, ?step/s]")
+    assert side_by_side.last_progress(log) == "0%, ? left"
 
 
-def test_a_command_that_fails_names_its_log(tmp_path):
-    experiment = Experiment(read_row(FOLDER, "scenario_a/deltaco", ["data.tasks=none"]), 0, tmp_path)
-    experiment.log.parent.mkdir(parents=True)
-    with pytest.raises(ExperimentError, match=re.escape(str(experiment.log))):
-        experiment.train_and_evaluate(n_threads=1)
-    assert "deltaco-train" in experiment.log.read_text()
+# Commands
+
+
+def test_a_command_prints_to_its_log_with_its_share_of_the_cores(tmp_path, monkeypatch):
+    started = {}
+
+    class Process:
+        def __init__(self, words, **options):
+            started.update(options, words=words)
+            options["stdout"].write("what it says\n")
+
+        def wait(self):
+            return 0
+
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    log = tmp_path / "log"
+    log.write_text("of before\n")
+    CommandRunner(log, n_threads=3).run("train", ["--steps=5"])
+    assert log.read_text() == "of before\n\ndeltaco-train --steps=5\nwhat it says\n"
+    assert started["words"][-2:] == ["lerobot_deltaco.commands.train", "--steps=5"]
+    assert started["stderr"] == subprocess.STDOUT
+    assert started["env"]["OMP_NUM_THREADS"] == "3"
+
+
+def test_a_command_that_fails_names_its_log_which_says_why(tmp_path):
+    log = tmp_path / "log"
+    with pytest.raises(ExperimentError, match=re.escape(f"exit status 2); see {log}")):
+        CommandRunner(log).run("embed", ["--no-such-option"])
+    assert "usage: deltaco-embed" in log.read_text()
+
+
+def test_a_command_can_be_stopped_and_no_other_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr(command_runner, "SECONDS_TO_END", 0.2)
+    monkeypatch.setattr(sys, "executable", _sleeper(tmp_path))
+    runner = CommandRunner(tmp_path / "log")
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(runner.run, "train", [])
+        while "asleep" not in ((tmp_path / "log").read_text() if (tmp_path / "log").exists() else ""):
+            time.sleep(0.01)
+        runner.stop()
+        with pytest.raises(ExperimentError, match="train failed"):
+            running.result(timeout=60)
+    with pytest.raises(ExperimentError, match="evaluate was not begun"):
+        runner.run("evaluate", [])
+
+
+def _sleeper(folder):
+    """A program that sleeps until it is killed: an interrupt does not wake it."""
+    program = folder / "sleeper"
+    program.write_text("#!/bin/sh\ntrap '' INT\necho asleep\nexec sleep 600\n")
+    program.chmod(0o755)
+    return str(program)
 
 
 @pytest.mark.slow

@@ -8,8 +8,9 @@ from pathlib import Path
 from lerobot_deltaco.evaluation.record import RecordError
 from lerobot_deltaco.evaluation.report import write_report
 from lerobot_deltaco.evaluation.series import ReportError
+from lerobot_deltaco.experiments.command_runner import ExperimentError
 from lerobot_deltaco.experiments.rows import RowError, read_row
-from lerobot_deltaco.experiments.run import Experiment, ExperimentError
+from lerobot_deltaco.experiments.run import Experiment
 from lerobot_deltaco.experiments.side_by_side import run_side_by_side
 
 
@@ -20,11 +21,14 @@ def main(arguments: list[str] | None = None) -> None:
     if options.jobs < 1:
         parser.error(f"--jobs must be at least 1. Got {options.jobs}.")
     try:
-        rows = [read_row(options.experiments, name, options.settings) for name in options.rows]
+        names = dict.fromkeys(options.rows)
+        rows = [read_row(options.experiments, name, options.settings) for name in names]
     except RowError as error:
         parser.error(str(error))
     try:
-        experiments = [Experiment(row, seed, options.out) for seed in options.seed for row in rows]
+        experiments = [
+            Experiment(row, seed, options.out) for seed in dict.fromkeys(options.seed) for row in rows
+        ]
         done: list[Path] = []
 
         def report(run: Path) -> None:
@@ -68,7 +72,8 @@ def _parser() -> argparse.ArgumentParser:
         type=int,
         default=1,
         metavar="N",
-        help="train and evaluate N runs at a time, which share the processor's cores (%(default)s)",
+        help="train and evaluate N runs at a time (%(default)s). Each has its share of the processor's cores "
+        "and its own copy of the frames in memory; those on a GPU are all on the same.",
     )
     parser.add_argument(
         "--report",

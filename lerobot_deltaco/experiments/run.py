@@ -3,30 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import shlex
 import shutil
-import subprocess
-import sys
 from collections.abc import Mapping
-from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
 from lerobot_deltaco.experiments.rows import Row
 
 LAST = Path("checkpoints", "last", "pretrained_model")
-
-
-class ExperimentError(RuntimeError):
-    """A step of an experiment failed; the message says which."""
-
-
-class _Place(NamedTuple):
-    """Where a command prints to, and how much of the processor it takes."""
-
-    log: Path | None = None  # this terminal
-    n_threads: int | None = None  # as many as there are cores
 
 
 class Experiment:
@@ -43,7 +28,7 @@ class Experiment:
         self.seed = seed
         self.outputs = outputs
         self.run = run_folder(outputs, row.name, seed)
-        self.log = self.run.with_name(f"{self.run.name}.log")  # where it is told to write to one
+        self.log = self.run.with_name(f"{self.run.name}.log")  # where several run at a time
 
     def do(self) -> None:
         """Everything that is not done yet.
@@ -53,22 +38,15 @@ class Experiment:
         """
         self.check_settings()
         self.collect()
-        self.train_and_evaluate()
+        self.train_and_evaluate(CommandRunner())
 
     def check_settings(self) -> None:
-        """Keeps the settings beside the run, and refuses others for it.
+        """Checks that the run, if there is one, was begun with the same settings.
 
         Raises:
-            ExperimentError: The run was begun with other settings.
+            ExperimentError: It was begun with others.
         """
-        file = self.run.with_name(f"{self.run.name}.json")
-        settings = {
-            "data": dict(self.row.data),
-            "demonstrations": dict(self.row.demonstrations),
-            "policy": dict(self.row.policy),
-            "training": dict(self.row.training),
-            "start_from": self.row.start_from,
-        }
+        file, settings = self._settings_file(), self._settings()
         there = json.loads(file.read_text()) if file.exists() else settings
         for section, values in settings.items():
             if there[section] != values:
@@ -76,34 +54,45 @@ class Experiment:
                     f"{self.run} was begun with other settings: {section} was {there[section]}, and now is "
                     f"{values}. Ask for the same, name another --out, or move the run and {file.name} away."
                 )
-        file.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = file.with_suffix(".unfinished")
-        unfinished.write_text(json.dumps(settings, indent=2) + "\n")
-        unfinished.replace(file)
 
     def collect(self) -> None:
         """Collects the datasets that the row needs and that are not there."""
         for plan in (self.row.data, self.row.demonstrations):
             options = [f"--{key.replace('_', '-')}={value}" for key, value in plan.items()]
-            _do("collect", [*options, f"--root={dataset_folder(self.outputs, plan)}"])
+            CommandRunner().run("collect", [*options, f"--root={dataset_folder(self.outputs, plan)}"])
 
-    def train_and_evaluate(self, n_threads: int | None = None) -> None:
-        """Trains on the datasets that were collected, and evaluates.
+    def train_and_evaluate(self, commands: CommandRunner) -> None:
+        """Trains on the datasets that were collected, and evaluates."""
+        self._keep_settings()
+        self._train(commands)
+        self._evaluate(commands)
 
-        Args:
-            n_threads: To leave processor cores to others. If given, what it prints goes to the file `log`.
-        """
-        place = _Place() if n_threads is None else _Place(self.log, n_threads)
-        self._train(place)
-        self._evaluate(place)
+    def _settings_file(self) -> Path:
+        return self.run.with_name(f"{self.run.name}.json")
 
-    def _train(self, place: _Place) -> None:
+    def _settings(self) -> dict[str, Any]:
+        return {
+            "data": dict(self.row.data),
+            "demonstrations": dict(self.row.demonstrations),
+            "policy": dict(self.row.policy),
+            "training": dict(self.row.training),
+            "start_from": self.row.start_from,
+        }
+
+    def _keep_settings(self) -> None:
+        file = self._settings_file()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = file.with_suffix(".unfinished")
+        unfinished.write_text(json.dumps(self._settings(), indent=2) + "\n")
+        unfinished.replace(file)
+
+    def _train(self, commands: CommandRunner) -> None:
         """Trains, from the last checkpoint if there is one."""
         last = self.run / LAST / "train_config.json"
         if last.exists():
             if _steps_done(self.run) >= self.row.training["steps"]:
                 return
-            _do("train", [f"--config_path={last}", "--resume=true"], place)
+            commands.run("train", [f"--config_path={last}", "--resume=true"])
             return
         # What an interrupted training left before its first checkpoint.
         shutil.rmtree(self.run, ignore_errors=True)
@@ -136,12 +125,12 @@ class Experiment:
                     f"{self.seed}. Run that row first."
                 )
             options = {"policy.path": start / LAST, **options}
-        _do("train", [f"--{name}={_text(value)}" for name, value in options.items()], place)
+        commands.run("train", [f"--{name}={_text(value)}" for name, value in options.items()])
 
-    def _evaluate(self, place: _Place) -> None:
+    def _evaluate(self, commands: CommandRunner) -> None:
         """Evaluates the checkpoints that were not evaluated in training."""
         options = [f"--{name}={value}" for name, value in self.row.evaluation.items()]
-        _do("evaluate", [str(self.run), *options, f"--experiment={self.row.name}"], place)
+        commands.run("evaluate", [str(self.run), *options, f"--experiment={self.row.name}"])
 
 
 def run_folder(outputs: Path, row_name: str, seed: int) -> Path:
@@ -161,20 +150,3 @@ def _steps_done(run: Path) -> int:
 
 def _text(value: Any) -> str:
     return json.dumps(value) if isinstance(value, bool | list) else str(value)
-
-
-def _do(command: str, arguments: list[str], place: _Place | None = None) -> None:
-    """Runs one of this project's commands, with this Python."""
-    words = [sys.executable, "-m", f"lerobot_deltaco.commands.{command}", *arguments]
-    log, n_threads = place or _Place()
-    environment = os.environ | ({"OMP_NUM_THREADS": str(n_threads)} if n_threads else {})
-    with log.open("a", encoding="utf-8") if log else nullcontext(sys.stdout) as output:
-        output.write(f"\ndeltaco-{command} {shlex.join(arguments)}\n")
-        output.flush()
-        streams = {"stdout": output, "stderr": subprocess.STDOUT} if log else {}
-        code = subprocess.run(words, check=False, env=environment, **streams).returncode
-    if code != 0:
-        raise ExperimentError(
-            f"deltaco-{command} failed (exit status {code}); see {log or 'above'} for why. The same command "
-            "goes on from here."
-        )

@@ -8,18 +8,28 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+import sys
+import time
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import NamedTuple
 
 from tqdm import tqdm
 
+from lerobot_deltaco.experiments.command_runner import CommandRunner
 from lerobot_deltaco.experiments.run import Experiment, run_folder
 
 SECONDS_BETWEEN_LOOKS = 1.0
+SECONDS_BETWEEN_LINES = 60.0  # where what is printed goes to a file
 _LAST_CHARACTERS = 2000
-# A progress bar of tqdm, without the bar itself.
-_PROGRESS = re.compile(r"(\d+)%\|[^|]*\| *([^\]\r\n]*\])")
+# A progress bar of tqdm: the percentage and the time that is left.
+_PROGRESS = re.compile(r"(\d+)%\|[^|]*\|[^\]\r\n]*<([\d:?]+)[^\]\r\n]*\]")
+
+
+class _Running(NamedTuple):
+    experiment: Experiment
+    commands: CommandRunner
 
 
 def run_side_by_side(experiments: Sequence[Experiment], jobs: int, report: Callable[[Path], None]) -> None:
@@ -28,8 +38,8 @@ def run_side_by_side(experiments: Sequence[Experiment], jobs: int, report: Calla
     Each run prints to its log. A row that starts from another of these waits for it.
 
     Args:
-        experiments: What to run.
-        jobs: How many at a time; they share the processor's cores evenly.
+        experiments: What to run; each is another run.
+        jobs: How many at a time. Each takes the same share of the processor's cores, also when some are done.
         report: Called with the folder of each run that is complete.
 
     Raises:
@@ -44,42 +54,77 @@ def run_side_by_side(experiments: Sequence[Experiment], jobs: int, report: Calla
             experiment.collect()
             collected.append(plans)
 
-    n_threads = max(1, (os.cpu_count() or 1) // jobs)
+    jobs = min(jobs, len(experiments))
+    n_threads = max(1, available_cores() // jobs)
     waiting = list(experiments)
-    running: dict[Future[None], Experiment] = {}
-    failure: BaseException | None = None
-    with ThreadPoolExecutor(jobs) as pool, tqdm(total=len(experiments), desc="Runs", unit="run") as progress:
-        while running or (waiting and failure is None):
-            while failure is None and len(running) < jobs and (ready := _next(waiting, running)):
-                waiting.remove(ready)
-                running[pool.submit(ready.train_and_evaluate, n_threads)] = ready
-                tqdm.write(f"{_label(ready)}: see {ready.log}")
-            done, _ = wait(running, SECONDS_BETWEEN_LOOKS, FIRST_COMPLETED)
-            for future in done:
-                experiment = running.pop(future)
-                failure = failure or future.exception()
-                if future.exception() is None:
-                    progress.update()
-                    report(experiment.run)
-            states = [f"{_label(now)} {last_progress(now.log)}" for now in running.values()]
-            progress.set_postfix_str("; ".join(states))
+    running: dict[Future[None], _Running] = {}
+    failure: Exception | None = None
+    with ThreadPoolExecutor(jobs) as pool, _Progress(len(experiments)) as progress:
+        try:
+            while running or (waiting and failure is None):
+                while failure is None and len(running) < jobs and (ready := _next(waiting, running.values())):
+                    waiting.remove(ready)
+                    commands = CommandRunner(ready.log, n_threads)
+                    future = pool.submit(ready.train_and_evaluate, commands)
+                    running[future] = _Running(ready, commands)
+                    progress.write(f"{_label(ready)} prints to {ready.log}")
+                done, _ = wait(running, SECONDS_BETWEEN_LOOKS, FIRST_COMPLETED)
+                for future in done:
+                    experiment = running.pop(future).experiment
+                    try:
+                        future.result()
+                        progress.update()
+                        report(experiment.run)
+                    except Exception as error:
+                        progress.write(f"{_label(experiment)}: {error}")
+                        failure = failure or error
+                progress.show([now.experiment for now in running.values()])
+        except BaseException:
+            for now in running.values():
+                now.commands.stop()
+            raise
     if failure is not None:
         raise failure
 
 
+def available_cores() -> int:
+    """How many of the processor's cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def last_progress(log: Path) -> str:
-    """The last progress bar in a file, such as "70% 7/10 [00:20<00:08, 2.8step/s]", or nothing."""
+    """What the last progress bar in a file says, such as "70%, 00:08 left", or nothing."""
     if not log.exists():
         return ""
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - _LAST_CHARACTERS))
         found = _PROGRESS.findall(file.read().decode(errors="replace"))
-    return f"{found[-1][0]}% {found[-1][1]}" if found else ""
+    return "{}%, {} left".format(*found[-1]) if found else ""
 
 
-def _next(waiting: Sequence[Experiment], running: dict[Future[None], Experiment]) -> Experiment | None:
+class _Progress(tqdm):
+    """How many runs are done, and how far the others have come."""
+
+    def __init__(self, n_runs: int) -> None:
+        form = "Runs: {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
+        super().__init__(total=n_runs, bar_format=form, dynamic_ncols=True)
+        self._shown_at = -SECONDS_BETWEEN_LINES
+
+    def show(self, running: Sequence[Experiment]) -> None:
+        """Says how far those that run have come."""
+        states = (f"{_label(experiment)} {last_progress(experiment.log)}" for experiment in running)
+        self.set_postfix_str("; ".join(states), refresh=False)
+        seconds = 0.0 if sys.stderr.isatty() else SECONDS_BETWEEN_LINES
+        if time.monotonic() >= self._shown_at + seconds:
+            self._shown_at = time.monotonic()
+            self.refresh()
+
+
+def _next(waiting: Sequence[Experiment], running: Collection[_Running]) -> Experiment | None:
     """The first that does not start from one that is still to be completed."""
-    incomplete = {experiment.run for experiment in (*waiting, *running.values())}
+    incomplete = {experiment.run for experiment in (*waiting, *(now.experiment for now in running))}
     for experiment in waiting:
         start = experiment.row.start_from
         if start is None or run_folder(experiment.outputs, start, experiment.seed) not in incomplete:

@@ -241,7 +241,10 @@ class FullPrecisionLinear(nn.Linear):
 
 
 def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:
-    """Fully connected layers with ReLU between them; `dims` are the sizes from input to output."""
+    """Fully connected layers with ReLU between them; `dims` are the sizes from input to output.
+
+    The last computes in full precision.
+    """
     *hidden_dims, out_dim = dims
     layers: list[nn.Module] = []
     for in_dim, hidden_dim in pairwise(hidden_dims):
