@@ -98,6 +98,12 @@ class DeltacoConfig(PreTrainedConfig):
         crop_padding: Pixels by which observations are shifted at random in training, 0 for none.
         demo_crop_padding: The same for demonstrations. Without it, the encoder soon knows those of a small
             dataset by heart, and misreads new ones.
+        color_shuffle: Share of the training samples that see red, green and blue exchanged, in their
+            observation and their demonstration alike, and are told nothing by their instruction, which may
+            name colors. It makes five further objects of each, to learn to find by a demonstration.
+        demo_dropout: Share of the training samples that are told nothing by their demonstration, and so learn
+            to follow the instruction where demonstrations would do most of the time.
+        language_dropout: Share of those that are told nothing by their instruction.
         demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at
             least 2, so that none is shown its own episode; 0 for one drawn anew for every sample. Sharing
             saves most of the demonstration encoder's time.
@@ -142,6 +148,9 @@ class DeltacoConfig(PreTrainedConfig):
     temperature: float = 0.1
     crop_padding: int = 4
     demo_crop_padding: int = 4
+    color_shuffle: float = 0.0
+    demo_dropout: float = 0.0
+    language_dropout: float = 0.0
     demos_per_task: int = 0
     demo_repo_id: str | None = None
     demo_root: str | None = None
@@ -222,6 +231,7 @@ class DeltacoConfig(PreTrainedConfig):
             )
         self._check_upsampling()
         self._check_conditioning()
+        self._check_augmentation()
 
     def _check_upsampling(self) -> None:
         if self.upsampled_tasks is None:
@@ -238,6 +248,31 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 "`upsampled_tasks` get a share of the tasks of a batch: `tasks_per_batch` must be at least "
                 f"2. Got {self.tasks_per_batch}."
+            )
+
+    def _check_augmentation(self) -> None:
+        for name in ("color_shuffle", "demo_dropout", "language_dropout"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(
+                    f"`{name}` is a share of the samples, from 0 to less than 1. Got {getattr(self, name)}."
+                )
+        inputs = "+".join(self.conditioning[:2]).split("+")
+        told_both = "demo" in inputs and "language" in inputs
+        if self.color_shuffle and "demo" not in inputs:
+            raise ValueError(
+                "`color_shuffle` leaves a sample nothing but its demonstration, which must be an input, in "
+                f"`film` or `concat`. The method {self.method!r} has {', '.join(self.conditioning[:2])}."
+            )
+        dropouts = [name for name in ("demo_dropout", "language_dropout") if getattr(self, name)]
+        if dropouts and not told_both:
+            raise ValueError(
+                f"`{dropouts[0]}` needs both a demonstration and an instruction as inputs, in `film` or "
+                f"`concat`. The method {self.method!r} has {', '.join(self.conditioning[:2])}."
+            )
+        if not self.demo_dropout + self.language_dropout <= 1:
+            raise ValueError(
+                "`demo_dropout` and `language_dropout` must not come to more than 1: each sample keeps one "
+                f"of both. Got {self.demo_dropout} and {self.language_dropout}."
             )
 
     def _check_choice(self, name: str, valid: Collection[str]) -> None:

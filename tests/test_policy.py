@@ -23,6 +23,7 @@ from small_policies import (
 from lerobot_deltaco.commands import embed as embed_command
 from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.augmentation import COLOR_ORDERS
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.language import LanguageEncoderError
 from lerobot_deltaco.policy.training_episodes import training_episodes
@@ -93,6 +94,13 @@ def test_the_defaults_are_the_papers():
         ({"film": "none", "concat": "none"}, "would not know its task"),
         ({"method": "language_only", "encoder_loss": "contrastive"}, "no demonstration is used"),
         ({"method": "mcil", "film": "demo"}, "`film` cannot be changed"),
+        ({"color_shuffle": 1.0}, "`color_shuffle` is a share of the samples, from 0 to less than 1"),
+        ({"demo_dropout": -0.1}, "`demo_dropout` is a share"),
+        ({"demo_dropout": 0.6, "language_dropout": 0.5}, "must not come to more than 1"),
+        ({"method": "language_only", "color_shuffle": 0.2}, "nothing but its demonstration"),
+        ({"method": "one_hot", "color_shuffle": 0.2}, "has one_hot, none"),
+        ({"method": "demo_only", "language_dropout": 0.2}, "needs both a demonstration and an instruction"),
+        ({"method": "mcil", "demo_dropout": 0.2}, "`demo_dropout` needs both"),
     ],
 )
 def test_impossible_configurations_say_what_is_valid(options, message):
@@ -128,6 +136,9 @@ def test_a_gripper_that_is_not_there_is_refused(make):
         {"demo_encoder": "attention"},
         {"demo_encoder": "attention", "demo_rows": 2},
         {"motion_modes": 3},
+        {"demo_dropout": 0.3, "language_dropout": 0.3, "color_shuffle": 0.3},
+        {"method": "demo_only", "color_shuffle": 0.5, "demos_per_task": 2},
+        {"method": "bc_z", "color_shuffle": 0.5},
         {"gripper": "none"},
         {"language_encoder": "all-distilroberta-v1"},
     ],
@@ -214,13 +225,68 @@ def test_shared_demonstrations_are_encoded_once(make, dataset, monkeypatch):
     policy, before, _ = make(demos_per_task=2)
     encoded = []
     monkeypatch.setattr(
-        policy, "_encode_demo", lambda shown, rows, _: encoded.append(rows) or torch.zeros(len(rows), 384)
+        policy, "_encode_demo", lambda shown, rows, *_: encoded.append(rows) or torch.zeros(len(rows), 384)
     )
     policy(before(batch_of(dataset, [0, 1, 2, 3, 5, 6, 7, 15, 16, 20])))
     assert len(encoded[0]) == 4
     policy.eval()
     policy(before(batch_of(dataset, [0, 1, 2])))
     assert len(encoded[1]) == 3
+
+
+@pytest.mark.parametrize("demos_per_task", [0, 2])
+def test_other_colors_are_seen_and_shown_alike_and_not_spoken_of(make, dataset, monkeypatch, demos_per_task):
+    policy, before, _ = make(
+        concat="demo+language",
+        color_shuffle=0.7,
+        demo_dropout=0.5,
+        language_dropout=0.5,
+        crop_padding=0,
+        demo_crop_padding=0,
+        demos_per_task=demos_per_task,
+        encoder_loss_weight=1e4,
+    )
+    batch = before(batch_of(dataset, [0, 6, 11, 15, 20] * 8))
+    policy(batch)
+    whole = torch.randint(256, policy.trained_on.frames.shape, dtype=torch.uint8)
+    policy.trained_on.frames = whole
+    acted = recorded(monkeypatch, policy.policy)
+    shown = recorded(monkeypatch, policy.demo_encoder)
+    losses, _ = policy(batch, reduction="none")
+    ((images, film, concat), _), ((frames,), embeddings) = acted[0], shown[0]
+    usual = (images == policy._images(batch)).flatten(1).all(dim=1)
+    assert 0 < usual.sum() < 40
+    demo, language = concat[:, :384], concat[:, 384:768]
+    assert torch.equal(film, demo)
+    told_demo, told_language = (part.abs().sum(dim=1) > 0 for part in (demo, language))
+    assert not told_language[~usual].any()  # since an instruction may name colors
+    assert told_demo[~usual].all()
+    assert (told_demo ^ told_language)[usual].all()
+    assert losses[~usual].max() < 1e3 < losses[usual].min()  # without and with the encoder's
+    orders = set()
+    for sample in told_demo.nonzero().flatten().tolist():
+        picture = policy._images(batch)[sample]
+        (order,) = (o for o in COLOR_ORDERS.tolist() if torch.equal(picture[1, o], images[sample, 1]))
+        (row,) = (embeddings == demo[sample]).all(dim=1).nonzero()[0]
+        assert (whole[:, :, order].float() / 255 == frames[row]).flatten(1).all(dim=1).any()
+        orders.add(tuple(order))
+    assert len(orders) > 2
+    policy.eval()
+    policy(batch)
+    assert torch.equal(acted[1][0][0], policy._images(batch))
+    assert (acted[1][0][2][:, :768].reshape(-1, 384).norm(dim=1) > 0.99).all()
+
+
+def recorded(monkeypatch, module):
+    """The inputs and the output of each call of a module from now on."""
+    calls, forward = [], module.forward
+
+    def call(*inputs):
+        calls.append((inputs, forward(*inputs)))
+        return calls[-1][1]
+
+    monkeypatch.setattr(module, "forward", call)
+    return calls
 
 
 def test_demonstrations_are_the_first_and_the_last_frame(make, dataset):

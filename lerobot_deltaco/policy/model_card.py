@@ -208,6 +208,12 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
         "random shifts": f"up to {config.crop_padding} pixels",
         "arithmetic": config.dtype,
     }
+    shares = {
+        "samples with other colors": config.color_shuffle,
+        "samples without the demonstration": config.demo_dropout,
+        "samples without the instruction": config.language_dropout,
+    }
+    options |= {name: f"{share:.0%}" for name, share in shares.items() if share}
     if config.gripper_index is not None:
         kind = config.gripper_loss.replace("_", " ")
         options["gripper's loss"] = f"{kind}, weight {config.gripper_weight:g}"

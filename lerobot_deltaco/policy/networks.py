@@ -250,26 +250,3 @@ def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:
     for in_dim, hidden_dim in pairwise(hidden_dims):
         layers += [nn.Linear(in_dim, hidden_dim), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers, FullPrecisionLinear(hidden_dims[-1], out_dim))
-
-
-def random_crop(images: Tensor, padding: int, generator: torch.Generator | None = None) -> Tensor:
-    """Shifts each picture at random by up to `padding` pixels; what comes in at the edges is black.
-
-    Args:
-        images: (batch, ..., H, W). All pictures of a sample are shifted alike.
-        padding: px.
-        generator: Source of the shifts, on the CPU.
-
-    Returns:
-        The same shape.
-    """
-    batch_size, (height, width) = len(images), images.shape[-2:]
-    shifts = torch.randint(0, 2 * padding + 1, (2, batch_size), generator=generator).to(images.device)
-    padded = F.pad(images, [padding] * 4)
-    rows = shifts[0, :, None] + torch.arange(height, device=images.device)  # (batch, H)
-    columns = shifts[1, :, None] + torch.arange(width, device=images.device)  # (batch, W)
-    sample = torch.arange(batch_size, device=images.device)
-    flat = padded.flatten(1, -3) if padded.ndim > 4 else padded  # (batch, channels, H + 2p, W + 2p)
-    # Advanced indices on both sides of a slice put the batch, rows and columns first.
-    cropped = flat[sample[:, None, None], :, rows[:, :, None], columns[:, None, :]]  # (batch, H, W, channels)
-    return rearrange(cropped, "b h w c -> b c h w").reshape(images.shape)

@@ -1,0 +1,96 @@
+"""What is changed at random in training: where pictures lie, their colors, and what a sample is told."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from einops import rearrange
+from torch import Tensor
+
+# Of red, green and blue; the first is as it was.
+COLOR_ORDERS = torch.tensor(list(permutations(range(3))))
+
+
+def random_crop(images: Tensor, padding: int, generator: torch.Generator | None = None) -> Tensor:
+    """Shifts each picture at random by up to `padding` pixels; what comes in at the edges is black.
+
+    Args:
+        images: (batch, ..., H, W). All pictures of a sample are shifted alike.
+        padding: px.
+        generator: Source of the shifts, on the CPU.
+
+    Returns:
+        The same shape.
+    """
+    batch_size, (height, width) = len(images), images.shape[-2:]
+    shifts = torch.randint(0, 2 * padding + 1, (2, batch_size), generator=generator).to(images.device)
+    padded = F.pad(images, [padding] * 4)
+    rows = shifts[0, :, None] + torch.arange(height, device=images.device)  # (batch, H)
+    columns = shifts[1, :, None] + torch.arange(width, device=images.device)  # (batch, W)
+    sample = torch.arange(batch_size, device=images.device)
+    flat = padded.flatten(1, -3) if padded.ndim > 4 else padded  # (batch, channels, H + 2p, W + 2p)
+    # Advanced indices on both sides of a slice put the batch, rows and columns first.
+    cropped = flat[sample[:, None, None], :, rows[:, :, None], columns[:, None, :]]  # (batch, H, W, channels)
+    return rearrange(cropped, "b h w c -> b c h w").reshape(images.shape)
+
+
+def draw_color_orders(n: int, share: float, generator: torch.Generator | None = None) -> Tensor:
+    """Draws orders of red, green and blue.
+
+    Args:
+        n: How many.
+        share: Of another order than the usual one, each of the five as likely.
+        generator: Source of the draws, on the CPU.
+
+    Returns:
+        (n, 3) int64 on the CPU, for `reorder_colors`.
+    """
+    changed = torch.rand(n, generator=generator) < share
+    order = torch.randint(1, len(COLOR_ORDERS), (n,), generator=generator)
+    return COLOR_ORDERS[torch.where(changed, order, 0)]
+
+
+def is_reordered(orders: Tensor) -> Tensor:
+    """Which of (n, 3) orders are not the usual one, (n,) bool."""
+    return (orders != torch.arange(3, device=orders.device)).any(dim=1)
+
+
+def reorder_colors(images: Tensor, orders: Tensor) -> Tensor:
+    """Exchanges the color channels of pictures.
+
+    Args:
+        images: (batch, ..., 3, H, W). All pictures of a sample are changed alike.
+        orders: (batch, 3); the channel that each comes from.
+
+    Returns:
+        The same shape.
+    """
+    channels = images.flatten(0, -3)  # (pictures * 3, H, W)
+    first = torch.arange(0, len(channels), 3, device=images.device).view(len(images), -1, 1)
+    return channels[(first + orders[:, None]).flatten()].view(images.shape)
+
+
+def leave_out(
+    demo: Tensor,
+    language: Tensor,
+    demo_share: float,
+    language_share: float,
+    generator: torch.Generator | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Puts zeros in the place of some samples' embeddings; of a sample, one of the two at most.
+
+    Args:
+        demo: (batch, embedding).
+        language: (batch, embedding).
+        demo_share: Of the samples that are told nothing by their demonstration.
+        language_share: Of those that are told nothing by their instruction; both shares come to 1 at most.
+        generator: Source of the draws, on the CPU.
+
+    Returns:
+        The demonstrations' and the instructions' embeddings.
+    """
+    draws = torch.rand(len(demo), 1, generator=generator).to(demo.device)
+    without_language = (draws >= demo_share) & (draws < demo_share + language_share)
+    return demo.masked_fill(draws < demo_share, 0), language.masked_fill(without_language, 0)
