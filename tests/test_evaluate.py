@@ -164,9 +164,24 @@ def test_records_of_other_evaluations_are_not_taken_for_this_one(run, capsys):
     assert "is of another evaluation" in capsys.readouterr().err
 
 
+def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder(run, tmp_path, capsys):
+    collect_command.main(["--tasks", "7", "--episodes-per-task", "1", "--root", str(tmp_path / "shown")])
+    arguments = [str(run), "--tasks", "7", "--trials", "1", "--steps", "last"]
+    with pytest.raises(SystemExit):
+        evaluate_command.main([*arguments, "--out", str(tmp_path / "out")])
+    assert "--policy.demo_root" in capsys.readouterr().err
+    shown = ["--policy.demo_repo_id", "test/shown", "--policy.demo_root", str(tmp_path / "shown")]
+    with pytest.MonkeyPatch.context() as patch:
+        use_fake_encoder(patch)
+        evaluate_command.main([*arguments, *shown, "--out", str(tmp_path / "out")])
+    (episode,) = read_record(record_path(tmp_path / "out", 2)).episodes
+    assert episode.demonstration == episode.instruction == get_task(7).instruction
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["another_run", "--out", "out"], "the records of one run. Got 2 runs"),
         (["--tasks", "301"], "301"),
         (["--trials", "0"], "`trials` must be at least 1"),
         (["--steps", "5"], "no checkpoint of step 5. There are 1, 2"),

@@ -482,6 +482,15 @@ def test_configurations_that_differ_between_seeds_are_noted(tmp_path):
     assert "differ in more than their seed: in backbone of" in note
 
 
+def test_options_that_are_newer_than_a_record_were_off(tmp_path):
+    newer = {**record().policy, "demo_dropout": 0.0, "film": None}
+    write(tmp_path, record(), record(seed=1, policy=newer))
+    assert make_report(find_records([tmp_path])).notes == []
+    write(tmp_path, record(seed=2, policy={**newer, "demo_dropout": 0.1}))
+    (note,) = make_report(find_records([tmp_path])).notes
+    assert "differ in more than their seed: in demo_dropout of" in note
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

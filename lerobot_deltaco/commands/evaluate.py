@@ -30,6 +30,8 @@ def main(arguments: list[str] | None = None) -> None:
         plan = EvaluationPlan(
             options.tasks, options.trials, options.seed, options.counterfactual, options.ambiguity
         )
+        if options.out is not None and len(options.runs) > 1:
+            parser.error(f"--out is the folder for the records of one run. Got {len(options.runs)} runs.")
         todo = [(run, checkpoint) for run in options.runs for checkpoint in _chosen(run, options.steps)]
     except (ValueError, OSError) as error:
         parser.error(str(error))
@@ -60,7 +62,8 @@ def _chosen(run: Path, steps: str) -> list[Checkpoint]:
 def _evaluate(
     run: Path, checkpoint: Checkpoint, plan: EvaluationPlan, options: argparse.Namespace, command: str
 ) -> None:
-    path = record_path(run, checkpoint.step, plan.counterfactual)
+    folder = options.out or run
+    path = record_path(folder, checkpoint.step, plan.counterfactual)
     if path.exists():
         record = read_record(path)
         made_for = EvaluationPlan(
@@ -69,15 +72,16 @@ def _evaluate(
         if made_for != plan:
             raise RecordError(
                 f"{path} is of another evaluation: {asdict(made_for)}. Asked for is {asdict(plan)}. Ask for "
-                "the same one, or move the record away."
+                "the same one, or name another folder for its records with --out."
             )
         sys.stdout.write(_text(run, record, "was there already"))
         return
     description = describe(checkpoint)
-    overrides = [f"--device={options.device}"] if options.device else []
+    given = {name: getattr(options, name) for name in ("device", "demo_repo_id", "demo_root")}
+    overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
     policy, preprocessor, postprocessor = load_policy(checkpoint.folder, overrides)
     record = run_set(
-        run,
+        folder,
         checkpoint.step,
         policy,
         preprocessor,
@@ -148,6 +152,25 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help="what was trained; runs of the same name differ in their seeds "
         "alone (by default, the run's --job_name)",
+    )
+    parser.add_argument(
+        "--policy.demo_repo_id",
+        dest="demo_repo_id",
+        metavar="USER/NAME",
+        help="dataset that shows the tasks (by default, the checkpoint's own demonstrations)",
+    )
+    parser.add_argument(
+        "--policy.demo_root",
+        dest="demo_root",
+        metavar="DIR",
+        help="its folder, if it is not in LeRobot's cache",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where to write the folder `evaluations` of the one RUN_DIR, for a second evaluation of the "
+        "same steps (by default, in RUN_DIR)",
     )
     parser.add_argument("--device", help="such as cpu or cuda (by default, the checkpoint's)")
     return parser

@@ -311,7 +311,9 @@ def _notes_on_series(series: Series) -> Iterator[str]:
 def _differing_options(series: Series) -> list[str]:
     policies = [run[max(run)].record.policy for run in series.runs.values()]
     names = sorted(set().union(*policies) - _OPTIONS_OF_A_RUN)
-    return [name for name in names if any(policy.get(name) != policies[0].get(name) for policy in policies)]
+    # An option that an older record lacks was off.
+    values = {name: [policy.get(name) or None for policy in policies] for name in names}
+    return [name for name in names if any(value != values[name][0] for value in values[name])]
 
 
 def counted(noun: str, numbers: Sequence[int]) -> str:

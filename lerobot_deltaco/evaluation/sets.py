@@ -15,7 +15,7 @@ from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 
 
 def run_set(
-    run: Path,
+    folder: Path,
     step: int,
     policy: DeltacoPolicy,
     preprocessor: PolicyProcessorPipeline,
@@ -29,7 +29,7 @@ def run_set(
     """Runs an evaluation set, and writes its record.
 
     Args:
-        run: Folder of the training run.
+        folder: Whose folder `evaluations` gets the record; usually the training run's.
         step: How many steps the policy has trained; it also numbers the set.
         policy: In evaluation mode, on its device.
         preprocessor: The policy's.
@@ -63,7 +63,7 @@ def run_set(
         command=command,
         seconds=time.monotonic() - start,
     )
-    write_record(record, record_path(run, step, plan.counterfactual))
+    write_record(record, record_path(folder, step, plan.counterfactual))
     return record
 
 
