@@ -100,10 +100,13 @@ class DeltacoConfig(PreTrainedConfig):
             dataset by heart, and misreads new ones.
         color_shuffle: Share of the training samples that see red, green and blue exchanged, in their
             observation and their demonstration alike, and are told nothing by their instruction, which may
-            name colors. It makes five further objects of each, to learn to find by a demonstration.
-        demo_dropout: Share of the training samples that are told nothing by their demonstration, and so learn
-            to follow the instruction where demonstrations would do most of the time.
-        language_dropout: Share of those that are told nothing by their instruction.
+            name colors; the encoder's loss is without them, too. It makes five further objects of each, to
+            learn to find by a demonstration.
+        demo_dropout: Of the training samples in their own colors, the share that are told nothing by their
+            demonstration, and so learn to follow the instruction where demonstrations would do most of the
+            time.
+        language_dropout: Of these samples, the share that are told nothing by their instruction. None is told
+            nothing at all.
         demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at
             least 2, so that none is shown its own episode; 0 for one drawn anew for every sample. Sharing
             saves most of the demonstration encoder's time.
@@ -251,24 +254,29 @@ class DeltacoConfig(PreTrainedConfig):
             )
 
     def _check_augmentation(self) -> None:
-        for name in ("color_shuffle", "demo_dropout", "language_dropout"):
+        shares = ("color_shuffle", "demo_dropout", "language_dropout")
+        for name in shares:
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(
                     f"`{name}` is a share of the samples, from 0 to less than 1. Got {getattr(self, name)}."
                 )
-        inputs = "+".join(self.conditioning[:2]).split("+")
-        told_both = "demo" in inputs and "language" in inputs
+        if self.method == "mcil":
+            given = [name for name in shares if getattr(self, name)]
+            if given:
+                raise ValueError(f"`{given[0]}` cannot be used with the method 'mcil'.")
+        film, concat, _ = self.conditioning
+        inputs = f"{film}+{concat}".split("+")
         if self.color_shuffle and "demo" not in inputs:
             raise ValueError(
-                "`color_shuffle` leaves a sample nothing but its demonstration, which must be an input, in "
-                f"`film` or `concat`. The method {self.method!r} has {', '.join(self.conditioning[:2])}."
+                "`color_shuffle` leaves a sample nothing but its demonstration, which must go through FiLM "
+                f"or be concatenated. `film` is {film!r}, and `concat` {concat!r}."
             )
-        dropouts = [name for name in ("demo_dropout", "language_dropout") if getattr(self, name)]
-        if dropouts and not told_both:
-            raise ValueError(
-                f"`{dropouts[0]}` needs both a demonstration and an instruction as inputs, in `film` or "
-                f"`concat`. The method {self.method!r} has {', '.join(self.conditioning[:2])}."
-            )
+        for name in ("demo_dropout", "language_dropout"):
+            if getattr(self, name) and not {"demo", "language"} <= set(inputs):
+                raise ValueError(
+                    f"`{name}` leaves a sample one of demonstration and instruction, which both must go "
+                    f"through FiLM or be concatenated. `film` is {film!r}, and `concat` {concat!r}."
+                )
         if not self.demo_dropout + self.language_dropout <= 1:
             raise ValueError(
                 "`demo_dropout` and `language_dropout` must not come to more than 1: each sample keeps one "

@@ -207,14 +207,14 @@ class DeltacoPolicy(PreTrainedPolicy):
                 encoder_loss = contrastive_loss(logits, column)
             else:
                 encoder_loss = cosine_loss(demo.float(), language)
-            right = logits.argmax(dim=1) == column
+            right = (logits.argmax(dim=1) == column).float()
             if recolored is not None:
-                # Instructions may name colors.
-                encoder_loss, right = encoder_loss.masked_fill(recolored, 0), right & ~recolored
+                # The others' alone, since instructions may name colors.
+                weight = (~recolored) * (len(tasks) / (~recolored).sum().clamp(min=1))
+                encoder_loss, right = weight * encoder_loss, weight * right
             loss = loss + self.config.encoder_loss_weight * encoder_loss
-            n_aligned = len(tasks) if recolored is None else (~recolored).sum().clamp(min=1)
-            logged["encoder_loss"] = encoder_loss.sum() / n_aligned
-            logged["demo_accuracy"] = right.sum() / n_aligned
+            logged["encoder_loss"] = encoder_loss.mean()
+            logged["demo_accuracy"] = right.mean()
         if self.training:
             self.step += 1
         return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)

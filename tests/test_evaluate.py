@@ -176,12 +176,17 @@ def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder
         evaluate_command.main([*arguments, *shown, "--out", str(tmp_path / "out")])
     (episode,) = read_record(record_path(tmp_path / "out", 2)).episodes
     assert episode.demonstration == episode.instruction == get_task(7).instruction
+    with pytest.raises(SystemExit):
+        evaluate_command.main([*arguments, "--experiment", "another", "--out", str(tmp_path / "out")])
+    assert "is of another run: of 'small/deltaco' with the seed 7" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["another_run", "--out", "out"], "the records of one run. Got 2 runs"),
+        (["--policy.demo_root", "data", "--out", "out"], "Name both"),
+        (["--policy.demo_repo_id", "USER/NAME"], "folder for its records with --out"),
+        (["another_run", "--out", "out"], "for the records of one run. Got 2 runs"),
         (["--tasks", "301"], "301"),
         (["--trials", "0"], "`trials` must be at least 1"),
         (["--steps", "5"], "no checkpoint of step 5. There are 1, 2"),

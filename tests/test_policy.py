@@ -20,6 +20,7 @@ from small_policies import (
     write_dataset,
 )
 
+from lerobot_deltaco import modeling_deltaco
 from lerobot_deltaco.commands import embed as embed_command
 from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
@@ -98,9 +99,11 @@ def test_the_defaults_are_the_papers():
         ({"demo_dropout": -0.1}, "`demo_dropout` is a share"),
         ({"demo_dropout": 0.6, "language_dropout": 0.5}, "must not come to more than 1"),
         ({"method": "language_only", "color_shuffle": 0.2}, "nothing but its demonstration"),
-        ({"method": "one_hot", "color_shuffle": 0.2}, "has one_hot, none"),
-        ({"method": "demo_only", "language_dropout": 0.2}, "needs both a demonstration and an instruction"),
-        ({"method": "mcil", "demo_dropout": 0.2}, "`demo_dropout` needs both"),
+        ({"method": "one_hot", "color_shuffle": 0.2}, "`film` is 'one_hot', and `concat` 'none'"),
+        ({"method": "demo_only", "language_dropout": 0.2}, "one of demonstration and instruction"),
+        ({"film": "demo", "concat": "none", "demo_dropout": 0.2}, "`concat` 'none'"),
+        ({"method": "mcil", "color_shuffle": 0.2}, "`color_shuffle` cannot be used with the method 'mcil'"),
+        ({"method": "mcil", "demo_dropout": 0.2}, "`demo_dropout` cannot be used"),
     ],
 )
 def test_impossible_configurations_say_what_is_valid(options, message):
@@ -234,7 +237,7 @@ def test_shared_demonstrations_are_encoded_once(make, dataset, monkeypatch):
     assert len(encoded[1]) == 3
 
 
-@pytest.mark.parametrize("demos_per_task", [0, 2])
+@pytest.mark.parametrize("demos_per_task", [0, 3])
 def test_other_colors_are_seen_and_shown_alike_and_not_spoken_of(make, dataset, monkeypatch, demos_per_task):
     policy, before, _ = make(
         concat="demo+language",
@@ -277,6 +280,34 @@ def test_other_colors_are_seen_and_shown_alike_and_not_spoken_of(make, dataset, 
     assert (acted[1][0][2][:, :768].reshape(-1, 384).norm(dim=1) > 0.99).all()
 
 
+def test_the_encoders_loss_is_that_of_the_samples_in_their_own_colors(make, dataset, monkeypatch):
+    policy, before, _ = make(color_shuffle=0.5, crop_padding=0)
+    batch = before(batch_of(dataset, [0, 6, 11, 15, 20] * 4))
+    acted = recorded(monkeypatch, policy.policy)
+    loss, logged = policy(batch)
+    (images, demo, _), _ = acted[0]
+    usual = (images == policy._images(batch)).flatten(1).all(dim=1)
+    tasks = list(dict.fromkeys(batch["task"]))
+    column = torch.tensor([tasks.index(task) for task in batch["task"]])
+    logits = (demo @ policy.instructions(tasks, "cpu").T / 0.1)[usual]
+    expected = torch.nn.functional.cross_entropy(logits, column[usual])
+    assert logged["encoder_loss"] == pytest.approx(expected.item(), rel=1e-4)
+    accuracy = (logits.argmax(dim=1) == column[usual]).float().mean()
+    assert logged["demo_accuracy"] == pytest.approx(accuracy.item(), rel=1e-5)
+    parts = logged["motion_nll"] + 30 * logged["gripper_loss"] + 10 * logged["encoder_loss"]
+    assert loss.item() == pytest.approx(parts, rel=1e-5)
+
+
+def test_what_is_not_asked_for_is_not_drawn(make, dataset, monkeypatch):
+    def must_not_draw(*arguments):
+        raise AssertionError("drawn")
+
+    policy, before, _ = make()
+    for name in ("draw_color_orders", "leave_out"):
+        monkeypatch.setattr(modeling_deltaco, name, must_not_draw)
+    policy(before(batch_of(dataset, [0, 6])))
+
+
 def recorded(monkeypatch, module):
     """The inputs and the output of each call of a module from now on."""
     calls, forward = [], module.forward
@@ -297,8 +328,17 @@ def test_demonstrations_are_the_first_and_the_last_frame(make, dataset):
     assert shades == [[10 * episode, 10 * episode + LENGTH - 1] for episode in range(6)]
 
 
-def test_draws_are_a_function_of_the_seed_and_the_step(make, dataset):
-    policy, before, _ = make(method="demo_only")
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"method": "demo_only"},
+        {"color_shuffle": 0.5, "crop_padding": 0},
+        {"demo_dropout": 0.3, "language_dropout": 0.3, "crop_padding": 0},
+    ],
+    ids=str,
+)
+def test_draws_are_a_function_of_the_seed_and_the_step(make, dataset, options):
+    policy, before, _ = make(**options)
     batch = before(batch_of(dataset, list(range(15))))
     twin = copy.deepcopy(policy)
     losses = [policy(batch)[0].item() for _ in range(3)]

@@ -31,7 +31,14 @@ def main(arguments: list[str] | None = None) -> None:
             options.tasks, options.trials, options.seed, options.counterfactual, options.ambiguity
         )
         if options.out is not None and len(options.runs) > 1:
-            parser.error(f"--out is the folder for the records of one run. Got {len(options.runs)} runs.")
+            parser.error(f"--out is for the records of one run. Got {len(options.runs)} runs.")
+        if options.demo_root is not None and options.demo_repo_id is None:
+            parser.error("--policy.demo_root is the folder of --policy.demo_repo_id. Name both.")
+        if options.demo_repo_id is not None and options.out is None:
+            parser.error(
+                "With other demonstrations, an evaluation is not to be taken for the run's own. Name another "
+                "folder for its records with --out."
+            )
         todo = [(run, checkpoint) for run in options.runs for checkpoint in _chosen(run, options.steps)]
     except (ValueError, OSError) as error:
         parser.error(str(error))
@@ -63,9 +70,16 @@ def _evaluate(
     run: Path, checkpoint: Checkpoint, plan: EvaluationPlan, options: argparse.Namespace, command: str
 ) -> None:
     folder = options.out or run
+    description = describe(checkpoint)
+    experiment = options.experiment or description.experiment
     path = record_path(folder, checkpoint.step, plan.counterfactual)
     if path.exists():
         record = read_record(path)
+        if options.out is not None and (record.experiment, record.run_seed) != (experiment, description.seed):
+            raise RecordError(
+                f"{path} is of another run: of {record.experiment!r} with the seed {record.run_seed}. Asked "
+                f"for is {experiment!r} with the seed {description.seed}. Name another folder with --out."
+            )
         made_for = EvaluationPlan(
             record.tasks, record.trials, record.evaluation_seed, record.counterfactual, record.ambiguity
         )
@@ -76,7 +90,6 @@ def _evaluate(
             )
         sys.stdout.write(_text(run, record, "was there already"))
         return
-    description = describe(checkpoint)
     given = {name: getattr(options, name) for name in ("device", "demo_repo_id", "demo_root")}
     overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
     policy, preprocessor, postprocessor = load_policy(checkpoint.folder, overrides)
@@ -87,7 +100,7 @@ def _evaluate(
         preprocessor,
         postprocessor,
         plan,
-        experiment=options.experiment or description.experiment,
+        experiment=experiment,
         run_seed=description.seed,
         command=command,
     )

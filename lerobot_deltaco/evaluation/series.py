@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.authors import in_order
 from lerobot_deltaco.evaluation.record import (
     BENCHMARK,
@@ -311,8 +312,9 @@ def _notes_on_series(series: Series) -> Iterator[str]:
 def _differing_options(series: Series) -> list[str]:
     policies = [run[max(run)].record.policy for run in series.runs.values()]
     names = sorted(set().union(*policies) - _OPTIONS_OF_A_RUN)
-    # An option that an older record lacks was off.
-    values = {name: [policy.get(name) or None for policy in policies] for name in names}
+    # What an older record lacks was as it is by default.
+    defaults = {field.name: field.default for field in fields(DeltacoConfig)}
+    values = {name: [policy.get(name, defaults.get(name)) for policy in policies] for name in names}
     return [name for name in names if any(value != values[name][0] for value in values[name])]
 
 

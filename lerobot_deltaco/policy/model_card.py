@@ -209,9 +209,11 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
         "arithmetic": config.dtype,
     }
     shares = {
-        "samples with other colors": config.color_shuffle,
-        "samples without the demonstration": config.demo_dropout,
-        "samples without the instruction": config.language_dropout,
+        "samples in other colors, told nothing but by a demonstration": config.color_shuffle,
+        "samples told nothing by their demonstration": (1 - config.color_shuffle) * config.demo_dropout,
+        "further samples told nothing by their instruction": (
+            (1 - config.color_shuffle) * config.language_dropout
+        ),
     }
     options |= {name: f"{share:.0%}" for name, share in shares.items() if share}
     if config.gripper_index is not None:
