@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.authors import in_order
 from lerobot_deltaco.evaluation.record import (
     BENCHMARK,
@@ -312,10 +311,18 @@ def _notes_on_series(series: Series) -> Iterator[str]:
 def _differing_options(series: Series) -> list[str]:
     policies = [run[max(run)].record.policy for run in series.runs.values()]
     names = sorted(set().union(*policies) - _OPTIONS_OF_A_RUN)
-    # What an older record lacks was as it is by default.
-    defaults = {field.name: field.default for field in fields(DeltacoConfig)}
+    is_lacking = any(name not in policy for name in names for policy in policies)
+    defaults = _default_options() if is_lacking else {}
     values = {name: [policy.get(name, defaults.get(name)) for policy in policies] for name in names}
     return [name for name in names if any(value != values[name][0] for value in values[name])]
+
+
+def _default_options() -> dict[str, Any]:
+    """As which what an older record lacks is read."""
+    # Takes seconds, and is seldom needed.
+    from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+
+    return {field.name: field.default for field in fields(DeltacoConfig)}
 
 
 def counted(noun: str, numbers: Sequence[int]) -> str:
