@@ -82,6 +82,8 @@ class DeltacoConfig(PreTrainedConfig):
             language model.
         demo_encoder: cnn (the paper's), or attention (ours), which compares the frames at each place, and
             attends to a few places.
+        demo_encoder_dropout: Share of the features before its fully connected layers that is left out in
+            training, so that it does not know the demonstrations of a small dataset by heart.
         demo_rows: m, rows of the array of a demonstration's frames.
         demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
             (For the attention, which has no array, they are m n frames.)
@@ -139,6 +141,7 @@ class DeltacoConfig(PreTrainedConfig):
     language_encoder: str = "paraphrase-MiniLM-L3-v2"
     instruction_embeddings: str | None = None
     demo_encoder: str = "cnn"
+    demo_encoder_dropout: float = 0.0
     demo_rows: int = 1
     demo_columns: int = 2
     image_size: int = 48
@@ -255,11 +258,9 @@ class DeltacoConfig(PreTrainedConfig):
 
     def _check_augmentation(self) -> None:
         shares = ("color_shuffle", "demo_dropout", "language_dropout")
-        for name in shares:
+        for name in (*shares, "demo_encoder_dropout"):
             if not 0 <= getattr(self, name) < 1:
-                raise ValueError(
-                    f"`{name}` is a share of the samples, from 0 to less than 1. Got {getattr(self, name)}."
-                )
+                raise ValueError(f"`{name}` is a share, from 0 to less than 1. Got {getattr(self, name)}.")
         if self.method == "mcil":
             given = [name for name in shares if getattr(self, name)]
             if given:

@@ -28,6 +28,7 @@ from lerobot_deltaco.policy.augmentation import (
     leave_out,
     random_crop,
     reorder_colors,
+    seeded,
 )
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
@@ -143,10 +144,11 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     def _make_demo_encoder(self) -> nn.Module:
         config = self.config
+        dim, dropout = config.embedding_dim, config.demo_encoder_dropout
         if config.demo_encoder == "attention":
-            return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
+            return AttentionEncoder(config.n_demo_frames, dim, dropout=dropout)
         size, stride = config.image_size, BACKBONES[config.backbone].demo_stride
-        return ArrayEncoder(size, size, config.demo_rows, config.demo_columns, config.embedding_dim, stride)
+        return ArrayEncoder(size, size, config.demo_rows, config.demo_columns, dim, stride, dropout=dropout)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """All weights; the language encoder is not among them."""
@@ -468,7 +470,10 @@ class DeltacoPolicy(PreTrainedPolicy):
             frames = reorder_colors(frames, orders)
         if self.training and self.config.demo_crop_padding:
             frames = random_crop(frames, self.config.demo_crop_padding, generator)
-        return self.demo_encoder(frames)
+        if not self.training or not self.config.demo_encoder_dropout:
+            return self.demo_encoder(frames)
+        with seeded(generator, frames.device):
+            return self.demo_encoder(frames)
 
     def _split(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
         """An action's motion, and its gripper in 0..1."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import permutations
 
 import torch
@@ -94,3 +96,17 @@ def leave_out(
     draws = torch.rand(len(demo), 1, generator=generator).to(demo.device)
     without_language = (draws >= demo_share) & (draws < demo_share + language_share)
     return demo.masked_fill(draws < demo_share, 0), language.masked_fill(without_language, 0)
+
+
+@contextmanager
+def seeded(generator: torch.Generator, device: torch.device) -> Iterator[None]:
+    """What draws from PyTorch's own generators, as dropout does, is a function of this one meanwhile.
+
+    Args:
+        generator: On the CPU.
+        device: Whose generator is drawn from, besides the CPU's.
+    """
+    seed = int(torch.randint(2**62, (), generator=generator))
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        yield

@@ -240,13 +240,16 @@ class FullPrecisionLinear(nn.Linear):
             return super().forward(x.to(self.weight.dtype))
 
 
-def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:
-    """Fully connected layers with ReLU between them; `dims` are the sizes from input to output.
+def multilayer_perceptron(dims: Sequence[int], dropout: float = 0.0) -> nn.Sequential:
+    """Fully connected layers with ReLU between them, of which the last computes in full precision.
 
-    The last computes in full precision.
+    Args:
+        dims: Sizes from input to output.
+        dropout: Before each layer, the share of its inputs that is left out in training.
     """
     *hidden_dims, out_dim = dims
+    before: list[nn.Module] = [nn.Dropout(dropout)] if dropout else []
     layers: list[nn.Module] = []
     for in_dim, hidden_dim in pairwise(hidden_dims):
-        layers += [nn.Linear(in_dim, hidden_dim), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers, FullPrecisionLinear(hidden_dims[-1], out_dim))
+        layers += [*before, nn.Linear(in_dim, hidden_dim), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers, *before, FullPrecisionLinear(hidden_dims[-1], out_dim))
