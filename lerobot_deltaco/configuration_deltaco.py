@@ -100,15 +100,10 @@ class DeltacoConfig(PreTrainedConfig):
         crop_padding: Pixels by which observations are shifted at random in training, 0 for none.
         demo_crop_padding: The same for demonstrations. Without it, the encoder soon knows those of a small
             dataset by heart, and misreads new ones.
-        color_shuffle: Share of the training samples that see red, green and blue exchanged, in their
-            observation and their demonstration alike, and are told nothing by their instruction, which may
-            name colors; the encoder's loss is without them, too. It makes five further objects of each, to
-            learn to find by a demonstration.
-        demo_dropout: Of the training samples in their own colors, the share that are told nothing by their
-            demonstration, and so learn to follow the instruction where demonstrations would do most of the
-            time.
-        language_dropout: Of these samples, the share that are told nothing by their instruction. None is told
-            nothing at all.
+        demo_dropout: Share of the training samples that are told nothing by their demonstration, and so learn
+            to follow the instruction where demonstrations would do most of the time.
+        language_dropout: Share of those that are told nothing by their instruction. None is told nothing at
+            all.
         demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at
             least 2, so that none is shown its own episode; 0 for one drawn anew for every sample. Sharing
             saves most of the demonstration encoder's time.
@@ -154,7 +149,6 @@ class DeltacoConfig(PreTrainedConfig):
     temperature: float = 0.1
     crop_padding: int = 4
     demo_crop_padding: int = 4
-    color_shuffle: float = 0.0
     demo_dropout: float = 0.0
     language_dropout: float = 0.0
     demos_per_task: int = 0
@@ -237,7 +231,7 @@ class DeltacoConfig(PreTrainedConfig):
             )
         self._check_upsampling()
         self._check_conditioning()
-        self._check_augmentation()
+        self._check_dropouts()
 
     def _check_upsampling(self) -> None:
         if self.upsampled_tasks is None:
@@ -256,8 +250,8 @@ class DeltacoConfig(PreTrainedConfig):
                 f"2. Got {self.tasks_per_batch}."
             )
 
-    def _check_augmentation(self) -> None:
-        shares = ("color_shuffle", "demo_dropout", "language_dropout")
+    def _check_dropouts(self) -> None:
+        shares = ("demo_dropout", "language_dropout")
         for name in (*shares, "demo_encoder_dropout"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"`{name}` is a share, from 0 to less than 1. Got {getattr(self, name)}.")
@@ -267,12 +261,7 @@ class DeltacoConfig(PreTrainedConfig):
                 raise ValueError(f"`{given[0]}` cannot be used with the method 'mcil'.")
         film, concat, _ = self.conditioning
         inputs = f"{film}+{concat}".split("+")
-        if self.color_shuffle and "demo" not in inputs:
-            raise ValueError(
-                "`color_shuffle` leaves a sample nothing but its demonstration, which must go through FiLM "
-                f"or be concatenated. `film` is {film!r}, and `concat` {concat!r}."
-            )
-        for name in ("demo_dropout", "language_dropout"):
+        for name in shares:
             if getattr(self, name) and not {"demo", "language"} <= set(inputs):
                 raise ValueError(
                     f"`{name}` leaves a sample one of demonstration and instruction, which both must go "

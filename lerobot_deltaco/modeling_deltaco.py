@@ -23,11 +23,8 @@ from torch import Tensor, nn
 
 from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
 from lerobot_deltaco.policy.augmentation import (
-    draw_color_orders,
-    is_reordered,
     leave_out,
     random_crop,
-    reorder_colors,
     seeded,
 )
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
@@ -179,14 +176,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         images = self._images(batch)
         if self.training and self.config.crop_padding:
             images = random_crop(images, self.config.crop_padding, generator)
-        demo = language = recolored = None
+        demo = language = None
         distinct = {task: n for n, task in enumerate(dict.fromkeys(tasks))}
         column = torch.tensor([distinct[task] for task in tasks], device=device)
         if self.config.uses_demo:
-            demo, orders = self._show(batch["episode_index"], tasks, column, generator)
-            if orders is not None:
-                images = reorder_colors(images, orders)
-                recolored = is_reordered(orders)  # (batch,)
+            demo = self._show(batch["episode_index"], tasks, column, generator)
         if self.config.uses_language:
             known = self.instructions(list(distinct), device)  # (distinct, embedding)
             language = known[column]  # (batch, embedding)
@@ -199,7 +193,10 @@ class DeltacoPolicy(PreTrainedPolicy):
             loss = torch.stack([part[0] for part in parts]).mean(dim=0)
             logged = {name: torch.stack([part[1][name] for part in parts]).mean() for name in parts[0][1]}
         else:
-            told = self._partly_told(demo, language, recolored, generator)
+            dropouts = self.config.demo_dropout, self.config.language_dropout
+            told = demo, language
+            if self.training and any(dropouts):
+                told = leave_out(demo, language, *dropouts, generator)
             film, concat = self._told_by(tasks, *told)
             loss, logged = self._imitation_loss(batch, images, film, concat)
 
@@ -209,14 +206,9 @@ class DeltacoPolicy(PreTrainedPolicy):
                 encoder_loss = contrastive_loss(logits, column)
             else:
                 encoder_loss = cosine_loss(demo.float(), language)
-            right = (logits.argmax(dim=1) == column).float()
-            if recolored is not None:
-                # The others' alone, since instructions may name colors.
-                weight = (~recolored) * (len(tasks) / (~recolored).sum().clamp(min=1))
-                encoder_loss, right = weight * encoder_loss, weight * right
             loss = loss + self.config.encoder_loss_weight * encoder_loss
             logged["encoder_loss"] = encoder_loss.mean()
-            logged["demo_accuracy"] = right.mean()
+            logged["demo_accuracy"] = (logits.argmax(dim=1) == column).float().mean()
         if self.training:
             self.step += 1
         return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
@@ -251,48 +243,19 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     def _show(
         self, episodes: Tensor, tasks: Sequence[str], column: Tensor, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor | None]:
-        """Shows samples a demonstration; `column` numbers their tasks.
-
-        Returns:
-            Embeddings, (batch, embedding), and the order of the colors that each was shown in, (batch, 3), if
-            they are shuffled.
-        """
+    ) -> Tensor:
+        """Embeddings of demonstrations for samples, (batch, embedding); `column` numbers their tasks."""
         shown = self._training_demonstrations(episodes.device)
         if not self.training:
             rows = shown.others(episodes, generator, tasks=tasks)
-            return self._encode_demo(shown, rows, generator), None
+            return self._encode_demo(shown, rows, generator)
         check = not self._knows_all_episodes
-        which: Tensor | slice = slice(None)
-        if self.config.demos_per_task:
-            n_tasks, n_each = len(set(tasks)), self.config.demos_per_task
-            rows, which = shown.shared(episodes, column, n_tasks, n_each, generator, check)
-        else:
-            rows = shown.others(episodes, generator, check)
-        if not self.config.color_shuffle:
-            return self._encode_demo(shown, rows, generator)[which], None
-        orders = draw_color_orders(len(rows), self.config.color_shuffle, generator).to(rows.device)
-        return self._encode_demo(shown, rows, generator, orders)[which], orders[which]
-
-    def _partly_told(
-        self,
-        demo: Tensor | None,
-        language: Tensor | None,
-        recolored: Tensor | None,
-        generator: torch.Generator,
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """Both embeddings as the policy is told them in training: some are left out."""
-        shares = self.config.demo_dropout, self.config.language_dropout
-        if not self.training or demo is None or language is None:
-            return demo, language
-        whole = demo
-        if any(shares):
-            demo, language = leave_out(demo, language, *shares, generator)
-        if recolored is not None:
-            # The demonstration alone shows what other colors a task would have.
-            demo = torch.where(recolored[:, None], whole, demo)
-            language = language.masked_fill(recolored[:, None], 0)
-        return demo, language
+        if not self.config.demos_per_task:
+            return self._encode_demo(shown, shown.others(episodes, generator, check), generator)
+        rows, which = shown.shared(
+            episodes, column, len(set(tasks)), self.config.demos_per_task, generator, check
+        )
+        return self._encode_demo(shown, rows, generator)[which]
 
     def _training_demonstrations(self, device: torch.device) -> DemonstrationSet:
         if self.trained_on is None:
@@ -461,13 +424,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         indices = torch.tensor([places[task] for task in tasks], device=self.step.device)
         return F.one_hot(indices, len(places)).float()
 
-    def _encode_demo(
-        self, shown: DemonstrationSet, rows: Tensor, generator: torch.Generator, orders: Tensor | None = None
-    ) -> Tensor:
-        """Unit embeddings of demonstrations, (batch, embedding); `orders` of their colors, (batch, 3)."""
+    def _encode_demo(self, shown: DemonstrationSet, rows: Tensor, generator: torch.Generator) -> Tensor:
+        """Unit embeddings of demonstrations, (batch, embedding)."""
         frames = shown.pictures(rows, self.config.n_demo_frames, generator)
-        if orders is not None:
-            frames = reorder_colors(frames, orders)
         if self.training and self.config.demo_crop_padding:
             frames = random_crop(frames, self.config.demo_crop_padding, generator)
         if not self.training or not self.config.demo_encoder_dropout:

@@ -5,11 +5,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 
 from lerobot_deltaco.policy.augmentation import (
-    draw_color_orders,
-    is_reordered,
     leave_out,
     random_crop,
-    reorder_colors,
+    seeded,
 )
 
 
@@ -44,33 +42,6 @@ def test_all_pictures_of_a_sample_are_shifted_alike_and_by_the_generator_alone()
     assert not torch.equal(first, random_crop(images, 3, torch.Generator().manual_seed(2)))
 
 
-def test_other_orders_of_the_colors_are_as_likely_and_have_their_share():
-    orders = draw_color_orders(6000, 0.5, generator())
-    found, counts = orders.unique(dim=0, return_counts=True)
-    assert found.tolist() == [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]]
-    assert counts[0].item() == pytest.approx(3000, abs=150)
-    assert counts[1:].tolist() == pytest.approx([600] * 5, abs=100)
-    assert torch.equal(is_reordered(orders), (orders != torch.tensor([0, 1, 2])).any(dim=1))
-    assert torch.equal(orders, draw_color_orders(6000, 0.5, generator()))
-    assert not is_reordered(draw_color_orders(100, 0.0, generator())).any()
-
-
-@pytest.mark.parametrize("pictures", [(), (1,), (2,), (2, 3)], ids=str)
-def test_colors_are_exchanged_alike_in_all_pictures_of_a_sample(pictures):
-    images = torch.rand(5, *pictures, 3, 4, 6)
-    orders = torch.tensor([[0, 1, 2], [2, 1, 0], [1, 2, 0], [0, 1, 2], [0, 2, 1]])
-    changed = reorder_colors(images, orders)
-    for sample, order in enumerate(orders.tolist()):
-        for channel, source in enumerate(order):
-            assert torch.equal(changed[sample][..., channel, :, :], images[sample][..., source, :, :])
-
-
-def test_colors_of_channels_last_pictures_are_exchanged_too():
-    images = torch.rand(2, 3, 4, 6).contiguous(memory_format=torch.channels_last)
-    orders = torch.tensor([[2, 1, 0], [1, 2, 0]])
-    assert torch.equal(reorder_colors(images, orders), reorder_colors(images.contiguous(), orders))
-
-
 def test_of_a_sample_one_embedding_at_most_is_left_out():
     demo, language = torch.rand(4000, 3) + 1, torch.rand(4000, 3) + 1
     left = leave_out(demo, language, 0.1, 0.3, generator())
@@ -82,3 +53,17 @@ def test_of_a_sample_one_embedding_at_most_is_left_out():
     assert torch.equal(left[1][~without_language], language[~without_language])
     always = leave_out(demo, language, 0.5, 0.5, generator())
     assert (((always[0] == 0).all(dim=1)) ^ ((always[1] == 0).all(dim=1))).all()
+
+
+def test_what_pytorch_draws_meanwhile_is_the_generators_and_nothing_else_is():
+    cpu = torch.device("cpu")
+    torch.manual_seed(1)
+    with seeded(generator(), cpu):
+        first = torch.rand(3)
+    after = torch.rand(3)
+    torch.manual_seed(1)
+    assert torch.equal(after, torch.rand(3))
+    with seeded(generator(), cpu):
+        assert torch.equal(first, torch.rand(3))
+    with seeded(generator(1), cpu):
+        assert not torch.equal(first, torch.rand(3))

@@ -170,7 +170,7 @@ def test_the_card_names_what_was_chosen_for_a_run():
         "scheduler_warmup_steps": 1000,
         "optimizer_weight_decay": 0.01,
         "gripper_loss": "cross_entropy",
-        "color_shuffle": 0.4,
+        "demo_encoder_dropout": 0.4,
         "demo_dropout": 0.1,
         "language_dropout": 0.25,
     }
@@ -181,9 +181,9 @@ def test_the_card_names_what_was_chosen_for_a_run():
         "| tasks in a batch | 16 |",
         "| tasks drawn more often | those with `green\\|red`, 50% of each batch |",
         "| gripper's loss | cross entropy, weight 3 |",
-        "| samples in other colors, told nothing but by a demonstration | 40% |",
-        "| samples told nothing by their demonstration | 6% |",
-        "| further samples told nothing by their instruction | 15% |",
+        "| dropout in the encoder of demonstrations | 40% |",
+        "| samples told nothing by their demonstration | 10% |",
+        "| samples told nothing by their instruction | 25% |",
     ):
         assert row in text
 
@@ -202,7 +202,8 @@ def test_what_is_beyond_the_paper_is_named(dataset):
     paper = words_of(foreign_card(dataset)[0])
     assert "| encoder of demonstrations | the paper's convolutional network" in paper
     assert "Gaussians" not in paper
-    assert "other colors" not in paper
+    assert "told nothing" not in paper
+    assert "dropout" not in paper
 
 
 def test_the_demonstrations_that_it_carries_are_listed(dataset, shown):

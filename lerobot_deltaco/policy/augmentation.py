@@ -1,18 +1,14 @@
-"""What is changed at random in training: where pictures lie, their colors, and what a sample is told."""
+"""What is changed at random in training: where pictures lie, and what a sample is told."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import permutations
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from einops import rearrange
 from torch import Tensor
-
-# Of red, green and blue; the first is as it was.
-COLOR_ORDERS = torch.tensor(list(permutations(range(3))))
 
 
 def random_crop(images: Tensor, padding: int, generator: torch.Generator | None = None) -> Tensor:
@@ -36,42 +32,6 @@ def random_crop(images: Tensor, padding: int, generator: torch.Generator | None 
     # Advanced indices on both sides of a slice put the batch, rows and columns first.
     cropped = flat[sample[:, None, None], :, rows[:, :, None], columns[:, None, :]]  # (batch, H, W, channels)
     return rearrange(cropped, "b h w c -> b c h w").reshape(images.shape)
-
-
-def draw_color_orders(n: int, share: float, generator: torch.Generator | None = None) -> Tensor:
-    """Draws orders of red, green and blue.
-
-    Args:
-        n: How many.
-        share: Of another order than the usual one, each of the five as likely.
-        generator: Source of the draws, on the CPU.
-
-    Returns:
-        (n, 3) int64 on the CPU, for `reorder_colors`.
-    """
-    changed = torch.rand(n, generator=generator) < share
-    order = torch.randint(1, len(COLOR_ORDERS), (n,), generator=generator)
-    return COLOR_ORDERS[torch.where(changed, order, 0)]
-
-
-def is_reordered(orders: Tensor) -> Tensor:
-    """Which of (n, 3) orders are not the usual one, (n,) bool."""
-    return (orders != torch.arange(3, device=orders.device)).any(dim=1)
-
-
-def reorder_colors(images: Tensor, orders: Tensor) -> Tensor:
-    """Exchanges the color channels of pictures.
-
-    Args:
-        images: (batch, ..., 3, H, W). All pictures of a sample are changed alike.
-        orders: (batch, 3); the channel that each comes from.
-
-    Returns:
-        The same shape.
-    """
-    channels = images.flatten(0, -3)  # (pictures * 3, H, W)
-    first = torch.arange(0, len(channels), 3, device=images.device).view(len(images), -1, 1)
-    return channels[(first + orders[:, None]).flatten()].view(images.shape)
 
 
 def leave_out(

@@ -209,11 +209,9 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
         "arithmetic": config.dtype,
     }
     shares = {
-        "samples in other colors, told nothing but by a demonstration": config.color_shuffle,
-        "samples told nothing by their demonstration": (1 - config.color_shuffle) * config.demo_dropout,
-        "further samples told nothing by their instruction": (
-            (1 - config.color_shuffle) * config.language_dropout
-        ),
+        "dropout in the encoder of demonstrations": config.demo_encoder_dropout,
+        "samples told nothing by their demonstration": config.demo_dropout,
+        "samples told nothing by their instruction": config.language_dropout,
     }
     options |= {name: f"{share:.0%}" for name, share in shares.items() if share}
     if config.gripper_index is not None:
