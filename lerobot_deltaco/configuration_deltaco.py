@@ -100,10 +100,6 @@ class DeltacoConfig(PreTrainedConfig):
         crop_padding: Pixels by which observations are shifted at random in training, 0 for none.
         demo_crop_padding: The same for demonstrations. Without it, the encoder soon knows those of a small
             dataset by heart, and misreads new ones.
-        demo_dropout: Share of the training samples that are told nothing by their demonstration, and so learn
-            to follow the instruction where demonstrations would do most of the time.
-        language_dropout: Share of those that are told nothing by their instruction. None is told nothing at
-            all.
         demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at
             least 2, so that none is shown its own episode; 0 for one drawn anew for every sample. Sharing
             saves most of the demonstration encoder's time.
@@ -149,8 +145,6 @@ class DeltacoConfig(PreTrainedConfig):
     temperature: float = 0.1
     crop_padding: int = 4
     demo_crop_padding: int = 4
-    demo_dropout: float = 0.0
-    language_dropout: float = 0.0
     demos_per_task: int = 0
     demo_repo_id: str | None = None
     demo_root: str | None = None
@@ -219,6 +213,11 @@ class DeltacoConfig(PreTrainedConfig):
         for name in ("temperature", "optimizer_lr"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"`{name}` must be greater than 0. Got {getattr(self, name)}.")
+        if not 0 <= self.demo_encoder_dropout < 1:
+            raise ValueError(
+                "`demo_encoder_dropout` is a share of features, from 0 to less than 1. Got "
+                f"{self.demo_encoder_dropout}."
+            )
         if self.demos_per_task == 1:
             raise ValueError(
                 "`demos_per_task` cannot be 1: the sample from the one episode would be shown itself. Choose "
@@ -231,7 +230,6 @@ class DeltacoConfig(PreTrainedConfig):
             )
         self._check_upsampling()
         self._check_conditioning()
-        self._check_dropouts()
 
     def _check_upsampling(self) -> None:
         if self.upsampled_tasks is None:
@@ -248,29 +246,6 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 "`upsampled_tasks` get a share of the tasks of a batch: `tasks_per_batch` must be at least "
                 f"2. Got {self.tasks_per_batch}."
-            )
-
-    def _check_dropouts(self) -> None:
-        shares = ("demo_dropout", "language_dropout")
-        for name in (*shares, "demo_encoder_dropout"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"`{name}` is a share, from 0 to less than 1. Got {getattr(self, name)}.")
-        if self.method == "mcil":
-            given = [name for name in shares if getattr(self, name)]
-            if given:
-                raise ValueError(f"`{given[0]}` cannot be used with the method 'mcil'.")
-        film, concat, _ = self.conditioning
-        inputs = f"{film}+{concat}".split("+")
-        for name in shares:
-            if getattr(self, name) and not {"demo", "language"} <= set(inputs):
-                raise ValueError(
-                    f"`{name}` leaves a sample one of demonstration and instruction, which both must go "
-                    f"through FiLM or be concatenated. `film` is {film!r}, and `concat` {concat!r}."
-                )
-        if not self.demo_dropout + self.language_dropout <= 1:
-            raise ValueError(
-                "`demo_dropout` and `language_dropout` must not come to more than 1: each sample keeps one "
-                f"of both. Got {self.demo_dropout} and {self.language_dropout}."
             )
 
     def _check_choice(self, name: str, valid: Collection[str]) -> None:

@@ -22,11 +22,6 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
-from lerobot_deltaco.policy.augmentation import (
-    leave_out,
-    random_crop,
-    seeded,
-)
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
 from lerobot_deltaco.policy.inference import FoldedPolicy
@@ -41,6 +36,7 @@ from lerobot_deltaco.policy.losses import (
 from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.model_card import model_card
 from lerobot_deltaco.policy.networks import ConditionedPolicy
+from lerobot_deltaco.policy.randomness import random_crop, seeded
 from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
@@ -193,11 +189,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             loss = torch.stack([part[0] for part in parts]).mean(dim=0)
             logged = {name: torch.stack([part[1][name] for part in parts]).mean() for name in parts[0][1]}
         else:
-            dropouts = self.config.demo_dropout, self.config.language_dropout
-            told = demo, language
-            if self.training and any(dropouts):
-                told = leave_out(demo, language, *dropouts, generator)
-            film, concat = self._told_by(tasks, *told)
+            film, concat = self._told_by(tasks, demo, language)
             loss, logged = self._imitation_loss(batch, images, film, concat)
 
         if self.config.conditioning.encoder_loss != "none":

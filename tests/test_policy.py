@@ -20,7 +20,6 @@ from small_policies import (
     write_dataset,
 )
 
-from lerobot_deltaco import modeling_deltaco
 from lerobot_deltaco.commands import embed as embed_command
 from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
@@ -94,12 +93,7 @@ def test_the_defaults_are_the_papers():
         ({"film": "none", "concat": "none"}, "would not know its task"),
         ({"method": "language_only", "encoder_loss": "contrastive"}, "no demonstration is used"),
         ({"method": "mcil", "film": "demo"}, "`film` cannot be changed"),
-        ({"demo_encoder_dropout": 1.0}, "`demo_encoder_dropout` is a share, from 0 to less than 1"),
-        ({"demo_dropout": -0.1}, "`demo_dropout` is a share"),
-        ({"demo_dropout": 0.6, "language_dropout": 0.5}, "must not come to more than 1"),
-        ({"method": "demo_only", "language_dropout": 0.2}, "one of demonstration and instruction"),
-        ({"film": "demo", "concat": "none", "demo_dropout": 0.2}, "`concat` 'none'"),
-        ({"method": "mcil", "demo_dropout": 0.2}, "`demo_dropout` cannot be used"),
+        ({"demo_encoder_dropout": 1.0}, "`demo_encoder_dropout` is a share of features"),
     ],
 )
 def test_impossible_configurations_say_what_is_valid(options, message):
@@ -135,7 +129,6 @@ def test_a_gripper_that_is_not_there_is_refused(make):
         {"demo_encoder": "attention"},
         {"demo_encoder": "attention", "demo_rows": 2},
         {"motion_modes": 3},
-        {"demo_dropout": 0.3, "language_dropout": 0.3},
         {"demo_encoder_dropout": 0.5},
         {"demo_encoder": "attention", "demo_encoder_dropout": 0.5},
         {"gripper": "none"},
@@ -224,62 +217,13 @@ def test_shared_demonstrations_are_encoded_once(make, dataset, monkeypatch):
     policy, before, _ = make(demos_per_task=2)
     encoded = []
     monkeypatch.setattr(
-        policy, "_encode_demo", lambda shown, rows, *_: encoded.append(rows) or torch.zeros(len(rows), 384)
+        policy, "_encode_demo", lambda shown, rows, _: encoded.append(rows) or torch.zeros(len(rows), 384)
     )
     policy(before(batch_of(dataset, [0, 1, 2, 3, 5, 6, 7, 15, 16, 20])))
     assert len(encoded[0]) == 4
     policy.eval()
     policy(before(batch_of(dataset, [0, 1, 2])))
     assert len(encoded[1]) == 3
-
-
-def test_what_is_left_out_is_zero_in_training_and_aligned_all_the_same(make, dataset, monkeypatch):
-    policy, before, _ = make(
-        film="demo+language", concat="demo+language", demo_dropout=0.5, language_dropout=0.5
-    )
-    batch = before(batch_of(dataset, [0, 6, 11, 15, 20] * 8))
-    acted, shown = recorded(monkeypatch, policy.policy), recorded(monkeypatch, policy.demo_encoder)
-    _, logged = policy(batch)
-    (_, film, concat), _ = acted[0]
-    assert torch.equal(film, concat[:, :768])
-    demo, language = film.split(384, dim=1)
-    told_demo, told_language = (part.abs().sum(dim=1) > 0 for part in (demo, language))
-    assert (told_demo ^ told_language).all()
-    assert 0 < told_demo.sum() < 40
-    _, embeddings = shown[0]
-    assert torch.equal(demo[told_demo], embeddings[told_demo])
-    known = policy.instructions(batch["task"], "cpu")
-    assert torch.equal(language[told_language], known[told_language])
-    tasks = list(dict.fromkeys(batch["task"]))
-    logits = embeddings @ policy.instructions(tasks, "cpu").T / 0.1
-    column = torch.tensor([tasks.index(task) for task in batch["task"]])
-    expected = torch.nn.functional.cross_entropy(logits, column)
-    assert logged["encoder_loss"] == pytest.approx(expected.item(), rel=1e-4)
-    policy.eval()
-    policy(batch)
-    assert torch.allclose(acted[1][0][1].view(-1, 384).norm(dim=1), torch.ones(80))
-
-
-def test_what_is_not_asked_for_is_not_drawn(make, dataset, monkeypatch):
-    def must_not_draw(*arguments):
-        raise AssertionError("drawn")
-
-    policy, before, _ = make()
-    for name in ("leave_out", "seeded"):
-        monkeypatch.setattr(modeling_deltaco, name, must_not_draw)
-    policy(before(batch_of(dataset, [0, 6])))
-
-
-def recorded(monkeypatch, module):
-    """The inputs and the output of each call of a module from now on."""
-    calls, forward = [], module.forward
-
-    def call(*inputs):
-        calls.append((inputs, forward(*inputs)))
-        return calls[-1][1]
-
-    monkeypatch.setattr(module, "forward", call)
-    return calls
 
 
 def test_demonstrations_are_the_first_and_the_last_frame(make, dataset):
@@ -295,7 +239,6 @@ def test_demonstrations_are_the_first_and_the_last_frame(make, dataset):
     [
         {"method": "demo_only"},
         {"demo_encoder_dropout": 0.5, "crop_padding": 0, "demo_crop_padding": 0},
-        {"demo_dropout": 0.3, "language_dropout": 0.3, "crop_padding": 0},
     ],
     ids=str,
 )

@@ -208,12 +208,8 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
         "random shifts": f"up to {config.crop_padding} pixels",
         "arithmetic": config.dtype,
     }
-    shares = {
-        "dropout in the encoder of demonstrations": config.demo_encoder_dropout,
-        "samples told nothing by their demonstration": config.demo_dropout,
-        "samples told nothing by their instruction": config.language_dropout,
-    }
-    options |= {name: f"{share:.0%}" for name, share in shares.items() if share}
+    if config.demo_encoder_dropout:
+        options["dropout in the encoder of demonstrations"] = f"{config.demo_encoder_dropout:.0%}"
     if config.gripper_index is not None:
         kind = config.gripper_loss.replace("_", " ")
         options["gripper's loss"] = f"{kind}, weight {config.gripper_weight:g}"

@@ -1,4 +1,4 @@
-"""What is changed at random in training: where pictures lie, and what a sample is told."""
+"""What training draws at random: shifts of pictures, and what PyTorch itself draws, as in dropout."""
 
 from __future__ import annotations
 
@@ -32,30 +32,6 @@ def random_crop(images: Tensor, padding: int, generator: torch.Generator | None 
     # Advanced indices on both sides of a slice put the batch, rows and columns first.
     cropped = flat[sample[:, None, None], :, rows[:, :, None], columns[:, None, :]]  # (batch, H, W, channels)
     return rearrange(cropped, "b h w c -> b c h w").reshape(images.shape)
-
-
-def leave_out(
-    demo: Tensor,
-    language: Tensor,
-    demo_share: float,
-    language_share: float,
-    generator: torch.Generator | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Puts zeros in the place of some samples' embeddings; of a sample, one of the two at most.
-
-    Args:
-        demo: (batch, embedding).
-        language: (batch, embedding).
-        demo_share: Of the samples that are told nothing by their demonstration.
-        language_share: Of those that are told nothing by their instruction; both shares come to 1 at most.
-        generator: Source of the draws, on the CPU.
-
-    Returns:
-        The demonstrations' and the instructions' embeddings.
-    """
-    draws = torch.rand(len(demo), 1, generator=generator).to(demo.device)
-    without_language = (draws >= demo_share) & (draws < demo_share + language_share)
-    return demo.masked_fill(draws < demo_share, 0), language.masked_fill(without_language, 0)
 
 
 @contextmanager

@@ -1,14 +1,10 @@
-"""What is changed at random in training."""
+"""What training draws at random."""
 
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 
-from lerobot_deltaco.policy.augmentation import (
-    leave_out,
-    random_crop,
-    seeded,
-)
+from lerobot_deltaco.policy.randomness import random_crop, seeded
 
 
 @pytest.fixture(autouse=True)
@@ -40,19 +36,6 @@ def test_all_pictures_of_a_sample_are_shifted_alike_and_by_the_generator_alone()
     torch.testing.assert_close(first[:, 0], first[:, 1])
     torch.testing.assert_close(first, random_crop(images, 3, torch.Generator().manual_seed(1)))
     assert not torch.equal(first, random_crop(images, 3, torch.Generator().manual_seed(2)))
-
-
-def test_of_a_sample_one_embedding_at_most_is_left_out():
-    demo, language = torch.rand(4000, 3) + 1, torch.rand(4000, 3) + 1
-    left = leave_out(demo, language, 0.1, 0.3, generator())
-    without_demo, without_language = ((part == 0).all(dim=1) for part in left)
-    assert without_demo.float().mean() == pytest.approx(0.1, abs=0.02)
-    assert without_language.float().mean() == pytest.approx(0.3, abs=0.03)
-    assert not (without_demo & without_language).any()
-    assert torch.equal(left[0][~without_demo], demo[~without_demo])
-    assert torch.equal(left[1][~without_language], language[~without_language])
-    always = leave_out(demo, language, 0.5, 0.5, generator())
-    assert (((always[0] == 0).all(dim=1)) ^ ((always[1] == 0).all(dim=1))).all()
 
 
 def test_what_pytorch_draws_meanwhile_is_the_generators_and_nothing_else_is():
