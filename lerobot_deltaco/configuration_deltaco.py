@@ -82,8 +82,6 @@ class DeltacoConfig(PreTrainedConfig):
             language model.
         demo_encoder: cnn (the paper's), or attention (ours), which compares the frames at each place, and
             attends to a few places.
-        demo_encoder_dropout: Share of the features before its fully connected layers that is left out in
-            training, so that it does not know the demonstrations of a small dataset by heart.
         demo_rows: m, rows of the array of a demonstration's frames.
         demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
             (For the attention, which has no array, they are m n frames.)
@@ -132,7 +130,6 @@ class DeltacoConfig(PreTrainedConfig):
     language_encoder: str = "paraphrase-MiniLM-L3-v2"
     instruction_embeddings: str | None = None
     demo_encoder: str = "cnn"
-    demo_encoder_dropout: float = 0.0
     demo_rows: int = 1
     demo_columns: int = 2
     image_size: int = 48
@@ -213,11 +210,6 @@ class DeltacoConfig(PreTrainedConfig):
         for name in ("temperature", "optimizer_lr"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"`{name}` must be greater than 0. Got {getattr(self, name)}.")
-        if not 0 <= self.demo_encoder_dropout < 1:
-            raise ValueError(
-                "`demo_encoder_dropout` is a share of features, from 0 to less than 1. Got "
-                f"{self.demo_encoder_dropout}."
-            )
         if self.demos_per_task == 1:
             raise ValueError(
                 "`demos_per_task` cannot be 1: the sample from the one episode would be shown itself. Choose "

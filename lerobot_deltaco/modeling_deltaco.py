@@ -35,8 +35,7 @@ from lerobot_deltaco.policy.losses import (
 )
 from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.model_card import model_card
-from lerobot_deltaco.policy.networks import ConditionedPolicy
-from lerobot_deltaco.policy.randomness import random_crop, seeded
+from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
 from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
@@ -137,11 +136,10 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     def _make_demo_encoder(self) -> nn.Module:
         config = self.config
-        dim, dropout = config.embedding_dim, config.demo_encoder_dropout
         if config.demo_encoder == "attention":
-            return AttentionEncoder(config.n_demo_frames, dim, dropout=dropout)
+            return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
         size, stride = config.image_size, BACKBONES[config.backbone].demo_stride
-        return ArrayEncoder(size, size, config.demo_rows, config.demo_columns, dim, stride, dropout=dropout)
+        return ArrayEncoder(size, size, config.demo_rows, config.demo_columns, config.embedding_dim, stride)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """All weights; the language encoder is not among them."""
@@ -421,10 +419,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         frames = shown.pictures(rows, self.config.n_demo_frames, generator)
         if self.training and self.config.demo_crop_padding:
             frames = random_crop(frames, self.config.demo_crop_padding, generator)
-        if not self.training or not self.config.demo_encoder_dropout:
-            return self.demo_encoder(frames)
-        with seeded(generator, frames.device):
-            return self.demo_encoder(frames)
+        return self.demo_encoder(frames)
 
     def _split(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
         """An action's motion, and its gripper in 0..1."""

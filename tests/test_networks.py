@@ -23,6 +23,7 @@ from lerobot_deltaco.policy.networks import (
     FilmBlock,
     Motion,
     SpatialSoftmax,
+    random_crop,
 )
 
 
@@ -236,3 +237,25 @@ def test_frames_are_laid_out_in_raster_order():
     assert array.shape == (1, 3, 4, 4)
     assert array[0, 0, ::2, ::2].tolist() == [[0, 1], [2, 3]]
     assert frame_array(frames[:, :2], rows=1)[0, 0, 0].tolist() == [0, 0, 1, 1]
+
+
+def test_crops_are_shifts_by_at_most_the_padding():
+    images = torch.rand(64, 3, 9, 9)
+    cropped = random_crop(images, 4, torch.Generator().manual_seed(0))
+    padded = F.pad(images, [4] * 4)
+    found = []
+    for image, big in zip(cropped, padded, strict=True):
+        shifts = [
+            (i, j) for i in range(9) for j in range(9) if torch.equal(image, big[:, i : i + 9, j : j + 9])
+        ]
+        assert len(shifts) == 1
+        found += shifts
+    assert {i for i, _ in found} == {j for _, j in found} == set(range(9))
+
+
+def test_all_pictures_of_a_sample_are_shifted_alike_and_by_the_generator_alone():
+    images = torch.rand(4, 1, 3, 8, 8).expand(4, 2, 3, 8, 8)
+    first = random_crop(images, 3, torch.Generator().manual_seed(1))
+    torch.testing.assert_close(first[:, 0], first[:, 1])
+    torch.testing.assert_close(first, random_crop(images, 3, torch.Generator().manual_seed(1)))
+    assert not torch.equal(first, random_crop(images, 3, torch.Generator().manual_seed(2)))

@@ -170,7 +170,6 @@ def test_the_card_names_what_was_chosen_for_a_run():
         "scheduler_warmup_steps": 1000,
         "optimizer_weight_decay": 0.01,
         "gripper_loss": "cross_entropy",
-        "demo_encoder_dropout": 0.4,
     }
     text = benchmark_card(**chosen).text
     for row in (
@@ -179,7 +178,6 @@ def test_the_card_names_what_was_chosen_for_a_run():
         "| tasks in a batch | 16 |",
         "| tasks drawn more often | those with `green\\|red`, 50% of each batch |",
         "| gripper's loss | cross entropy, weight 3 |",
-        "| dropout in the encoder of demonstrations | 40% |",
     ):
         assert row in text
 
@@ -198,7 +196,6 @@ def test_what_is_beyond_the_paper_is_named(dataset):
     paper = words_of(foreign_card(dataset)[0])
     assert "| encoder of demonstrations | the paper's convolutional network" in paper
     assert "Gaussians" not in paper
-    assert "dropout" not in paper
 
 
 def test_the_demonstrations_that_it_carries_are_listed(dataset, shown):

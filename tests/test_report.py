@@ -483,12 +483,12 @@ def test_configurations_that_differ_between_seeds_are_noted(tmp_path):
 
 
 def test_options_that_are_newer_than_a_record_were_as_they_are_by_default(tmp_path):
-    newer = {**record().policy, "demo_encoder_dropout": 0.0, "film": None, "demo_columns": 2}
+    newer = {**record().policy, "compile": False, "film": None, "demo_columns": 2}
     write(tmp_path, record(), record(seed=1, policy=newer))
     assert make_report(find_records([tmp_path])).notes == []
-    write(tmp_path, record(seed=2, policy={**newer, "demo_encoder_dropout": 0.1, "demo_episode": 0}))
+    write(tmp_path, record(seed=2, policy={**newer, "compile": True, "demo_episode": 0}))
     (note,) = make_report(find_records([tmp_path])).notes
-    assert "differ in more than their seed: in demo_encoder_dropout, demo_episode of" in note
+    assert "differ in more than their seed: in compile, demo_episode of" in note
 
 
 @pytest.mark.parametrize(

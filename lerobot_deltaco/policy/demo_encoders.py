@@ -25,7 +25,6 @@ class ArrayEncoder(nn.Module):
         stride: Of the first convolution.
         channels: Of the convolutions.
         hidden_dims: Of the fully connected layers.
-        dropout: Before each of these, the share of its inputs that is left out in training.
     """
 
     def __init__(
@@ -38,7 +37,6 @@ class ArrayEncoder(nn.Module):
         stride: int = 1,
         channels: int = 16,
         hidden_dims: Sequence[int] = (1024, 512, 256),
-        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.rows = rows
@@ -56,7 +54,7 @@ class ArrayEncoder(nn.Module):
         # The first convolution rounds up, the poolings down.
         sides = (math.ceil(size / stride) // 4 for size in (rows * height, columns * width))
         flat_dim = channels * math.prod(sides)
-        self.layers = multilayer_perceptron([flat_dim, *hidden_dims, embedding_dim], dropout)
+        self.layers = multilayer_perceptron([flat_dim, *hidden_dims, embedding_dim])
 
     def forward(self, frames: Tensor) -> Tensor:
         """From (batch, rows * columns, 3, height, width) in 0..1 to unit vectors (batch, embedding_dim)."""
@@ -80,7 +78,6 @@ class AttentionEncoder(nn.Module):
         channels: Of the convolutions. The first two halve the maps.
         n_heads: Places that are attended to.
         hidden_dim: Of the fully connected layer.
-        dropout: Before it, and after it, the share of the inputs that is left out in training.
     """
 
     def __init__(
@@ -90,7 +87,6 @@ class AttentionEncoder(nn.Module):
         channels: Sequence[int] = (32, 32, 64, 64),
         n_heads: int = 8,
         hidden_dim: int = 512,
-        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         layers: list[nn.Module] = []
@@ -103,8 +99,7 @@ class AttentionEncoder(nn.Module):
             ]
         self.convolutions = nn.Sequential(*layers)
         self.attention = nn.Conv2d(channels[-1], n_heads, 1)
-        dims = [n_heads * (channels[-1] + 2), hidden_dim, embedding_dim]
-        self.layers = multilayer_perceptron(dims, dropout)
+        self.layers = multilayer_perceptron([n_heads * (channels[-1] + 2), hidden_dim, embedding_dim])
 
     def forward(self, frames: Tensor) -> Tensor:
         """From (batch, n_frames, 3, height, width) in 0..1 to unit vectors (batch, embedding_dim)."""

@@ -208,8 +208,6 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
         "random shifts": f"up to {config.crop_padding} pixels",
         "arithmetic": config.dtype,
     }
-    if config.demo_encoder_dropout:
-        options["dropout in the encoder of demonstrations"] = f"{config.demo_encoder_dropout:.0%}"
     if config.gripper_index is not None:
         kind = config.gripper_loss.replace("_", " ")
         options["gripper's loss"] = f"{kind}, weight {config.gripper_weight:g}"

@@ -240,16 +240,36 @@ class FullPrecisionLinear(nn.Linear):
             return super().forward(x.to(self.weight.dtype))
 
 
-def multilayer_perceptron(dims: Sequence[int], dropout: float = 0.0) -> nn.Sequential:
-    """Fully connected layers with ReLU between them, of which the last computes in full precision.
+def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:
+    """Fully connected layers with ReLU between them; `dims` are the sizes from input to output.
 
-    Args:
-        dims: Sizes from input to output.
-        dropout: Before each layer, the share of its inputs that is left out in training.
+    The last computes in full precision.
     """
     *hidden_dims, out_dim = dims
-    before: list[nn.Module] = [nn.Dropout(dropout)] if dropout else []
     layers: list[nn.Module] = []
     for in_dim, hidden_dim in pairwise(hidden_dims):
-        layers += [*before, nn.Linear(in_dim, hidden_dim), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers, *before, FullPrecisionLinear(hidden_dims[-1], out_dim))
+        layers += [nn.Linear(in_dim, hidden_dim), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers, FullPrecisionLinear(hidden_dims[-1], out_dim))
+
+
+def random_crop(images: Tensor, padding: int, generator: torch.Generator | None = None) -> Tensor:
+    """Shifts each picture at random by up to `padding` pixels; what comes in at the edges is black.
+
+    Args:
+        images: (batch, ..., H, W). All pictures of a sample are shifted alike.
+        padding: px.
+        generator: Source of the shifts, on the CPU.
+
+    Returns:
+        The same shape.
+    """
+    batch_size, (height, width) = len(images), images.shape[-2:]
+    shifts = torch.randint(0, 2 * padding + 1, (2, batch_size), generator=generator).to(images.device)
+    padded = F.pad(images, [padding] * 4)
+    rows = shifts[0, :, None] + torch.arange(height, device=images.device)  # (batch, H)
+    columns = shifts[1, :, None] + torch.arange(width, device=images.device)  # (batch, W)
+    sample = torch.arange(batch_size, device=images.device)
+    flat = padded.flatten(1, -3) if padded.ndim > 4 else padded  # (batch, channels, H + 2p, W + 2p)
+    # Advanced indices on both sides of a slice put the batch, rows and columns first.
+    cropped = flat[sample[:, None, None], :, rows[:, :, None], columns[:, None, :]]  # (batch, H, W, channels)
+    return rearrange(cropped, "b h w c -> b c h w").reshape(images.shape)
