@@ -590,13 +590,15 @@ def test_the_files(runs, tmp_path, capsys):
 
 
 def test_the_text(runs, tmp_path):
+    write(runs, record("scenario_b/deltaco"))
     write_report([runs], tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "| DeL-TaCo | 0, 1 | 41.7 (2.8) | 3 of 3 sets | 66.7 [39.1, 86.2] | 30,000 | 25.8 (3.4) |" in text
     assert "authors, another simulation" in text
     assert ENV_ID in text
     assert "`method=one_hot`, `language_encoder=all-MiniLM-L6-v2`" in text
-    assert "Seeds 0 and 1; 6 records" in text
+    assert "- Seeds 0 and 1; 6 records; 4 min of evaluation." in text
+    assert "- Seed 0; 1 record; 1 min of evaluation." in text
     assert "    deltaco-evaluate --run scenario_a/deltaco_1\n" in text
     assert "Nothing." in text
     # Every table is whole.

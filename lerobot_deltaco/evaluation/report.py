@@ -356,8 +356,8 @@ def _origin_section(report: Report) -> str:
         parts.append(
             f"### {series.name}\n\n"
             f"- Policy: `method={records[0].method}`{options}.\n"
-            f"- {counted('seed', series.seeds).capitalize()}; {len(records)} records; "
-            f"{sum(record.seconds for record in records) / 3600:.1f} h of evaluation.\n"
+            f"- {counted('seed', series.seeds).capitalize()}; {len(records)} record{'s' * (len(records) > 1)}; "
+            f"{sum(record.seconds for record in records) / 60:.0f} min of evaluation.\n"
             f"- {', '.join(f'{name} {" and ".join(sorted(found))}' for name, found in versions.items())}.\n\n"
             + "\n".join(f"    {line}" for command in commands for line in command.splitlines())
             + "\n"
