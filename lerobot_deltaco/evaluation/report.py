@@ -353,10 +353,11 @@ def _origin_section(report: Report) -> str:
             for name, version in record.versions.items():
                 versions[name].add(version)
         commands = dict.fromkeys(record.command for record in records)
+        n_records = f"{len(records)} record{'s' * (len(records) > 1)}"
         parts.append(
             f"### {series.name}\n\n"
             f"- Policy: `method={records[0].method}`{options}.\n"
-            f"- {counted('seed', series.seeds).capitalize()}; {len(records)} record{'s' * (len(records) > 1)}; "
+            f"- {counted('seed', series.seeds).capitalize()}; {n_records}; "
             f"{sum(record.seconds for record in records) / 60:.0f} min of evaluation.\n"
             f"- {', '.join(f'{name} {" and ".join(sorted(found))}' for name, found in versions.items())}.\n\n"
             + "\n".join(f"    {line}" for command in commands for line in command.splitlines())
