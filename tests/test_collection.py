@@ -240,9 +240,11 @@ def test_an_expert_that_never_succeeds_ends_the_collection(tmp_path, env, monkey
         ("E48", 48, "validation"),
         ("E54", 54, "validation"),
         ("E102", 102, "validation"),
+        ("T150", 150, "train"),
+        ("V48", 48, "validation"),
     ],
 )
-def test_data_sets_of_the_paper_have_their_tasks_and_splits(name, n_tasks, split):
+def test_named_data_sets_have_their_tasks_and_splits(name, n_tasks, split):
     plan = CollectionPlan(name, 1)
     assert len(set(plan.task_ids)) == len(plan.task_ids) == n_tasks
     assert plan.split == split
@@ -260,17 +262,26 @@ def test_data_sets_of_the_paper_fit_together():
     assert tasks["T54"] == tasks["E54"] == set(SCENARIOS["b"].test_tasks)
 
 
+def test_data_sets_for_choosing_settings_split_the_training_tasks():
+    tasks = {name: set(task_ids) for name, (task_ids, _) in DATA_SETS.items()}
+    assert tasks["T150"] | tasks["V48"] == tasks["T198"]
+    assert not tasks["T150"] & tasks["V48"]
+
+
 @pytest.mark.parametrize(
     ("tasks", "split"),
     [
         ("scenario_a_test", "validation"),
         ("scenario_b_test", "validation"),
+        ("scenario_a_validation", "validation"),
+        ("scenario_a_selection_train", "train"),
+        ("0,scenario_a_validation", "train"),
         ("scenario_a_train", "train"),
         ("all", "train"),
         ("4,50-53", "train"),
     ],
 )
-def test_test_sets_are_for_validation_and_all_else_for_training(tasks, split):
+def test_held_out_tasks_are_for_validation_and_all_else_for_training(tasks, split):
     assert CollectionPlan(tasks, 1).split == split
     assert CollectionPlan(tasks, 1, split="train").split == "train"
     assert CollectionPlan(tasks, 1, split="validation").split == "validation"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import OBJECTS, SCENARIOS, TASK_SETS, TASKS, get_task, select_tasks
+from gym_deltaco.tasks import OBJECTS, SCENARIOS, TASK_SETS, TASKS, VALIDATION, get_task, select_tasks
 
 # The paper's table: name, shape, color.
 PAPER_OBJECTS = """\
@@ -153,6 +153,38 @@ def test_there_are_two_scenarios_and_no_more():
 
 def test_scenario_b_tests_on_a_part_of_what_a_tests_on():
     assert set(SCENARIOS["b"].test_tasks) < set(SCENARIOS["a"].test_tasks)
+
+
+# Validation tasks
+
+
+VALIDATION_ROWS = [6, 10, 12, 16, 36, 38, 40, 44]
+
+
+def test_validation_tasks_are_those_of_eight_training_rows():
+    held_out, remaining = (set(TASK_SETS[f"scenario_a_{name}"]) for name in ("validation", "selection_train"))
+    assert held_out == {50 * column + row for column in range(6) for row in VALIDATION_ROWS}
+    assert len(held_out) == 48
+    assert len(remaining) == 150
+    assert held_out | remaining == set(SCENARIOS["a"].train_tasks)
+    assert not held_out & remaining
+    kinds = [TASKS[row].kind for row in VALIDATION.test_rows]
+    assert (kinds.count("name"), kinds.count("color"), kinds.count("shape")) == (4, 2, 2)
+
+
+def test_validation_rows_follow_their_rule():
+    names = {row for row in VALIDATION.test_rows if TASKS[row].kind == "name"}
+    # 1. A held-out object is never a target.
+    assert not names & {target for task in VALIDATION.train_tasks for target in TASKS[task].targets}
+    # 2. What a held-out color or shape asks for is partly held out by name, and partly a target by name.
+    for row in set(VALIDATION.test_rows) - names:
+        targets = set(TASKS[row].targets)
+        assert targets & names
+        assert targets & set(VALIDATION.train_rows)
+    # 3. The objects differ in color and shape; one shape is in no remaining instruction.
+    assert len({OBJECTS[row].color for row in names}) == len({OBJECTS[row].shape for row in names}) == 4
+    remaining = " ".join(TASKS[task].instruction for task in VALIDATION.train_tasks)
+    assert {OBJECTS[row].shape for row in names if OBJECTS[row].shape not in remaining} == {"cylinder"}
 
 
 # Selections

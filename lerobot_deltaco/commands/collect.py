@@ -89,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--tasks",
         required=True,
-        help=f"a task set (scenario_a_train, ...), a data set of the paper ({', '.join(DATA_SETS)}), "
+        help=f"a task set (scenario_a_train, ...), a named data set ({', '.join(DATA_SETS)}), "
         "or indices and ranges of 0 to 299, such as 4,50-73",
     )
     parser.add_argument("--episodes-per-task", type=int, required=True, metavar="N")
@@ -99,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
         "--split",
         choices=COLLECTED_SPLITS,
         help="what the episodes are for; their scenes never coincide (that of the data set; else "
-        "validation for test sets, and train)",
+        "validation for test and validation tasks, and train)",
     )
     parser.add_argument(
         "--ambiguity",

@@ -16,7 +16,7 @@ from gym_deltaco.env import CONTROL_FPS, MIN_IMAGE_SIZE, PickPlaceEnv
 from gym_deltaco.expert import NOISE, expert_episode
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
 from gym_deltaco.seeding import Split, episode_seed
-from gym_deltaco.tasks import SCENARIOS, TASKS, select_tasks
+from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, select_tasks
 from lerobot_deltaco.data.dataset_files import DEFAULT_FEATURES
 from lerobot_deltaco.data.feature_names import ACTION_NAMES, PRIVILEGED, STATE_NAMES
 
@@ -28,7 +28,7 @@ MAX_ATTEMPTS = 100
 COLLECTED_SPLITS: tuple[Split, ...] = ("train", "validation")
 
 _NOVEL_OBJECTS = tuple(task for task in SCENARIOS["a"].test_tasks if TASKS[task].kind == "name")
-# The authors' names of their data sets: which tasks, and what the episodes are for.
+# Named data sets: which tasks, and what the episodes are for. All but T150 and V48 are the authors'.
 DATA_SETS: dict[str, tuple[tuple[int, ...], Split]] = {
     "T198": (SCENARIOS["a"].train_tasks, "train"),
     "T48": (_NOVEL_OBJECTS, "train"),
@@ -36,6 +36,9 @@ DATA_SETS: dict[str, tuple[tuple[int, ...], Split]] = {
     "E48": (_NOVEL_OBJECTS, "validation"),
     "E54": (SCENARIOS["b"].test_tasks, "validation"),
     "E102": (SCENARIOS["a"].test_tasks, "validation"),
+    # For choosing settings: the training tasks that remain, and the demonstrations of those held out.
+    "T150": (VALIDATION.train_tasks, "train"),
+    "V48": (VALIDATION.test_tasks, "validation"),
 }
 
 
@@ -48,11 +51,12 @@ class CollectionPlan:
     """Arguments of a collection; equal plans give equal datasets.
 
     Args:
-        tasks: A task set, a data set of the authors (T198, T48, T54, E48, E54, E102), or indices and ranges.
+        tasks: A task set, a named data set (T198, T48, T54, E48, E54, E102 of the authors; T150 and V48 for
+            choosing settings), or indices and ranges.
         episodes_per_task: Number of successful episodes of each task, at least 1.
         seed: Of the whole collection, at least 0.
         split: What the episodes are for: "train" or "validation", whose scenes never coincide. None is that
-            of the data set, or "validation" for a test set and "train" for all else.
+            of the data set, or "validation" for test and validation tasks and "train" for all else.
         ambiguity: "container" or "object", the paper's schemes i and ii.
         noise: Standard deviation of the noise on the expert's motions, at least 0.
         image_size: Height and width of the pictures, px.
@@ -84,11 +88,7 @@ class CollectionPlan:
         if self.ambiguity not in AMBIGUITIES:
             raise ValueError(f"`ambiguity` must be one of {', '.join(AMBIGUITIES)}. Got {self.ambiguity!r}.")
         if self.split is None:
-            is_test = set(task_ids) <= set(SCENARIOS["a"].test_tasks) and self.tasks.endswith("_test")
-            default = (
-                DATA_SETS[self.tasks][1] if self.tasks in DATA_SETS else "validation" if is_test else "train"
-            )
-            object.__setattr__(self, "split", default)
+            object.__setattr__(self, "split", _default_split(self.tasks, task_ids))
         if self.split not in COLLECTED_SPLITS:
             raise ValueError(f"`split` must be one of {', '.join(COLLECTED_SPLITS)}. Got {self.split!r}.")
 
@@ -127,6 +127,16 @@ class CollectionPlan:
             **dict.fromkeys(PRIVILEGED, number),
             **DEFAULT_FEATURES,
         }
+
+
+def _default_split(tasks: str, task_ids: tuple[int, ...]) -> Split:
+    """What episodes of a selection are for unless the plan says so."""
+    if tasks in DATA_SETS:
+        return DATA_SETS[tasks][1]
+    for suffix, held_out in (("_test", "scenario_a_test"), ("_validation", "scenario_a_validation")):
+        if tasks.endswith(suffix) and set(task_ids) <= set(TASK_SETS[held_out]):
+            return "validation"
+    return "train"
 
 
 def renderer() -> str:
