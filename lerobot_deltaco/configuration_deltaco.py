@@ -75,8 +75,8 @@ class DeltacoConfig(PreTrainedConfig):
         concat: Ablation: what is concatenated to the feature points instead of the method's; the same names.
         encoder_loss: Ablation: contrastive, cosine or none, instead of the method's.
         language_encoder: A frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'),
-            all-distilroberta-v1, distilbert-base-uncased, or all-MiniLM-L6-v2, which the extra `offline`
-            brings along.
+            all-distilroberta-v1, distilbert-base-uncased or all-MiniLM-L6-v2. The extra `offline` brings the
+            first and the last, which then need no network.
         instruction_embeddings: A file with embeddings of instructions, which are then not computed: a
             checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
             language model.

