@@ -146,6 +146,7 @@ def test_the_info_is_the_documented_one(env):
 def test_the_constructor_has_the_documented_defaults():
     env = gym.make(ENV_ID).unwrapped
     assert (env.task.index, env.ambiguity, env.image_size, env.render_size) == (0, "container", 48, 256)
+    assert (env.objects, env.adversarial_probability) == ("all", 0.6)
     assert env.render_mode is None
     assert env.metadata["render_fps"] == 24
     assert env.metadata["render_modes"] == ["rgb_array"]
@@ -623,6 +624,11 @@ def test_a_policy_that_picks_at_random_succeeds_in_1_of_6():
         ({"image_size": "48"}, r"`image_size` must be .*\. Got '?48'?"),
         ({"render_size": 7}, r"`render_size` must be at least 8\. Got 7"),
         ({"render_size": 100.5}, r"`render_size` must be .*\. Got 100\.5"),
+        ({"objects": "some"}, r"`objects` must be one of all, scenario_a_train\. Got 'some'"),
+        ({"task_id": 24, "objects": "scenario_a_train"}, r"Task 24 asks for a gray .* bathtub, of which"),
+        ({"adversarial_probability": 1.1}, r"`adversarial_probability` must be between 0 and 1\. Got 1\.1"),
+        ({"adversarial_probability": -0.1}, r"between 0 and 1\. Got -0\.1"),
+        ({"adversarial_probability": float("nan")}, r"between 0 and 1\. Got nan"),
         ({"render_mode": "human"}, r"`render_mode` must be 'rgb_array' or None\. Got 'human'"),
     ],
     ids=str,
@@ -632,6 +638,16 @@ def test_bad_arguments_say_what_is_valid(arguments, message):
     with pytest.raises(ValueError, match=message):
         PickPlaceEnv(**arguments)
     assert connected_clients() == before
+
+
+def test_a_reset_to_a_task_that_the_objects_do_not_allow_leaves_the_scene():
+    env = PickPlaceEnv(4, image_size=8, objects="scenario_a_train")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="Task 39 asks for a yellow colored object, of which"):
+        env.reset(options={"task_id": 39})
+    assert env.task.index == 4
+    env.step(STAY_OPEN)
+    env.close()
 
 
 BAD_ACTIONS = {

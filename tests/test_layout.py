@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gym_deltaco.layout import AMBIGUITIES, sample_layout, twin_word
+from gym_deltaco.object_sets import OBJECT_SETS
 from gym_deltaco.tasks import OBJECTS, TASKS
 
 SEEDS_PER_TASK = 3
@@ -213,6 +214,35 @@ def test_all_32_objects_stand_as_distractors():
         layout = draw(GREEN_TASK, "container", seed)
         seen |= {item.label.index for item in layout.objects}
     assert seen == {label.index for label in OBJECTS}
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0])
+def test_the_share_of_adversarial_distractors_can_be_chosen(probability):
+    alike, n = {0, 2, 7}, 300  # of the smushed dumbbell
+    indices = [
+        item.label.index
+        for seed in range(n)
+        for item in sample_layout(
+            TASKS[4], "container", np.random.default_rng(seed), adversarial_probability=probability
+        ).objects
+        if item.label.index != 4
+    ]
+    share = sum(index in alike for index in indices) / len(indices)
+    # Drawn uniformly, 3 of the 31 others are alike.
+    expected = 1.0 if probability else 3 / 31
+    assert share == pytest.approx(expected, abs=4.5 * np.sqrt(expected * (1 - expected) / (2 * n)))
+
+
+@pytest.mark.parametrize("ambiguity", AMBIGUITIES)
+def test_scenes_can_be_drawn_without_the_test_objects(ambiguity):
+    seen = {
+        item.label.index
+        for seed in range(400)
+        for item in sample_layout(
+            TASKS[GREEN_TASK], ambiguity, np.random.default_rng(seed), OBJECT_SETS["scenario_a_train"]
+        ).objects
+    }
+    assert seen == set(range(24))
 
 
 def test_the_target_is_alone_in_its_quadrant_as_often_as_any_object():

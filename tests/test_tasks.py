@@ -187,6 +187,22 @@ def test_validation_rows_follow_their_rule():
     assert {OBJECTS[row].shape for row in names if OBJECTS[row].shape not in remaining} == {"cylinder"}
 
 
+# The clean scenario
+
+
+def test_the_clean_scenario_is_a_without_its_yellow_training_tasks():
+    train, test = (TASK_SETS[f"scenario_a_clean_{split}"] for split in ("train", "test"))
+    yellow = [task.index for task in TASKS if task.object_phrase == "yellow colored object"]
+    assert {*train, *yellow} == set(SCENARIOS["a"].train_tasks)
+    assert len(train) == 192
+    assert test == SCENARIOS["a"].test_tasks
+
+
+def test_clean_training_tasks_have_no_test_object_as_a_target():
+    targets = {target for task in TASK_SETS["scenario_a_clean_train"] for target in TASKS[task].targets}
+    assert targets == set(range(24))
+
+
 # Selections
 
 

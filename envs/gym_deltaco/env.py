@@ -10,7 +10,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from gym_deltaco import kinematics as kin
-from gym_deltaco.layout import AMBIGUITIES, Ambiguity, sample_layout
+from gym_deltaco.layout import ADVERSARIAL_PROBABILITY, AMBIGUITIES, Ambiguity, sample_layout
+from gym_deltaco.object_sets import check_task, select_objects
 from gym_deltaco.scene import Scene
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import Task, get_task
@@ -78,6 +79,10 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         image_size: Height and width of `pixels`, at least 8.
         render_mode: "rgb_array" or None.
         render_size: Height and width of what `render` returns, for people to look at.
+        objects: Name of the set of objects that scenes are made of: "all", as in the paper, or
+            "scenario_a_train", without the 8 test objects (`gym_deltaco.object_sets`).
+        adversarial_probability: Probability that a distractor is drawn from the objects that share the
+            target's color or shape, 0..1; 0.6 as in the paper's data, 0 for uniform draws.
 
     Raises:
         ValueError: An argument is out of its range; the message says what is valid.
@@ -92,8 +97,11 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         image_size: int = 48,
         render_mode: str | None = None,
         render_size: int = 256,
+        objects: str = "all",
+        adversarial_probability: float = ADVERSARIAL_PROBABILITY,
     ) -> None:
-        self.task: Task = get_task(task_id)
+        self.objects = objects
+        self.task: Task = self._task(task_id)
         if ambiguity not in AMBIGUITIES:
             raise ValueError(
                 f"`ambiguity` must be one of {', '.join(get_args(Ambiguity))}. Got {ambiguity!r}."
@@ -105,7 +113,12 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
                 raise ValueError(f"`{name}` must be at least {MIN_IMAGE_SIZE}. Got {size}.")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"`render_mode` must be 'rgb_array' or None. Got {render_mode!r}.")
+        if not 0 <= adversarial_probability <= 1:
+            raise ValueError(
+                f"`adversarial_probability` must be between 0 and 1. Got {adversarial_probability}."
+            )
         self.ambiguity: Ambiguity = ambiguity
+        self.adversarial_probability = adversarial_probability
         self.image_size = image_size
         self.render_mode = render_mode
         self.render_size = render_size
@@ -124,6 +137,12 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._is_closed = False
         self._is_success = False
         self._grasped_object = -1
+
+    def _task(self, index: int) -> Task:
+        """The task of an index, which has to be one that the scenes' objects allow."""
+        task = get_task(index)
+        check_task(task, self.objects)
+        return task
 
     @property
     def task_description(self) -> str:
@@ -162,13 +181,17 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             raise gym.error.ClosedEnvironmentError(
                 "The environment is closed. Make a new one with `gymnasium.make`."
             )
-        task = get_task((options or {}).get("task_id", self.task.index))
+        task = self._task((options or {}).get("task_id", self.task.index))
         super().reset(seed=seed)
         # An interrupted reset leaves no scene, rather than half of one.
         self.task, self._scene = task, None
         if self._simulation is None:
             self._simulation = Simulation()
-        self._scene = Scene(self._simulation, sample_layout(self.task, self.ambiguity, self.np_random))
+        labels = select_objects(self.objects)
+        layout = sample_layout(
+            self.task, self.ambiguity, self.np_random, labels, self.adversarial_probability
+        )
+        self._scene = Scene(self._simulation, layout)
         self._is_success = False
         self._grasped_object = -1
         return self._observation(), self._info()

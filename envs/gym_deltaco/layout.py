@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -56,7 +57,13 @@ class Layout(NamedTuple):
     target_container: int  # index into `containers`
 
 
-def sample_layout(task: Task, ambiguity: Ambiguity, rng: np.random.Generator) -> Layout:
+def sample_layout(
+    task: Task,
+    ambiguity: Ambiguity,
+    rng: np.random.Generator,
+    objects: Sequence[ObjectLabel] = OBJECTS,
+    adversarial_probability: float = ADVERSARIAL_PROBABILITY,
+) -> Layout:
     """Draws a scene for a task.
 
     Args:
@@ -65,25 +72,30 @@ def sample_layout(task: Task, ambiguity: Ambiguity, rng: np.random.Generator) ->
             alone leaves open about containers (the paper's scheme i). "object": the target has an identical
             twin on the other side of the tray, and only the demonstration tells which of the two (scheme ii).
         rng: Source of all draws.
+        objects: Objects that the scene is made of; the task asks for at least one of them.
+        adversarial_probability: Probability that a distractor is drawn from the objects that share the
+            target's color or shape, 0..1. In scheme ii, none is.
 
     Returns:
         The scene.
     """
-    target = int(rng.choice(task.targets))
+    target = int(rng.choice([label.index for label in objects if task.describes(label)]))
     if ambiguity == "container":
-        distractors = _sample_distractors(task, OBJECTS[target], rng)
+        distractors = _sample_distractors(
+            task, object_model(target).label, rng, objects, adversarial_probability
+        )
         containers, object_quadrants = _sample_quadrants(task, rng)
     else:
         distractors = (
             target,
-            int(rng.choice([label.index for label in OBJECTS if not task.describes(label)])),
+            int(rng.choice([label.index for label in objects if not task.describes(label)])),
         )
         containers, object_quadrants = _sample_twin_quadrants(task, rng)
     models = [object_model(index) for index in (target, *distractors)]
-    objects = _place_objects(models, object_quadrants, containers, ambiguity, rng)
+    placed = _place_objects(models, object_quadrants, containers, ambiguity, rng)
     order = rng.permutation(N_OBJECTS)
     return Layout(
-        objects=tuple(objects[index] for index in order),
+        objects=tuple(placed[index] for index in order),
         containers=containers,
         target_object=int(np.flatnonzero(order == 0)[0]),
         target_container=next(
@@ -100,14 +112,20 @@ def twin_word(task: Task) -> ContainerWord:
     return axis[task.index % 2]
 
 
-def _sample_distractors(task: Task, target: ObjectLabel, rng: np.random.Generator) -> tuple[int, int]:
+def _sample_distractors(
+    task: Task,
+    target: ObjectLabel,
+    rng: np.random.Generator,
+    objects: Sequence[ObjectLabel],
+    adversarial_probability: float,
+) -> tuple[int, int]:
     """Two objects that the instruction does not describe, often alike to the target in color or shape."""
-    others = [label for label in OBJECTS if not task.describes(label) and label is not target]
+    others = [label for label in objects if not task.describes(label) and label.index != target.index]
     alike = [label.index for label in others if label.color == target.color or label.shape == target.shape]
     chosen: list[int] = []
     while len(chosen) < N_OBJECTS - 1:
         left = [index for index in alike if index not in chosen]
-        if not (left and rng.random() < ADVERSARIAL_PROBABILITY):
+        if not (left and rng.random() < adversarial_probability):
             left = [label.index for label in others if label.index not in chosen]
         chosen.append(int(rng.choice(left)))
     return chosen[0], chosen[1]

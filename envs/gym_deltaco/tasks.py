@@ -173,7 +173,8 @@ class Scenario:
     """A split of the rows of the task table; every row comes with all six containers.
 
     Attributes:
-        name: "a" or "b" for the paper's, "a_validation" for the one that settings are chosen on.
+        name: "a" or "b" for the paper's, "a_validation" for the one that settings are chosen on,
+            "a_clean" for the one whose training shows no test object.
         train_rows: Rows whose tasks are trained on.
         test_rows: Rows whose tasks are held out of training.
     """
@@ -237,6 +238,15 @@ tasks resemble the test tasks:
 Scenario A itself breaks the first point: its test object 29 is the target of the six yellow training tasks.
 """
 
+# Scenario A without its yellow tasks, which ask for a test object. With the objects "scenario_a_train" of
+# `gym_deltaco.object_sets`, its training shows no test object at all.
+_YELLOW_ROW = _FIRST_COLOR_ROW + COLORS.index("yellow")
+CLEAN = Scenario(
+    "a_clean",
+    train_rows=tuple(row for row in SCENARIOS["a"].train_rows if row != _YELLOW_ROW),
+    test_rows=SCENARIOS["a"].test_rows,
+)
+
 TASK_SETS = MappingProxyType(
     {
         "all": tuple(range(N_TASKS)),
@@ -244,6 +254,8 @@ TASK_SETS = MappingProxyType(
         **{f"scenario_{name}_test": scenario.test_tasks for name, scenario in SCENARIOS.items()},
         "scenario_a_selection_train": VALIDATION.train_tasks,
         "scenario_a_validation": VALIDATION.test_tasks,
+        "scenario_a_clean_train": CLEAN.train_tasks,
+        "scenario_a_clean_test": CLEAN.test_tasks,
     }
 )
 
