@@ -147,7 +147,7 @@ def test_the_constructor_has_the_documented_defaults():
     env = gym.make(ENV_ID).unwrapped
     assert (env.task.index, env.ambiguity, env.image_size, env.render_size) == (0, "container", 48, 256)
     assert (env.objects, env.adversarial_probability) == ("all", 0.6)
-    assert env.render_mode is None
+    assert (env.render_mode, env.instructions) == (None, None)
     assert env.metadata["render_fps"] == 24
     assert env.metadata["render_modes"] == ["rgb_array"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, get_args
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from gym_deltaco import kinematics as kin
+from gym_deltaco.instructions import check_tasks
 from gym_deltaco.layout import ADVERSARIAL_PROBABILITY, AMBIGUITIES, Ambiguity, sample_layout
 from gym_deltaco.object_sets import check_task, select_objects
 from gym_deltaco.scene import Scene
@@ -83,6 +85,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             "scenario_a_train", without the 8 test objects (`gym_deltaco.object_sets`).
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1; 0.6 as in the paper's data, 0 for uniform draws.
+        instructions: Sentences of each task, as `gym_deltaco.instructions.read_instructions` gives them. The
+            `task_description` of an episode is then one of its task's, drawn by the episode's seed; the scene
+            stays the same. By default, it is the benchmark's template.
 
     Raises:
         ValueError: An argument is out of its range; the message says what is valid.
@@ -99,6 +104,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         render_size: int = 256,
         objects: str = "all",
         adversarial_probability: float = ADVERSARIAL_PROBABILITY,
+        instructions: Mapping[int, Sequence[str]] | None = None,
     ) -> None:
         self.objects = objects
         self.task: Task = self._task(task_id)
@@ -122,6 +128,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.image_size = image_size
         self.render_mode = render_mode
         self.render_size = render_size
+        self.instructions = instructions
+        self._instruction: str | None = None  # of the current episode; None is the task's template
         self.observation_space = spaces.Dict(
             {
                 "pixels": spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
@@ -147,7 +155,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     @property
     def task_description(self) -> str:
         """The instruction, such as "Put blue colored object in front bin."."""
-        return self.task.instruction
+        return self.task.instruction if self._instruction is None else self._instruction
 
     @property
     def scene(self) -> Scene:
@@ -176,15 +184,20 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
         Returns:
             The first observation and info.
+
+        Raises:
+            InstructionsError: The environment has `instructions`, but none for the task.
         """
         if self._is_closed:
             raise gym.error.ClosedEnvironmentError(
                 "The environment is closed. Make a new one with `gymnasium.make`."
             )
         task = self._task((options or {}).get("task_id", self.task.index))
+        if self.instructions is not None:
+            check_tasks(self.instructions, [task.index], "The environment")
         super().reset(seed=seed)
         # An interrupted reset leaves no scene, rather than half of one.
-        self.task, self._scene = task, None
+        self.task, self._scene, self._instruction = task, None, None
         if self._simulation is None:
             self._simulation = Simulation()
         labels = select_objects(self.objects)
@@ -194,6 +207,11 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._scene = Scene(self._simulation, layout)
         self._is_success = False
         self._grasped_object = -1
+        if self.instructions is not None:
+            # A generator of its own, so that scenes are the same with and without.
+            (rng,) = self.np_random.spawn(1)
+            sentences = self.instructions[task.index]
+            self._instruction = sentences[rng.integers(len(sentences))]
         return self._observation(), self._info()
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

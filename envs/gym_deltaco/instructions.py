@@ -1,0 +1,186 @@
+"""Instructions in people's own words: sentences for tasks, read from a CSV file.
+
+The benchmark's own instruction of a task is a template. The paper's authors also collected five sentences for
+each of the 300 tasks from people (appendix H), spelling mistakes included. Nothing here depends on a
+simulator.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+from gym_deltaco.tasks import N_TASKS, get_task
+
+InstructionSplit = Literal["all", "train", "held_out"]
+INSTRUCTION_SPLITS: tuple[InstructionSplit, ...] = get_args(InstructionSplit)
+
+# A file's columns: ours, and those of the authors' file, which also numbers its rows.
+COLUMNS = ("task_id", "instruction")
+AUTHORS_COLUMNS = ("", "Task ID", "Instruction")
+AUTHORS_SENTENCES_PER_TASK = 5
+
+
+class InstructionsError(ValueError):
+    """A file of instructions cannot be used; the message says what is wrong with it."""
+
+
+def read_instructions(path: str | Path, split: InstructionSplit = "all") -> dict[int, tuple[str, ...]]:
+    """Reads the sentences of tasks from a CSV file.
+
+    Args:
+        path: The file, in UTF-8, with the columns `task_id` (0 to 299) and `instruction`; or the authors'
+            file, with the columns "" (the row's number), "Task ID" and "Instruction".
+        split: Which of them: see `split_instructions`.
+
+    Returns:
+        By index of the task, its distinct sentences in the order of the file. Runs of spaces are one space.
+
+    Raises:
+        InstructionsError: The file is missing, or is no such file; the message names the line.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InstructionsError(f"The instructions {path} cannot be read: {error}.") from error
+    return split_instructions(by_task(parse_instructions(text, str(path))), split)
+
+
+def parse_instructions(text: str, source: str) -> list[tuple[int, str]]:
+    """Reads the rows of a CSV file.
+
+    Args:
+        text: Its content.
+        source: What it is called in errors.
+
+    Returns:
+        Index of the task and sentence, of each row.
+
+    Raises:
+        InstructionsError: It is no such file; the message names the line.
+    """
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    rows = []
+    try:
+        header = tuple(name.strip() for name in next(reader, []))
+        if header not in (COLUMNS, AUTHORS_COLUMNS):
+            raise InstructionsError(
+                f"{source} must begin with a line that names the columns: {','.join(COLUMNS)} or "
+                f"{','.join(AUTHORS_COLUMNS)} (the authors' file). It begins with {','.join(header)!r}."
+            )
+        for row in reader:
+            if not row:
+                continue
+            if len(row) != len(header):
+                raise InstructionsError(
+                    f"{source}, line {reader.line_num}: there must be {len(header)} columns. Got {len(row)}; "
+                    "a sentence with a comma is put between double quotes."
+                )
+            rows.append(_parse_row(*row[-2:], f"{source}, line {reader.line_num}"))
+    except csv.Error as error:
+        raise InstructionsError(f"{source}, line {reader.line_num}: {error}.") from error
+    if not rows:
+        raise InstructionsError(f"{source} has no instructions.")
+    return rows
+
+
+def _parse_row(task_id: str, sentence: str, place: str) -> tuple[int, str]:
+    sentence = " ".join(sentence.split())
+    if not sentence:
+        raise InstructionsError(f"{place}: the instruction is empty.")
+    if not task_id.strip().isdecimal():
+        raise InstructionsError(f"{place}: a task is a number from 0 to {N_TASKS - 1}. Got {task_id!r}.")
+    try:
+        return get_task(int(task_id)).index, sentence
+    except ValueError as error:
+        raise InstructionsError(f"{place}: {error}") from None
+
+
+def by_task(rows: Iterable[tuple[int, str]]) -> dict[int, tuple[str, ...]]:
+    """The distinct sentences of each task, in the order of the rows, tasks ascending."""
+    found: dict[int, dict[str, str]] = {}
+    for task_id, sentence in rows:
+        found.setdefault(task_id, {}).setdefault(_key(sentence), sentence)
+    return {task_id: tuple(found[task_id].values()) for task_id in sorted(found)}
+
+
+def split_instructions(
+    instructions: Mapping[int, tuple[str, ...]], split: InstructionSplit
+) -> dict[int, tuple[str, ...]]:
+    """Chooses sentences for training, or those that are held out of it.
+
+    Args:
+        instructions: The sentences of each task.
+        split: "held_out": the last sentence of each task. "train": every sentence that is held out for no
+            task, whatever its capital letters, so that no held-out one is trained on as another task's.
+            "all": both, and training sentences that another task holds out.
+
+    Returns:
+        The sentences of each task that has some.
+
+    Raises:
+        ValueError: There is no such split.
+    """
+    if split not in INSTRUCTION_SPLITS:
+        raise ValueError(
+            f"`instructions_split` must be one of {', '.join(INSTRUCTION_SPLITS)}. Got {split!r}."
+        )
+    if split == "all":
+        return dict(instructions)
+    if split == "held_out":
+        return {task_id: sentences[-1:] for task_id, sentences in instructions.items()}
+    held_out = {_key(sentences[-1]) for sentences in instructions.values()}
+    kept = {
+        task_id: tuple(sentence for sentence in sentences if _key(sentence) not in held_out)
+        for task_id, sentences in instructions.items()
+    }
+    return {task_id: sentences for task_id, sentences in kept.items() if sentences}
+
+
+def check_tasks(instructions: Mapping[int, Sequence[str]], task_ids: Iterable[int], source: str) -> None:
+    """Checks that there are sentences for tasks.
+
+    Args:
+        instructions: The sentences of each task.
+        task_ids: Indices of the tasks.
+        source: Where the sentences come from, for the error.
+
+    Raises:
+        InstructionsError: A task has none.
+    """
+    missing = [task_id for task_id in task_ids if not instructions.get(task_id)]
+    if missing:
+        others = f" and {len(missing) - 1} others" if len(missing) > 1 else ""
+        raise InstructionsError(
+            f"{source} has no instruction for task {missing[0]} ({get_task(missing[0]).instruction!r})"
+            f"{others}. Add some, or choose other tasks."
+        )
+
+
+def check_authors(rows: Iterable[tuple[int, str]], source: str) -> None:
+    """Checks that rows are as many as the authors': five for each of the 300 tasks.
+
+    Args:
+        rows: Index of the task and sentence, of each row.
+        source: Where they come from, for the error.
+
+    Raises:
+        InstructionsError: A task has more or fewer.
+    """
+    counts = dict.fromkeys(range(N_TASKS), 0)
+    for task_id, _ in rows:
+        counts[task_id] += 1
+    wrong = [task_id for task_id, count in counts.items() if count != AUTHORS_SENTENCES_PER_TASK]
+    if wrong:
+        raise InstructionsError(
+            f"{source} must have {AUTHORS_SENTENCES_PER_TASK} instructions for each of the {N_TASKS} tasks. "
+            f"It has {sum(counts.values())} in all, and {counts[wrong[0]]} for task {wrong[0]}."
+        )
+
+
+def _key(sentence: str) -> str:
+    """Equal for sentences that differ in nothing but capital letters, which encoders do not see."""
+    return sentence.casefold()

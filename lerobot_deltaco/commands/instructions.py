@@ -1,0 +1,59 @@
+"""`deltaco-instructions`: fetches the instructions that people wrote, and checks files of instructions."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from gym_deltaco.instructions import (
+    INSTRUCTION_SPLITS,
+    InstructionsError,
+    read_instructions,
+    split_instructions,
+)
+from lerobot_deltaco.data.authors_instructions import AUTHORS_URL, fetch_instructions
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Fetches instructions, or checks some, and says how many there are."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        if options.check is None:
+            if options.out.exists():
+                parser.error(f"{options.out} is there already. Check it with --check {options.out}.")
+            fetch_instructions(options.out, options.url)
+        path = options.check or options.out
+        instructions = read_instructions(path)
+    except (InstructionsError, OSError) as error:
+        parser.exit(1, f"{parser.prog}: {error}\n")
+    lines = [f"{path}: distinct instructions of {len(instructions)} tasks"]
+    for split in INSTRUCTION_SPLITS:
+        chosen = split_instructions(instructions, split)
+        lines.append(f"  {split}: {sum(map(len, chosen.values()))} of {len(chosen)} tasks")
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="deltaco-instructions",
+        description="Downloads the 1,500 instructions that the paper's authors collected from people, five "
+        "for each task, and checks them; or checks a file of your own: CSV with the columns task_id and "
+        "instruction. Use the file with deltaco-evaluate --instructions, --env.instructions and "
+        "--policy.instructions.",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("human_instructions.csv"),
+        metavar="FILE",
+        help="where to write them (%(default)s)",
+    )
+    parser.add_argument("--url", default=AUTHORS_URL, help="where they are (%(default)s)")
+    parser.add_argument("--check", type=Path, metavar="FILE", help="only check this file")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
