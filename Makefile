@@ -9,8 +9,8 @@ INSTALLING := $(VENV)/.installing
 PYTHON ?=
 # More arguments for pytest: make test ARGS="-k tasks"
 ARGS ?=
-# A row of the paper's tables, a file in experiments/, and the seed of its training
-ROW ?= scenario_a/deltaco
+# An experiment, which is a file in experiments/, and the seed of its training
+EXPERIMENT ?= scenario_a/deltaco
 SEED ?= 0
 # Of the training of scenario A on a GPU, and further settings: SETTINGS="--set data.episodes_per_task=50"
 STEPS ?= 100000
@@ -35,8 +35,8 @@ install: $(INSTALLED) ## Only set up the environment, in .venv
 demo: $(INSTALLED) ## Collect, train and evaluate on a few tasks, in a quarter of an hour: outputs/demo
 	$(BIN)/deltaco-demo --out outputs/demo
 
-experiment: $(INSTALLED) ## Run a row of the tables: make experiment ROW=scenario_a/deltaco SEED=0
-	$(BIN)/deltaco-experiment $(ROW) --seed $(SEED)
+experiment: $(INSTALLED) ## Run an experiment: make experiment EXPERIMENT=scenario_a/deltaco SEED=0
+	$(BIN)/deltaco-experiment $(EXPERIMENT) --seed $(SEED)
 
 gpu-scenario-a: $(INSTALLED) ## Scenario A in full, on a GPU: make gpu-scenario-a STEPS=100000 SEED="0 1 2"
 	$(BIN)/deltaco-experiment scenario_a/deltaco scenario_a/language_only scenario_a/demo_only --seed $(SEED) \

@@ -6,7 +6,7 @@ import sys
 try:
     # These register `--env.type=deltaco` and `--policy.type=deltaco`, and the steps of its processors.
     import lerobot_deltaco.configuration_deltaco
-    import lerobot_deltaco.configuration_env
+    import lerobot_deltaco.envs.configuration_env
     import lerobot_deltaco.processor_deltaco  # noqa: F401
 except Exception as error:
     problem = (

@@ -74,7 +74,7 @@ def make_policy(device: str, backbone: str, dtype: str) -> DeltacoPolicy:
     n_episodes = len(TASKS) * EPISODES_PER_TASK
     frames = torch.randint(0, 256, (n_episodes, 2, 3, 48, 48), dtype=torch.uint8)
     tasks = [task for task in TASKS for _ in range(EPISODES_PER_TASK)]
-    policy.demonstrate_with(DemonstrationSet(frames, tasks, range(n_episodes)))
+    policy.set_train_demonstrations(DemonstrationSet(frames, tasks, range(n_episodes)))
     vectors = torch.nn.functional.normalize(torch.randn(len(TASKS), EMBEDDING_DIM), dim=-1)
     policy.instructions.put(TASKS, vectors)
     return policy.to(device)

@@ -2,7 +2,7 @@
 
 Side by side: stock `lerobot-train`, which reads each frame from the disk, and `deltaco-train`. For both:
 samples per second of the data path alone and of training, and where the time of a training goes. The dataset,
-of random pictures, is made beforehand in a temporary folder. Times are of one machine; compare figures of one
+of random images, is made beforehand in a temporary folder. Times are of one machine; compare figures of one
 run. Run it while nothing else uses the processor.
 """
 
@@ -36,7 +36,7 @@ from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
 REPO_ID = "benchmark/random"
 N_TASKS, EPISODES_PER_TASK, EPISODE_LENGTH = 16, 12, 30
-PICTURE_AXES = ["height", "width", "channels"]
+IMAGE_AXES = ["height", "width", "channels"]
 PARTS = ("data", "forward", "backward", "optimizer")
 
 
@@ -74,10 +74,10 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def make_dataset(root: Path) -> None:
-    """A dataset with the benchmark's features; noise, so that pictures are as large as they get."""
+    """A dataset with the benchmark's features; noise, so that images are as large as they get."""
     names = ["delta_x", "delta_y", "delta_z", "gripper"]
     features = {
-        "observation.image": {"dtype": "image", "shape": (48, 48, 3), "names": PICTURE_AXES},
+        "observation.image": {"dtype": "image", "shape": (48, 48, 3), "names": IMAGE_AXES},
         "observation.state": {"dtype": "float32", "shape": (10,), "names": None},
         "action": {"dtype": "float32", "shape": (4,), "names": names},
     }

@@ -11,8 +11,8 @@ from typing import NamedTuple
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
 from lerobot_deltaco.data.feature_names import ACTION_NAMES
-from lerobot_deltaco.optimization import CosineSchedulerConfig, FusedAdamWConfig
-from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
+from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAdamWConfig
 
 
 class Conditioning(NamedTuple):
@@ -64,7 +64,7 @@ DTYPES = ("float32", "bfloat16")
 class DeltacoConfig(PreTrainedConfig):
     """DeL-TaCo (Yu & Mooney, ICLR 2023): a policy told its task by a demonstration and an instruction.
 
-    The defaults are the paper's (appendix B), for pictures of 48 x 48 pixels. On a small machine, choose
+    The defaults are the paper's (appendix B), for images of 48 x 48 pixels. On a small machine, choose
     `backbone=strided`: half of the residual blocks, with up to 64 channels, on maps of half the size, for a
     seventeenth of the arithmetic, and, with `demo_encoder=cnn`, a demonstration encoder on maps of half the
     size.
@@ -85,7 +85,7 @@ class DeltacoConfig(PreTrainedConfig):
         demo_rows: m, rows of the array of a demonstration's frames.
         demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
             (For the attention, which has no array, they are m n frames.)
-        image_size: Height and width to which pictures are scaled, if they differ.
+        image_size: Height and width to which images are scaled, if they differ.
         backbone: paper or strided.
         motion_modes: Gaussians of the motion's distribution. The paper has one, whose mean is between two
             motions where either would do; of several, the likeliest acts.
@@ -327,7 +327,7 @@ class DeltacoConfig(PreTrainedConfig):
             )
         shapes = {name: tuple(feature.shape) for name, feature in self.image_features.items()}
         if any(len(shape) != 3 or shape[0] != 3 for shape in shapes.values()):
-            raise ValueError(f"Pictures must have the shape (3, height, width). Got {shapes}.")
+            raise ValueError(f"Images must have the shape (3, height, width). Got {shapes}.")
         (action_dim,) = self.action_feature.shape
         if self.gripper_index is not None and not self.gripper_index < action_dim:
             raise ValueError(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from lerobot_deltaco.cards.policy_card import policy_card
 from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
@@ -34,7 +35,6 @@ from lerobot_deltaco.policy.losses import (
     mixture_negative_log_likelihood,
 )
 from lerobot_deltaco.policy.memory import keep_freed_memory
-from lerobot_deltaco.policy.model_card import model_card
 from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
 from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.training_episodes import training_episodes
@@ -43,15 +43,17 @@ logger = logging.getLogger(__name__)
 
 # Beside the weights: embeddings of instructions, and the demonstrations for evaluation.
 TASKS_FILE = "tasks.safetensors"
+# Of the names that the weights of `DeltacoPolicy.model` had before version 0.2.
+OLD_MODEL_PREFIX = "policy."
 
 
-class _Told(NamedTuple):
-    """What the policy is told of the tasks of a batch, for as long as an episode lasts."""
+class TaskConditioning(NamedTuple):
+    """What the networks receive about the tasks of a batch, computed once per episode."""
 
     tasks: tuple[str, ...]
     film: Tensor  # (batch, film_dim)
     concat: Tensor | None  # (batch, concatenated embeddings)
-    network: nn.Module  # that acts on it
+    model: nn.Module  # the network that acts
 
 
 class DeltacoPolicy(PreTrainedPolicy):
@@ -60,10 +62,6 @@ class DeltacoPolicy(PreTrainedPolicy):
     In training, each sample's demonstration is another episode of its task, from the training dataset. At
     evaluation, demonstrations come from the dataset that the configuration names, or from the checkpoint.
     The instruction is the batch's `task`.
-
-    Attributes:
-        shown_as: For an instruction, the task string whose demonstrations are shown with it, where that is
-            another one: `policy.shown_as["fetch me the red one"] = "Put red colored object in green bin."`.
 
     Args:
         config: The configuration. Features that it lacks are filled in by LeRobot beforehand.
@@ -87,14 +85,14 @@ class DeltacoPolicy(PreTrainedPolicy):
         self.instructions = InstructionTable(config.language_encoder)
         if config.instruction_embeddings is not None:
             self.instructions.read(Path(config.instruction_embeddings))
-        self.shown: DemonstrationSet | None = None  # for evaluation
-        self.trained_on: DemonstrationSet | None = None  # for training; read when the first batch comes
-        self.shown_as: dict[str, str] = {}
-        self._knows_all_episodes = False  # whether each episode that is trained on is surely among those
+        self.eval_demonstrations: DemonstrationSet | None = None
+        self.train_demonstrations: DemonstrationSet | None = None  # read with the first training batch
+        self._train_demonstrations_are_complete = False  # whether they surely include every training episode
+        self._demonstrated_as: Mapping[str, str] = {}
         if config.demo_repo_id is not None:
-            self.shown = self._load(config.demo_repo_id, config.demo_root, None)
+            self.eval_demonstrations = self._load_demonstrations(config.demo_repo_id, config.demo_root, None)
         if config.method == "one_hot" and not config.one_hot_tasks:
-            config.one_hot_tasks = self._vocabulary()
+            config.one_hot_tasks = self._one_hot_vocabulary()
 
         film, concat, encoder_loss = config.conditioning
         dims = {
@@ -108,7 +106,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         backbone = BACKBONES[config.backbone]
         state = config.robot_state_feature
         action_dim = config.action_feature.shape[0]
-        self.policy = ConditionedPolicy(
+        self.model = ConditionedPolicy(
             n_cameras=len(config.image_features),
             film_dim=dims[film],
             concat_dim=dims[concat] + (state.shape[0] if state else 0),
@@ -126,11 +124,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
         if config.compile:
-            for network in (self.policy, self.demo_encoder):
+            for network in (self.model, self.demo_encoder):
                 if network is not None:
                     network.compile()
-        self._folded = FoldedPolicy(self.policy)
-        self._told: dict[int, _Told] = {}
+        self._folded = FoldedPolicy(self.model)
+        self._conditioning: dict[int, TaskConditioning] = {}
         self._n_episodes: dict[str, int] = {}  # of each task
         self.reset()
 
@@ -174,7 +172,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         distinct = {task: n for n, task in enumerate(dict.fromkeys(tasks))}
         column = torch.tensor([distinct[task] for task in tasks], device=device)
         if self.config.uses_demo:
-            demo = self._show(batch["episode_index"], tasks, column, generator)
+            demo = self._train_demo_embeddings(batch["episode_index"], tasks, column, generator)
         if self.config.uses_language:
             known = self.instructions(list(distinct), device)  # (distinct, embedding)
             language = known[column]  # (batch, embedding)
@@ -187,7 +185,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             loss = torch.stack([part[0] for part in parts]).mean(dim=0)
             logged = {name: torch.stack([part[1][name] for part in parts]).mean() for name in parts[0][1]}
         else:
-            film, concat = self._told_by(tasks, demo, language)
+            film, concat = self.conditioning_inputs(tasks, demo, language)
             loss, logged = self._imitation_loss(batch, images, film, concat)
 
         if self.config.conditioning.encoder_loss != "none":
@@ -207,11 +205,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         self, batch: dict[str, Any], images: Tensor, film: Tensor, concat: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """L_pi of each sample, (batch,), and its parts."""
-        predicted, gripper = self.policy(images, film, self._concatenated(batch, concat))
+        predicted, gripper = self.model(images, film, self._concatenated(batch, concat))
         action = batch[ACTION].float()
-        motion, target = self._split(action)
+        motion, target = self._split_action(action)
         likelihood = mixture_negative_log_likelihood(
-            predicted.means.float(), predicted.logits.float(), self.policy.log_std.float(), motion
+            predicted.means.float(), predicted.logits.float(), self.model.log_std.float(), motion
         )
         error = (predicted.mean.float() - motion).square()
         logged = {"motion_nll": likelihood.mean(), "motion_mse": error.mean()}
@@ -222,33 +220,34 @@ class DeltacoPolicy(PreTrainedPolicy):
         logged["gripper_accuracy"] = ((gripper > 0) == (target > 0.5)).float().mean()
         return likelihood + self.config.gripper_weight * error, logged
 
-    def demonstrate_with(self, demonstrations: DemonstrationSet) -> None:
+    def set_train_demonstrations(self, demonstrations: DemonstrationSet) -> None:
         """Gives demonstrations for training, instead of those that the first batch would read from the disk.
 
         Args:
             demonstrations: Among them is every episode that is trained on.
         """
-        self.trained_on = demonstrations
-        self._knows_all_episodes = True
+        self.train_demonstrations = demonstrations
+        self._train_demonstrations_are_complete = True
 
-    def _show(
+    def _train_demo_embeddings(
         self, episodes: Tensor, tasks: Sequence[str], column: Tensor, generator: torch.Generator
     ) -> Tensor:
         """Embeddings of demonstrations for samples, (batch, embedding); `column` numbers their tasks."""
-        shown = self._training_demonstrations(episodes.device)
+        demonstrations = self._training_demonstrations(episodes.device)
         if not self.training:
-            rows = shown.others(episodes, generator, tasks=tasks)
-            return self._encode_demo(shown, rows, generator)
-        check = not self._knows_all_episodes
+            rows = demonstrations.sample_other_episodes(episodes, generator, tasks=tasks)
+            return self._encode_demo(demonstrations, rows, generator)
+        check = not self._train_demonstrations_are_complete
         if not self.config.demos_per_task:
-            return self._encode_demo(shown, shown.others(episodes, generator, check), generator)
-        rows, which = shown.shared(
+            rows = demonstrations.sample_other_episodes(episodes, generator, check)
+            return self._encode_demo(demonstrations, rows, generator)
+        rows, which = demonstrations.sample_shared_episodes(
             episodes, column, len(set(tasks)), self.config.demos_per_task, generator, check
         )
-        return self._encode_demo(shown, rows, generator)[which]
+        return self._encode_demo(demonstrations, rows, generator)[which]
 
     def _training_demonstrations(self, device: torch.device) -> DemonstrationSet:
-        if self.trained_on is None:
+        if self.train_demonstrations is None:
             if self._meta is None:
                 raise ValueError("Only a policy that was made with a dataset's metadata can be trained.")
             if self.config.tasks_per_batch:
@@ -257,8 +256,9 @@ class DeltacoPolicy(PreTrainedPolicy):
                     "`deltaco-train`, which takes the same arguments."
                 )
             chosen = self.config.demo_episodes or training_episodes(self._meta)
-            self.trained_on = self._load(self._meta.repo_id, self._meta.root, chosen).to(device)
-        return self.trained_on
+            loaded = self._load_demonstrations(self._meta.repo_id, self._meta.root, chosen)
+            self.train_demonstrations = loaded.to(device)
+        return self.train_demonstrations
 
     def _generator(self) -> torch.Generator:
         rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
@@ -274,11 +274,27 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Begins an episode (of this thread, if several evaluate tasks at the same time)."""
-        self._told.pop(threading.get_ident(), None)
+        self._conditioning.pop(threading.get_ident(), None)
 
     def begin_evaluation(self) -> None:
         """Forgets how many episodes each task has had: its demonstrations begin with the first again."""
         self._n_episodes.clear()
+
+    @contextmanager
+    def demonstrated_as(self, tasks: Mapping[str, str]) -> Iterator[None]:
+        """Demonstrates instructions by other tasks' demonstrations while the context is open.
+
+        For a sentence of one's own: `with policy.demonstrated_as({"fetch the jar": task.instruction}): ...`
+
+        Args:
+            tasks: Maps an instruction to the task string whose demonstrations are used with it. It is read at
+                the start of each episode; instructions that are not in it have their own demonstrations.
+        """
+        previous, self._demonstrated_as = self._demonstrated_as, tasks
+        try:
+            yield
+        finally:
+            self._demonstrated_as = previous
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
@@ -296,38 +312,42 @@ class DeltacoPolicy(PreTrainedPolicy):
         tasks = tuple(batch["task"])
         images = self._images(batch)
         with self._autocast(images.device):
-            told = self._told.get(threading.get_ident())
-            if told is None or told.tasks != tasks:
-                told = self._told[threading.get_ident()] = self._tell(tasks, images.device)
-            motion, gripper = told.network(images, told.film, self._concatenated(batch, told.concat))
-        return self._joined(motion.mean.float(), None if gripper is None else torch.sigmoid(gripper.float()))
+            conditioning = self._conditioning.get(threading.get_ident())
+            if conditioning is None or conditioning.tasks != tasks:
+                conditioning = self.encode_task(tasks, images.device)
+                self._conditioning[threading.get_ident()] = conditioning
+            concatenated = self._concatenated(batch, conditioning.concat)
+            motion, gripper = conditioning.model(images, conditioning.film, concatenated)
+        if gripper is not None:
+            gripper = torch.sigmoid(gripper.float())
+        return self._join_action(motion.mean.float(), gripper)
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The action as a chunk of one, (batch, 1, action)."""
         return self.select_action(batch, **kwargs).unsqueeze(1)
 
-    def _tell(self, tasks: tuple[str, ...], device: torch.device) -> _Told:
+    def encode_task(self, tasks: tuple[str, ...], device: torch.device) -> TaskConditioning:
         """Encodes the demonstrations and instructions of tasks, once an episode."""
-        trials = self._count(tasks)
+        trials = self._count_trials(tasks)
         demo = language = None
         if self.config.uses_demo:
-            shown, rows = self._choose(tasks, trials)
+            demonstrations, rows = self._eval_demonstrations_of(tasks, trials)
             generator = torch.Generator().manual_seed(self.config.seed)
-            demo = self._encode_demo(shown, rows, generator)
+            demo = self._encode_demo(demonstrations, rows, generator)
         if self.config.uses_language:
             language = self.instructions(tasks, device)
         if self.config.method == "mcil":
             # The trials of a task use the language and the demonstration in turn.
             by_language = torch.tensor(trials, device=device) % 2 == 0
             film = torch.where(by_language[:, None], self.project_language(language), demo)
-            return _Told(tasks, film, None, self._acting())
-        return _Told(tasks, *self._told_by(tasks, demo, language), self._acting())
+            return TaskConditioning(tasks, film, None, self._acting_model())
+        return TaskConditioning(tasks, *self.conditioning_inputs(tasks, demo, language), self._acting_model())
 
-    def _acting(self) -> nn.Module:
+    def _acting_model(self) -> nn.Module:
         """The network that acts: a copy that is quicker for small batches, unless in training mode."""
-        return self.policy if self.training else self._folded.network()
+        return self.model if self.training else self._folded.network()
 
-    def _count(self, tasks: tuple[str, ...]) -> list[int]:
+    def _count_trials(self, tasks: tuple[str, ...]) -> list[int]:
         """The number of each sample's episode among those of its task, from 0, whichever thread runs them."""
         trials = []
         for task in tasks:
@@ -335,26 +355,32 @@ class DeltacoPolicy(PreTrainedPolicy):
             self._n_episodes[task] = trials[-1] + 1
         return trials
 
-    def _choose(self, tasks: tuple[str, ...], trials: Sequence[int]) -> tuple[DemonstrationSet, Tensor]:
+    def _eval_demonstrations_of(
+        self, tasks: tuple[str, ...], trials: Sequence[int]
+    ) -> tuple[DemonstrationSet, Tensor]:
         """The demonstrations for evaluation, and the row of each task's; those of a task take turns."""
-        candidates = [shown for shown in (self.shown, self.trained_on) if shown is not None]
-        if self.config.demo_episode is not None and self.shown is not None:
-            found = (self.shown.episodes == self.config.demo_episode).nonzero().flatten()
+        candidates = [
+            demonstrations
+            for demonstrations in (self.eval_demonstrations, self.train_demonstrations)
+            if demonstrations is not None
+        ]
+        if self.config.demo_episode is not None and self.eval_demonstrations is not None:
+            found = (self.eval_demonstrations.episodes == self.config.demo_episode).nonzero().flatten()
             if not len(found):
                 raise ValueError(
                     f"`demo_episode` is {self.config.demo_episode}, but the demonstrations are the episodes "
-                    f"{self.shown.episodes.tolist()[:10]} ..."
+                    f"{self.eval_demonstrations.episodes.tolist()[:10]} ..."
                 )
-            return self.shown, found[:1].expand(len(tasks))
-        tasks = tuple(self.shown_as.get(task, task) for task in tasks)
-        for shown in candidates:
-            if all(task in shown.rows for task in tasks):
+            return self.eval_demonstrations, found[:1].expand(len(tasks))
+        tasks = tuple(self._demonstrated_as.get(task, task) for task in tasks)
+        for demonstrations in candidates:
+            if all(task in demonstrations.rows for task in tasks):
                 rows = [
-                    shown.rows[task][trial % len(shown.rows[task])]
+                    demonstrations.rows[task][trial % len(demonstrations.rows[task])]
                     for task, trial in zip(tasks, trials, strict=True)
                 ]
-                return shown, torch.tensor(rows, device=shown.frames.device)
-        there = sorted({task for shown in candidates for task in shown.rows})
+                return demonstrations, torch.tensor(rows, device=demonstrations.frames.device)
+        there = sorted({task for demonstrations in candidates for task in demonstrations.rows})
         missing = next(task for task in tasks if task not in there) if there else tasks[0]
         raise ValueError(
             f"There is no demonstration of the task {missing!r}. There are {len(there)} tasks"
@@ -371,15 +397,15 @@ class DeltacoPolicy(PreTrainedPolicy):
     # Both
 
     def _images(self, batch: dict[str, Any]) -> Tensor:
-        """Pictures of all cameras, (batch, cameras, 3, size, size)."""
+        """Images of all cameras, (batch, cameras, 3, size, size)."""
         size = self.config.image_size
-        pictures = []
+        images = []
         for name in self.config.image_features:
             image = batch[name]  # (batch, 3, H, W)
             if image.shape[-2:] != (size, size):
                 image = F.interpolate(image, (size, size), mode="bilinear", antialias=True)
-            pictures.append(image)
-        return torch.stack(pictures, dim=1)
+            images.append(image)
+        return torch.stack(images, dim=1)
 
     def _concatenated(self, batch: dict[str, Any], embedding: Tensor | None) -> Tensor | None:
         parts = [embedding] if embedding is not None else []
@@ -387,7 +413,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             parts.append(batch[OBS_STATE])
         return torch.cat(parts, dim=-1) if parts else None
 
-    def _told_by(
+    def conditioning_inputs(
         self, tasks: Sequence[str], demo: Tensor | None, language: Tensor | None
     ) -> tuple[Tensor | None, Tensor | None]:
         """What goes through FiLM and what is concatenated."""
@@ -414,14 +440,16 @@ class DeltacoPolicy(PreTrainedPolicy):
         indices = torch.tensor([places[task] for task in tasks], device=self.step.device)
         return F.one_hot(indices, len(places)).float()
 
-    def _encode_demo(self, shown: DemonstrationSet, rows: Tensor, generator: torch.Generator) -> Tensor:
+    def _encode_demo(
+        self, demonstrations: DemonstrationSet, rows: Tensor, generator: torch.Generator
+    ) -> Tensor:
         """Unit embeddings of demonstrations, (batch, embedding)."""
-        frames = shown.pictures(rows, self.config.n_demo_frames, generator)
+        frames = demonstrations.sample_frames(rows, self.config.n_demo_frames, generator)
         if self.training and self.config.demo_crop_padding:
             frames = random_crop(frames, self.config.demo_crop_padding, generator)
         return self.demo_encoder(frames)
 
-    def _split(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _split_action(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
         """An action's motion, and its gripper in 0..1."""
         index = self.config.gripper_index
         if index is None:
@@ -429,8 +457,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         motion = torch.cat([action[:, :index], action[:, index + 1 :]], dim=1)
         return motion, (action[:, index] + 1) / 2
 
-    def _joined(self, motion: Tensor, gripper: Tensor | None) -> Tensor:
-        """The inverse of `_split`."""
+    def _join_action(self, motion: Tensor, gripper: Tensor | None) -> Tensor:
+        """The inverse of `_split_action`."""
         index = self.config.gripper_index
         if index is None:
             return motion
@@ -438,18 +466,25 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     # Datasets and checkpoints
 
-    def _load(
+    def _load_demonstrations(
         self, repo_id: str, root: str | Path | None, episodes: Sequence[int] | None
     ) -> DemonstrationSet:
         camera = next(iter(self.config.image_features))
         size, n_frames = self.config.image_size, self.config.n_demo_frames
         return load_demonstrations(repo_id, root, episodes, camera, size, n_frames)
 
-    def _vocabulary(self) -> list[str]:
+    def _one_hot_vocabulary(self) -> list[str]:
         """Tasks of the training and demonstration datasets."""
         if self._meta is None:
             raise ValueError("A one-hot policy is made with a dataset, whose tasks it will know.")
-        return list(dict.fromkeys([*self._meta.tasks.index, *(self.shown.rows if self.shown else ())]))
+        return list(
+            dict.fromkeys(
+                [
+                    *self._meta.tasks.index,
+                    *(self.eval_demonstrations.rows if self.eval_demonstrations else ()),
+                ]
+            )
+        )
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         # What was read from the datasets is saved; the next user may name others.
@@ -463,9 +498,12 @@ class DeltacoPolicy(PreTrainedPolicy):
             for name, value in given.items():
                 setattr(self.config, name, value)
         tensors, known = self.instructions.state()
-        if self.shown is not None and self.config.uses_demo:
-            tensors |= {"frames": self.shown.frames.cpu(), "episodes": self.shown.episodes.cpu()}
-            known["tasks"] = json.dumps(self.shown.tasks)
+        if self.eval_demonstrations is not None and self.config.uses_demo:
+            tensors |= {
+                "frames": self.eval_demonstrations.frames.cpu(),
+                "episodes": self.eval_demonstrations.episodes.cpu(),
+            }
+            known["tasks"] = json.dumps(self.eval_demonstrations.tasks)
         save_file(tensors, save_directory / TASKS_FILE, metadata=known)
 
     @classmethod
@@ -486,6 +524,22 @@ class DeltacoPolicy(PreTrainedPolicy):
         policy._read_tasks(path)
         return policy
 
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """Loads weights. See `torch.nn.Module.load_state_dict`.
+
+        Raises:
+            ValueError: The weights were saved by a version that named them otherwise.
+        """
+        if any(name.startswith(OLD_MODEL_PREFIX) for name in state_dict):
+            raise ValueError(
+                "An earlier version of lerobot_policy_deltaco saved these weights: those of the policy's "
+                f"network are named `{OLD_MODEL_PREFIX}*`. Train the policy again, or rename them in "
+                f"model.safetensors: replace the prefix `{OLD_MODEL_PREFIX}` by `model.`."
+            )
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+
     def generate_model_card(
         self,
         dataset_repo_id: str,
@@ -496,9 +550,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> ModelCard:
         """The card that goes to the Hub with the policy. LeRobot's arguments."""
-        shown = list(self.shown.rows) if self.shown is not None else []
+        demonstrations = list(self.eval_demonstrations.rows) if self.eval_demonstrations is not None else []
         n_known = len(self.instructions.rows)
-        return model_card(self.config, shown, n_known, dataset_repo_id, license, tags, cfg, dataset_meta)
+        return policy_card(
+            self.config, demonstrations, n_known, dataset_repo_id, license, tags, cfg, dataset_meta
+        )
 
     def _read_tasks(self, path: Path) -> None:
         self.instructions.read(path)
@@ -506,7 +562,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             known = file.metadata()
             names = set(file.keys())
             # Demonstrations named on the command line come before those of the checkpoint.
-            if self.shown is None and "frames" in names:
-                self.shown = DemonstrationSet(
+            if self.eval_demonstrations is None and "frames" in names:
+                self.eval_demonstrations = DemonstrationSet(
                     file.get_tensor("frames"), json.loads(known["tasks"]), file.get_tensor("episodes")
                 ).to(self.config.device)

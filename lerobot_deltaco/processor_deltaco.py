@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline, make_default_pre_post_processors
 
-import lerobot_deltaco.thread_safe_steps  # noqa: F401
+import lerobot_deltaco.lerobot_internals.thread_safe_steps  # noqa: F401
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 
 
@@ -19,7 +19,7 @@ def make_deltaco_pre_post_processors(
 ]:
     """LeRobot's usual pipelines, with the configuration's normalization.
 
-    Pictures stay in 0..1; the state has mean 0 and standard deviation 1; actions are in -1..1: those of the
+    Images stay in 0..1; the state has mean 0 and standard deviation 1; actions are in -1..1: those of the
     benchmark as they are, any other dataset's by their least and greatest values.
 
     Args:

@@ -133,7 +133,7 @@ def read_frames(root):
     )
 
 
-def picture(cell):
+def decoded(cell):
     return np.asarray(Image.open(io.BytesIO(cell["bytes"])))
 
 
@@ -173,7 +173,7 @@ def test_episodes_replayed_from_their_seeds_are_the_same_to_the_bit(finished):
         assert info["target_container"] == first["benchmark.target_container"]
         assert len(episode) == EPISODE_STEPS
         for _, frame in episode.iterrows():
-            np.testing.assert_array_equal(picture(frame["observation.image"]), observation["pixels"])
+            np.testing.assert_array_equal(decoded(frame["observation.image"]), observation["pixels"])
             np.testing.assert_array_equal(frame["observation.state"], observation["agent_pos"])
             observation, reward, _, _, info = env.step(frame["action"])
             assert frame["next.reward"] == reward
@@ -366,8 +366,8 @@ def test_an_interrupted_addition_leaves_the_old_dataset_readable(copy, tmp_path,
 
 
 @pytest.mark.parametrize("change", [{"image_size": 32}, {"ambiguity": "object"}])
-def test_other_pictures_are_not_added(copy, change, in_process):
-    with pytest.raises(CollectionError, match="pictures differ in size, ambiguity, renderer"):
+def test_other_images_are_not_added(copy, change, in_process):
+    with pytest.raises(CollectionError, match="images differ in size, ambiguity, renderer"):
         collect(copy, replace(PLAN, **change), append=True)
     assert not in_process
 

@@ -63,9 +63,9 @@ def dataset(root):
 def frames(root):
     """All frames, decoded without LeRobot: each feature's values, (N, ...)."""
     table = pd.concat([pd.read_parquet(path) for path in data_files(root)])
-    pictures = [np.asarray(Image.open(io.BytesIO(cell["bytes"]))) for cell in table["observation.image"]]
+    images = [np.asarray(Image.open(io.BytesIO(cell["bytes"]))) for cell in table["observation.image"]]
     return {
-        name: np.stack(pictures if name == "observation.image" else list(column.to_numpy()))
+        name: np.stack(images if name == "observation.image" else list(column.to_numpy()))
         for name, column in table.items()
     }
 
@@ -180,20 +180,20 @@ def test_tables_have_the_columns_types_and_values_that_lerobot_writes(root, refe
     assert our_schema.equals(their_schema)
     assert hugging_face(our_schema) == hugging_face(their_schema)
     assert len(ours) == len(theirs)
-    # Which file has an episode is up to the writer, and statistics and pictures are compared elsewhere.
+    # Which file has an episode is up to the writer, and statistics and images are compared elsewhere.
     elsewhere = ("data/", "meta/", "stats/", "observation.image")
     for name in our_schema.names:
         if not name.startswith(elsewhere):
             assert nested(ours[name].to_list()) == nested(theirs[name].to_list()), name
 
 
-def test_pictures_have_the_names_and_pixels_that_lerobot_writes(root, reference):
+def test_images_have_the_names_and_pixels_that_lerobot_writes(root, reference):
     ours, theirs = (all_rows(path, "data")[1]["observation.image"] for path in (root, reference))
     for our_cell, their_cell in zip(ours, theirs, strict=True):
         assert our_cell["path"] == their_cell["path"]
-        our_picture, their_picture = (Image.open(io.BytesIO(c["bytes"])) for c in (our_cell, their_cell))
-        assert our_picture.mode == their_picture.mode == "RGB"
-        np.testing.assert_array_equal(our_picture, their_picture)
+        our_image, their_image = (Image.open(io.BytesIO(c["bytes"])) for c in (our_cell, their_cell))
+        assert our_image.mode == their_image.mode == "RGB"
+        np.testing.assert_array_equal(our_image, their_image)
 
 
 def test_tasks_are_what_lerobot_writes(root, reference):
@@ -318,9 +318,9 @@ def test_statistics_of_an_episode_are_what_lerobot_computes(root, frames, tmp_pa
         of_episode = slice(episode * LENGTH, (episode + 1) * LENGTH)
         columns = {name: values[of_episode] for name, values in frames.items()}
         paths = []
-        for i, picture in enumerate(columns["observation.image"]):
+        for i, image in enumerate(columns["observation.image"]):
             paths.append(str(tmp_path / f"{i}.png"))
-            Image.fromarray(picture).save(paths[-1])
+            Image.fromarray(image).save(paths[-1])
         theirs = compute_episode_stats({**columns, "observation.image": paths}, PLAN.features)
         for feature, statistics in theirs.items():
             values = columns[feature].astype(np.float64) / (255 if feature == "observation.image" else 1)
@@ -333,7 +333,7 @@ def test_statistics_of_an_episode_are_what_lerobot_computes(root, frames, tmp_pa
                 )
 
 
-@pytest.mark.parametrize("shape", [(7,), (7, 3), (7, 8, 8, 3)], ids=["numbers", "vectors", "pictures"])
+@pytest.mark.parametrize("shape", [(7,), (7, 3), (7, 8, 8, 3)], ids=["numbers", "vectors", "images"])
 def test_merged_statistics_are_those_of_everything(shape):
     rng = np.random.default_rng(0)
     values = rng.integers(0, 256, shape, dtype=np.uint8)
@@ -387,8 +387,8 @@ def edited_frames(dataset, wanted, frames):
             assert frame["index"] == position * LENGTH + step
             assert frame["benchmark.seed"] == frames["benchmark.seed"][source]
             np.testing.assert_array_equal(frame["observation.state"], frames["observation.state"][source])
-            picture = frame["observation.image"].permute(1, 2, 0).numpy() * 255
-            np.testing.assert_array_equal(picture.round(), frames["observation.image"][source])
+            image = frame["observation.image"].permute(1, 2, 0).numpy() * 255
+            np.testing.assert_array_equal(image.round(), frames["observation.image"][source])
             assert frame["task"] == TASKS[frame["benchmark.task_id"].item()].instruction
 
 

@@ -43,7 +43,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def small_envs():
-    """An environment with small pictures for each ambiguity scheme; tests have to reset it."""
+    """An environment with small images for each ambiguity scheme; tests have to reset it."""
     envs = {ambiguity: PickPlaceEnv(ambiguity=ambiguity, image_size=8) for ambiguity in AMBIGUITIES}
     yield envs
     for env in envs.values():
@@ -179,7 +179,7 @@ def test_observations_stay_in_their_space_when_the_arm_goes_around_its_base():
 
 
 @pytest.mark.parametrize("size", [8, 33, 96])
-def test_pictures_have_the_size_that_is_asked_for(size):
+def test_images_have_the_size_that_is_asked_for(size):
     env = PickPlaceEnv(image_size=size, render_mode="rgb_array", render_size=2 * size)
     observation, _ = env.reset(seed=0)
     assert observation["pixels"].shape == (size, size, 3)
@@ -218,7 +218,7 @@ def test_rendering_changes_nothing(env):
 
 
 def test_containers_are_seen_where_their_words_say():
-    # The camera looks back at the robot: the front is below in the picture, the right is on the right.
+    # The camera looks back at the robot: the front is below in the image, the right is on the right.
     env = PickPlaceEnv(4, render_mode="rgb_array", render_size=128)
     for seed in range(8):
         env.reset(seed=seed)

@@ -17,7 +17,7 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.commands import collect as collect_command
 from lerobot_deltaco.commands import evaluate as evaluate_command
-from lerobot_deltaco.evaluation.evaluate import EvaluationPlan, evaluate, other_task
+from lerobot_deltaco.evaluation.evaluate import EvaluationPlan, counterfactual_task, evaluate
 from lerobot_deltaco.evaluation.record import read_record, record_path
 from lerobot_deltaco.evaluation.runs import RunError, checkpoints, load_policy
 from lerobot_deltaco.training.loop import InMemoryTraining
@@ -117,7 +117,7 @@ def test_a_counterfactual_changes_one_of_both(loaded, changed):
         told = {"demo": episode.demonstration, "instruction": episode.instruction}
         assert told.pop(changed) != own
         assert list(told.values()) == [own]
-    assert loaded.policy.shown_as == {}
+    assert loaded.policy._demonstrated_as == {}
 
 
 def test_the_other_task_asks_for_another_object_of_the_scene_and_the_other_container():
@@ -129,13 +129,13 @@ def test_the_other_task_asks_for_another_object_of_the_scene_and_the_other_conta
         "container_quadrants": np.array([[0, 0], [1, 1]]),
     }
     others = [get_task(index) for index in (5, 14, 64, 55, 214, 100)]
-    chosen = {other_task(others, info, random.Random(seed)).index for seed in range(30)}
+    chosen = {counterfactual_task(others, info, random.Random(seed)).index for seed in range(30)}
     # 64: object 14 into red. 214 is object 14 into left, which is where the red container stands.
     assert chosen == {64, 214}
     # Without such a task, at least the container is another.
-    assert other_task([get_task(5), get_task(55)], info, random.Random(0)).index == 55
+    assert counterfactual_task([get_task(5), get_task(55)], info, random.Random(0)).index == 55
     with pytest.raises(ValueError, match="at least two tasks"):
-        other_task([], info, random.Random(0))
+        counterfactual_task([], info, random.Random(0))
 
 
 def test_the_command_writes_a_record_of_each_checkpoint_once(run, capsys, monkeypatch):

@@ -1,4 +1,4 @@
-"""The rows of the tables: each builds its policy and takes a training step; all that they name is valid."""
+"""Every experiment builds its policy and takes a training step; all that it names is valid."""
 
 import dataclasses
 import os
@@ -17,16 +17,16 @@ from small_policies import TASKS, batch_of, small_policy, use_fake_encoder, writ
 
 from lerobot_deltaco.commands import experiment as experiment_command
 from lerobot_deltaco.data.collection_plan import CollectionPlan
-from lerobot_deltaco.evaluation.authors import PUBLISHED
 from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
 from lerobot_deltaco.experiments import command_runner, side_by_side
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
-from lerobot_deltaco.experiments.rows import RowError, read_row, row_names
-from lerobot_deltaco.experiments.run import Experiment
+from lerobot_deltaco.experiments.config import ExperimentConfigError, experiment_names, read_experiment
+from lerobot_deltaco.experiments.run import ExperimentRun
 from lerobot_deltaco.experiments.side_by_side import run_side_by_side
+from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS
 
 FOLDER = Path(__file__).parents[1] / "experiments"
-ROWS = row_names(FOLDER)
+EXPERIMENTS = experiment_names(FOLDER)
 TRAINING_OPTIONS = {field.name for field in dataclasses.fields(TrainPipelineConfig)}
 
 
@@ -36,11 +36,11 @@ def dataset(tmp_path_factory):
     return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", EXPERIMENTS)
 def test_a_row_builds_its_policy_and_takes_a_training_step(dataset, monkeypatch, name):
     use_fake_encoder(monkeypatch)
-    row = read_row(FOLDER, name)
-    options = {key: value for key, value in row.policy.items() if value is not None}
+    config = read_experiment(FOLDER, name)
+    options = {key: value for key, value in config.policy.items() if value is not None}
     policy, before, _ = small_policy(dataset, **{**options, "device": "cpu", "dtype": "float32"})
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     weights = [parameter.clone() for parameter in policy.parameters()]
@@ -51,76 +51,78 @@ def test_a_row_builds_its_policy_and_takes_a_training_step(dataset, monkeypatch,
     assert any(not torch.equal(old, new) for old, new in zip(weights, policy.parameters(), strict=True))
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", EXPERIMENTS)
 def test_what_a_row_names_is_valid(name):
-    row = read_row(FOLDER, name)
-    plan, shown = CollectionPlan(**row.data), CollectionPlan(**row.demonstrations)
-    evaluation = EvaluationPlan(**row.evaluation)
+    config = read_experiment(FOLDER, name)
+    plan, shown = CollectionPlan(**config.data), CollectionPlan(**config.demonstrations)
+    evaluation = EvaluationPlan(**config.evaluation)
     assert plan.split == "train"
     assert shown.split == "validation"
     assert plan.ambiguity == shown.ambiguity == evaluation.ambiguity
-    assert set(row.training) <= TRAINING_OPTIONS
-    assert row.training["batch_size"] % row.policy["tasks_per_batch"] == 0
-    if row.start_from is not None:
-        assert row.start_from in ROWS
+    assert set(config.training) <= TRAINING_OPTIONS
+    assert config.training["batch_size"] % config.policy["tasks_per_batch"] == 0
+    if config.start_from is not None:
+        assert config.start_from in EXPERIMENTS
 
 
 def test_the_papers_rows_are_there():
     left_out = ("clip", "r3m", "finetuned_0")
-    expected = {name for name in PUBLISHED if not any(word in name for word in left_out)}
-    assert expected <= set(ROWS)
+    expected = {name for name in PAPER_RESULTS if not any(word in name for word in left_out)}
+    assert expected <= set(EXPERIMENTS)
 
 
 def test_rows_share_what_their_folders_say(tmp_path):
     (tmp_path / "one").mkdir()
     (tmp_path / "shared.yaml").write_text("policy: {seed: 1, dtype: float32}\ntraining: {steps: 5}\n")
     (tmp_path / "one" / "shared.yaml").write_text("policy: {seed: 2}\ndata: {tasks: '4'}\n")
-    (tmp_path / "one" / "row.yaml").write_text("policy: {method: one_hot}\n")
-    row = read_row(tmp_path, "one/row")
-    assert row.policy == {"seed": 2, "dtype": "float32", "method": "one_hot"}
-    assert (row.training, row.data, row.evaluation) == ({"steps": 5}, {"tasks": "4"}, {})
+    (tmp_path / "one" / "config.yaml").write_text("policy: {method: one_hot}\n")
+    config = read_experiment(tmp_path, "one/config")
+    assert config.policy == {"seed": 2, "dtype": "float32", "method": "one_hot"}
+    assert (config.training, config.data, config.evaluation) == ({"steps": 5}, {"tasks": "4"}, {})
 
 
 def test_unknown_rows_and_sections_are_refused(tmp_path):
-    with pytest.raises(RowError, match="no row 'scenario_c/deltaco'.*scenario_a/deltaco"):
-        read_row(FOLDER, "scenario_c/deltaco")
+    with pytest.raises(ExperimentConfigError, match="no experiment 'scenario_c/deltaco'.*scenario_a/deltaco"):
+        read_experiment(FOLDER, "scenario_c/deltaco")
     (tmp_path / "one").mkdir()
-    (tmp_path / "one" / "row.yaml").write_text("model: {}\n")
-    with pytest.raises(RowError, match="unknown section 'model'. Valid are data"):
-        read_row(tmp_path, "one/row")
+    (tmp_path / "one" / "config.yaml").write_text("model: {}\n")
+    with pytest.raises(ExperimentConfigError, match="unknown section 'model'. Valid are data"):
+        read_experiment(tmp_path, "one/config")
 
 
 def test_settings_come_before_the_files():
-    row = read_row(FOLDER, "scenario_a/bc_z", ["training.steps=7", "policy.device=cuda", "data.tasks=4,14"])
-    assert (row.training["steps"], row.policy["device"], row.data["tasks"]) == (7, "cuda", "4,14")
-    assert row.policy["method"] == "bc_z"
+    config = read_experiment(
+        FOLDER, "scenario_a/bc_z", ["training.steps=7", "policy.device=cuda", "data.tasks=4,14"]
+    )
+    assert (config.training["steps"], config.policy["device"], config.data["tasks"]) == (7, "cuda", "4,14")
+    assert config.policy["method"] == "bc_z"
     for wrong in ("steps=7", "training.steps", "model.size=3", "training=7"):
-        with pytest.raises(RowError, match="SECTION.NAME=VALUE"):
-            read_row(FOLDER, "scenario_a/bc_z", [wrong])
+        with pytest.raises(ExperimentConfigError, match="SECTION.NAME=VALUE"):
+            read_experiment(FOLDER, "scenario_a/bc_z", [wrong])
 
 
 def test_a_run_does_not_go_on_with_other_settings(tmp_path, monkeypatch):
     monkeypatch.setattr(CommandRunner, "run", lambda *_: None)
-    Experiment(read_row(FOLDER, "scenario_a/deltaco"), 0, tmp_path).do()
-    other = read_row(FOLDER, "scenario_a/deltaco", ["training.steps=7"])
-    with pytest.raises(ExperimentError, match="begun with other settings: training was.*'steps': 800000"):
-        Experiment(other, 0, tmp_path).do()
-    Experiment(other, 1, tmp_path).do()
-    Experiment(read_row(FOLDER, "scenario_a/deltaco"), 0, tmp_path).do()
+    ExperimentRun(read_experiment(FOLDER, "scenario_a/deltaco"), 0, tmp_path).run()
+    other = read_experiment(FOLDER, "scenario_a/deltaco", ["training.steps=7"])
+    with pytest.raises(ExperimentError, match="started with other settings: training was.*'steps': 800000"):
+        ExperimentRun(other, 0, tmp_path).run()
+    ExperimentRun(other, 1, tmp_path).run()
+    ExperimentRun(read_experiment(FOLDER, "scenario_a/deltaco"), 0, tmp_path).run()
 
 
 def test_a_row_that_starts_from_another_needs_it(tmp_path, monkeypatch):
     monkeypatch.setattr(CommandRunner, "run", lambda *_: None)
-    row = read_row(FOLDER, "scenario_a/demo_only_finetuned_10")
-    with pytest.raises(ExperimentError, match="starts from scenario_a/demo_only.*Run that row first"):
-        Experiment(row, 3, tmp_path).do()
+    config = read_experiment(FOLDER, "scenario_a/demo_only_finetuned_10")
+    with pytest.raises(ExperimentError, match="starts from scenario_a/demo_only.*Run that experiment first"):
+        ExperimentRun(config, 3, tmp_path).run()
 
 
 def test_rows_share_their_data(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(CommandRunner, "run", lambda _, *call: calls.append(call))
     for name in ("scenario_a/deltaco", "scenario_a/language_only"):
-        Experiment(read_row(FOLDER, name), 0, tmp_path).do()
+        ExperimentRun(read_experiment(FOLDER, name), 0, tmp_path).run()
     first, second = calls[:4], calls[4:]
     assert [command for command, _ in first] == ["collect", "collect", "train", "evaluate"]
     assert first[:2] == second[:2]
@@ -135,33 +137,33 @@ class _Commands:
     """In the place of the commands: notes which began and ended, and how many there were at once."""
 
     def __init__(self, fails: str = "", until: threading.Event | None = None) -> None:
-        self.fails = fails  # the row whose commands fail; the others' go on ...
+        self.fails = fails  # the config whose commands fail; the others' go on ...
         self.until = until  # ... until then
-        self.events: list[tuple[str, str, str]] = []  # began or ended, command, row
-        self.runners: dict[str, CommandRunner] = {}  # of each row
+        self.events: list[tuple[str, str, str]] = []  # began or ended, command, config
+        self.runners: dict[str, CommandRunner] = {}  # of each config
         self.at_once = self.most_at_once = 0
         self.lock = threading.Lock()
 
     def run(self, runner: CommandRunner, command: str, arguments: list[str]) -> None:
         about = re.search(r"(\w+)/seed_\d+$", "\n".join(arguments), re.M)
-        row = about[1] if about else ""
+        config = about[1] if about else ""
         with self.lock:
-            self.events.append(("began", command, row))
-            self.runners[row] = runner
+            self.events.append(("began", command, config))
+            self.runners[config] = runner
             self.at_once += 1
             self.most_at_once = max(self.most_at_once, self.at_once)
-        if row and row == self.fails:
+        if config and config == self.fails:
             raise ExperimentError(f"{command} failed")
-        if row and self.until is not None:
+        if config and self.until is not None:
             assert self.until.wait(60)
         else:
             time.sleep(0.05)
         with self.lock:
             self.at_once -= 1
-            self.events.append(("ended", command, row))
+            self.events.append(("ended", command, config))
 
     def began(self, command: str) -> list[str]:
-        return [row for what, name, row in self.events if (what, name) == ("began", command)]
+        return [config for what, name, config in self.events if (what, name) == ("began", command)]
 
 
 @pytest.fixture
@@ -171,8 +173,8 @@ def asked(tmp_path, monkeypatch):
 
     def asked(commands, *names, seeds=(0,)):
         monkeypatch.setattr(CommandRunner, "run", lambda self, *call: commands.run(self, *call))
-        rows = [read_row(FOLDER, f"scenario_a/{name}") for name in names]
-        return [Experiment(row, seed, tmp_path) for seed in seeds for row in rows]
+        configs = [read_experiment(FOLDER, f"scenario_a/{name}") for name in names]
+        return [ExperimentRun(config, seed, tmp_path) for seed in seeds for config in configs]
 
     return asked
 
@@ -184,11 +186,11 @@ def test_runs_side_by_side_are_all_done_in_their_logs_with_their_share_of_the_co
     assert [event[:2] for event in commands.events[:4]] == [("began", "collect"), ("ended", "collect")] * 2
     assert len(commands.began("collect")) == 2  # all share their data
     assert len(commands.began("train")) == len(commands.began("evaluate")) == 6
-    assert sorted(reported) == sorted(experiment.run for experiment in experiments)
+    assert sorted(reported) == sorted(experiment.folder for experiment in experiments)
     assert commands.most_at_once == 2
-    for row in ("deltaco", "language_only", "one_hot"):
-        assert commands.runners[row].log.parent.name == row
-        assert commands.runners[row].n_threads == max(1, side_by_side.available_cores() // 2)
+    for config in ("deltaco", "language_only", "one_hot"):
+        assert commands.runners[config].log.parent.name == config
+        assert commands.runners[config].n_threads == max(1, side_by_side.available_cores() // 2)
 
 
 def test_fewer_runs_than_jobs_take_all_cores(asked):
@@ -201,9 +203,9 @@ def test_a_row_waits_for_the_one_that_it_starts_from(asked, monkeypatch):
     commands = _Commands()
     experiments = asked(commands, "demo_only_finetuned_10", "demo_only", "deltaco")
     monkeypatch.setattr(
-        Experiment,
+        ExperimentRun,
         "train_and_evaluate",
-        lambda self, runner: commands.run(runner, "train", [f"--output_dir={self.run}"]),
+        lambda self, runner: commands.run(runner, "train", [f"--output_dir={self.folder}"]),
     )
     run_side_by_side(experiments, 3, lambda run: None)
     began = commands.events.index(("began", "train", "demo_only_finetuned_10"))
@@ -222,11 +224,11 @@ def test_after_a_failure_what_has_begun_is_completed_and_nothing_else_begins(ask
     monkeypatch.setattr(side_by_side._Progress, "write", staticmethod(write))
     with pytest.raises(ExperimentError, match="train failed"):
         run_side_by_side(experiments, 2, reported.append)
-    assert reported == [experiments[0].run]
+    assert reported == [experiments[0].folder]
     assert sorted(commands.began("train")) == ["deltaco", "language_only"]
     # What never began may be asked for with other settings.
-    other = read_row(FOLDER, "scenario_a/one_hot", ["training.steps=7"])
-    Experiment(other, 0, experiments[0].outputs).check_settings()
+    other = read_experiment(FOLDER, "scenario_a/one_hot", ["training.steps=7"])
+    ExperimentRun(other, 0, experiments[0].outputs).check_settings()
 
 
 def test_a_report_that_fails_does_not_take_the_other_runs_along(asked):
@@ -391,4 +393,4 @@ def test_the_command_for_a_gpu_runs_without_one_at_a_tiny_size(tmp_path):
     command = ["make", "-C", str(FOLDER.parent), "gpu-scenario-a", *arguments]
     subprocess.run(command, check=True, env={**os.environ, "HF_HUB_OFFLINE": "1"}, timeout=900)
     report = (tmp_path / "report" / "report.md").read_text()
-    assert all(f"scenario_a/{row}" in report for row in ("deltaco", "language_only", "demo_only"))
+    assert all(f"scenario_a/{config}" in report for config in ("deltaco", "language_only", "demo_only"))

@@ -1,4 +1,4 @@
-"""The gallery draws every picture, says honestly what it shows, and fails in one line."""
+"""The gallery draws every image, says honestly what it shows, and fails in one line."""
 
 import os
 import re
@@ -10,13 +10,14 @@ import pytest
 from PIL import Image
 
 from gym_deltaco import gallery
-from gym_deltaco.gallery import Episode, main, object_views
+from gym_deltaco.gallery import Episode, object_views
 from gym_deltaco.objects import object_model
 from gym_deltaco.sheets import caption, down, write_whole
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import OBJECTS, get_task
+from lerobot_deltaco.commands.gallery import main
 
-PICTURES = {
+IMAGES = {
     "objects_by_shape.png",
     "objects_by_color.png",
     "scenes.png",
@@ -29,18 +30,18 @@ PICTURES = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """What the command writes, run twice."""
-    folder = tmp_path_factory.mktemp("gallery") / "new" / "pictures"
+    folder = tmp_path_factory.mktemp("gallery") / "new" / "images"
     main(["--out", str(folder), "--tasks", "7"])
     main(["--out", str(folder), "--tasks", "4,187"])
     return folder
 
 
-def test_there_are_the_pictures_and_the_page_and_nothing_half_written(folder):
-    assert {path.name for path in folder.iterdir()} == PICTURES | {"index.md"}
+def test_there_are_the_images_and_the_page_and_nothing_half_written(folder):
+    assert {path.name for path in folder.iterdir()} == IMAGES | {"index.md"}
 
 
-@pytest.mark.parametrize("name", sorted(PICTURES))
-def test_a_picture_is_large_enough_to_see_and_small_enough_to_load(folder, name):
+@pytest.mark.parametrize("name", sorted(IMAGES))
+def test_an_image_is_large_enough_to_see_and_small_enough_to_load(folder, name):
     with Image.open(folder / name) as image:
         image.load()
         assert min(image.size) >= 256
@@ -55,21 +56,21 @@ def test_the_animation_shows_each_episode_from_its_start(folder):
         assert 10 <= image.n_frames <= 2 * 31
 
 
-def test_the_page_has_every_picture_and_links_to_nothing_else(folder):
+def test_the_page_has_every_image_and_links_to_nothing_else(folder):
     text = (folder / "index.md").read_text()
-    assert set(re.findall(r"\]\((.*?)\)", text)) == PICTURES
+    assert set(re.findall(r"\]\((.*?)\)", text)) == IMAGES
 
 
-def test_the_second_run_replaced_the_first_ones_pictures(folder):
+def test_the_second_run_replaced_the_first_ones_images(folder):
     text = (folder / "index.md").read_text()
     assert get_task(4).instruction in text
     assert get_task(187).instruction in text
     assert get_task(7).instruction not in text
 
 
-def test_a_seed_gives_the_same_pictures_again(folder, tmp_path):
+def test_a_seed_gives_the_same_images_again(folder, tmp_path):
     main(["--out", str(tmp_path), "--tasks", "4,187", "--seed", "0"])
-    for name in (*PICTURES, "index.md"):
+    for name in (*IMAGES, "index.md"):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
 
 
@@ -133,16 +134,16 @@ def failure(arguments, capsys):
     ],
 )
 def test_bad_arguments_are_one_line(tmp_path, capsys, arguments, message):
-    error = failure(["--out", tmp_path / "pictures", *arguments], capsys)
+    error = failure(["--out", tmp_path / "images", *arguments], capsys)
     assert message in error
     assert error.count("\n") == 1
-    assert not (tmp_path / "pictures").exists()
+    assert not (tmp_path / "images").exists()
 
 
 def test_a_file_is_no_folder(tmp_path, capsys):
     file = tmp_path / "file"
     file.write_text("mine")
-    for out in (file, file / "pictures"):
+    for out in (file, file / "images"):
         error = failure(["--out", out], capsys)
         assert "file" in error
         assert error.count("\n") == 1
@@ -172,7 +173,7 @@ def test_an_interrupted_write_leaves_the_file_as_it_was(tmp_path):
 
 
 def test_it_runs_as_a_module():
-    command = [sys.executable, "-m", "gym_deltaco.gallery", "--help"]
+    command = [sys.executable, "-m", "lerobot_deltaco.commands.gallery", "--help"]
     assert "--out DIR" in subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 

@@ -16,20 +16,20 @@ from huggingface_hub import DatasetCard, constants
 from PIL import Image
 
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, TASKS
-from lerobot_deltaco.commands import collect as collect_command
-from lerobot_deltaco.commands import push as push_command
-from lerobot_deltaco.data.collection import HISTORY_FILE, UNFINISHED, CollectionError, collect
-from lerobot_deltaco.data.collection_plan import CollectionPlan
-from lerobot_deltaco.data.dataset_card import (
+from lerobot_deltaco.cards.dataset_card import (
     CARD_FILE,
     CARD_FILES,
     DESCRIPTIONS,
-    EPISODE_PICTURE,
-    TASKS_PICTURE,
+    EPISODE_IMAGE,
+    TASKS_IMAGE,
     card_text,
     has_current_card,
     write_card,
 )
+from lerobot_deltaco.commands import collect as collect_command
+from lerobot_deltaco.commands import push as push_command
+from lerobot_deltaco.data.collection import HISTORY_FILE, UNFINISHED, CollectionError, collect
+from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.dataset_files import INFO_FILE
 from lerobot_deltaco.data.hub import HubError, check_credentials, check_dataset, check_repo_id
 
@@ -101,12 +101,12 @@ def test_the_metadata_are_what_the_hub_searches(dataset):
     assert stored == {str(path.relative_to(dataset)) for path in dataset.rglob("data/**/*.parquet")}
 
 
-def test_the_pictures_are_there_and_shown(dataset):
+def test_the_images_are_there_and_shown(dataset):
     shown = re.findall(r"!\[.+\]\((.+)\)", (dataset / CARD_FILE).read_text())
-    assert set(shown) == {str(TASKS_PICTURE), str(EPISODE_PICTURE)}
-    with Image.open(dataset / TASKS_PICTURE) as picture:
-        assert picture.width > 3 * 256
-    with Image.open(dataset / EPISODE_PICTURE) as film:
+    assert set(shown) == {str(TASKS_IMAGE), str(EPISODE_IMAGE)}
+    with Image.open(dataset / TASKS_IMAGE) as image:
+        assert image.width > 3 * 256
+    with Image.open(dataset / EPISODE_IMAGE) as film:
         assert film.n_frames == 30
         assert min(film.size) > 256
 
@@ -129,7 +129,7 @@ def test_the_films_of_people_and_of_the_dataset_show_the_same(copy):
 
 
 def film_frames(root):
-    with Image.open(root / EPISODE_PICTURE) as film:
+    with Image.open(root / EPISODE_IMAGE) as film:
         frames = []
         for number in range(film.n_frames):
             film.seek(number)
@@ -191,7 +191,7 @@ def test_the_card_is_a_function_of_the_dataset(dataset, copy):
         assert (copy / file).read_bytes() == (dataset / file).read_bytes()
 
 
-def test_a_card_of_other_pictures_names_the_options_of_the_environment(copy):
+def test_a_card_of_other_images_names_the_options_of_the_environment(copy):
     assert "--env.image_size" not in card_text(copy)
     assert "--env.ambiguity" not in card_text(copy)
     info = json.loads((copy / INFO_FILE).read_text())

@@ -9,8 +9,9 @@ from transformers import AutoTokenizer
 
 from gym_deltaco.tasks import TASKS
 from lerobot_deltaco.policy import language, packaged_encoders
-from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS, InstructionTable, load_language_encoder
-from lerobot_deltaco.policy.packaged_encoders import MINILM_L3, MINILM_L6, LanguageEncoderError
+from lerobot_deltaco.policy.language import InstructionTable, load_language_encoder
+from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6
+from lerobot_deltaco.policy.packaged_encoders import LanguageEncoderError
 
 INSTRUCTIONS = [task.instruction for task in TASKS]
 

@@ -16,7 +16,7 @@ from torch import nn
 
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASKS, select_tasks
-from lerobot_deltaco.configuration_env import DeltacoEnv
+from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 
 # One of each kind: a name, a color and a shape.
 ONE_OF_EACH_KIND = "4,32,90"

@@ -166,7 +166,7 @@ def test_outputs_are_not_rounded_under_mixed_precision():
 def test_cameras_are_seen_apart():
     policy = ConditionedPolicy(2, 4, 0, 3, False, channels=(8,) * 8).eval()
     images, film = torch.rand(3, 2, 3, 24, 24), torch.randn(3, 4)
-    first, second = (policy(pictures, film, None)[0].mean for pictures in (images, images.flip(1)))
+    first, second = (policy(views, film, None)[0].mean for views in (images, images.flip(1)))
     assert not torch.allclose(first, second)
 
 
@@ -228,7 +228,7 @@ def test_folding_the_batch_norms_changes_nothing_but_their_number(film_dim, moti
         torch.testing.assert_close(actual, expected, atol=1e-5, rtol=1e-4)
 
 
-# Pictures
+# Images
 
 
 def test_frames_are_laid_out_in_raster_order():
@@ -253,7 +253,7 @@ def test_crops_are_shifts_by_at_most_the_padding():
     assert {i for i, _ in found} == {j for _, j in found} == set(range(9))
 
 
-def test_all_pictures_of_a_sample_are_shifted_alike_and_by_the_generator_alone():
+def test_all_images_of_a_sample_are_shifted_alike_and_by_the_generator_alone():
     images = torch.rand(4, 1, 3, 8, 8).expand(4, 2, 3, 8, 8)
     first = random_crop(images, 3, torch.Generator().manual_seed(1))
     torch.testing.assert_close(first[:, 0], first[:, 1])

@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
+from lerobot_deltaco.cards.dataset_card import card_text
 from lerobot_deltaco.data.collection import collect
 from lerobot_deltaco.data.collection_plan import CollectionPlan
-from lerobot_deltaco.data.dataset_card import card_text
 
 # Without a network, and in a minute: nothing that this dataset or environment would need.
 QUICK = {

@@ -62,7 +62,7 @@ def test_the_defaults_are_the_papers():
     assert (config.gripper_weight, config.encoder_loss_weight, config.temperature) == (30, 10, 0.1)
     optimizer = config.get_optimizer_preset()
     assert (optimizer.type, optimizer.lr, optimizer.weight_decay, optimizer.grad_clip_norm) == (
-        "fused_adamw",
+        "deltaco_fused_adamw",
         3e-4,
         0,
         0,
@@ -159,7 +159,7 @@ def test_the_loss_is_the_papers_sum(make, dataset):
 
 
 @pytest.mark.parametrize("options", [{}, OURS], ids=str)
-def test_one_batch_can_be_learned_by_heart(make, dataset, options):
+def test_one_batch_can_be_overfitted(make, dataset, options):
     policy, before, _ = make(crop_padding=0, **options)
     batch = before(batch_of(dataset, [1, 6, 11, 16, 21, 26]))
     optimizer = torch.optim.Adam(policy.get_optim_params(), lr=1e-3)
@@ -176,24 +176,24 @@ def test_one_batch_can_be_learned_by_heart(make, dataset, options):
 def test_a_demonstration_is_another_episode_of_the_task(make, dataset):
     policy, before, _ = make()
     policy(before(batch_of(dataset, [0])))
-    shown, generator = policy.trained_on, torch.Generator().manual_seed(0)
+    demonstrations, generator = policy.train_demonstrations, torch.Generator().manual_seed(0)
     drawn = {}
     for episode in range(6):
-        rows = shown.others(torch.full((200,), episode), generator)
-        drawn[episode] = set(shown.episodes[rows].tolist())
+        rows = demonstrations.sample_other_episodes(torch.full((200,), episode), generator)
+        drawn[episode] = set(demonstrations.episodes[rows].tolist())
     # Episodes 0 to 2 stack, 3 and 4 pour; the only one that waves demonstrates itself.
     assert drawn == {0: {1, 2}, 1: {0, 2}, 2: {0, 1}, 3: {4}, 4: {3}, 5: {5}}
 
 
 def test_samples_of_a_task_can_share_demonstrations():
     tasks = ["a"] * 5 + ["b"] * 2 + ["c"] + ["d"] * 3
-    shown = DemonstrationSet(torch.zeros(11, 2, 3, 4, 4, dtype=torch.uint8), tasks, range(100, 111))
+    demonstrations = DemonstrationSet(torch.zeros(11, 2, 3, 4, 4, dtype=torch.uint8), tasks, range(100, 111))
     episodes = torch.tensor([107, 100, 104, 101, 105, 106, 101, 102, 103, 105])
     column = torch.tensor([2, 0, 0, 0, 1, 1, 0, 0, 0, 1])
     generator = torch.Generator().manual_seed(0)
     used = set()
     for _ in range(50):
-        rows, which = shown.shared(episodes, column, 3, 2, generator)
+        rows, which = demonstrations.sample_shared_episodes(episodes, column, 3, 2, generator)
         assert [tasks[row] for row in rows] == ["a", "a", "b", "b", "c", "c"]
         assert rows[0] != rows[1]
         assert rows[2] != rows[3]
@@ -204,17 +204,19 @@ def test_samples_of_a_task_can_share_demonstrations():
         used.update(zip(episodes.tolist(), demonstration.tolist(), strict=True))
     assert {demonstration for own, demonstration in used if own == 102} == {100, 101, 103, 104}
     for _ in range(20):  # more than some tasks have
-        rows, which = shown.shared(episodes, column, 3, 3, generator)
+        rows, which = demonstrations.sample_shared_episodes(episodes, column, 3, 3, generator)
         assert (100 + rows[which] == episodes).tolist() == [True] + 9 * [False]
     with pytest.raises(ValueError, match="Episode 500 is trained on"):
-        shown.shared(torch.tensor([500]), torch.tensor([0]), 1, 2, generator)
+        demonstrations.sample_shared_episodes(torch.tensor([500]), torch.tensor([0]), 1, 2, generator)
 
 
 def test_shared_demonstrations_are_encoded_once(make, dataset, monkeypatch):
     policy, before, _ = make(demos_per_task=2)
     encoded = []
     monkeypatch.setattr(
-        policy, "_encode_demo", lambda shown, rows, _: encoded.append(rows) or torch.zeros(len(rows), 384)
+        policy,
+        "_encode_demo",
+        lambda demonstrations, rows, _: encoded.append(rows) or torch.zeros(len(rows), 384),
     )
     policy(before(batch_of(dataset, [0, 1, 2, 3, 5, 6, 7, 15, 16, 20])))
     assert len(encoded[0]) == 4
@@ -226,8 +228,8 @@ def test_shared_demonstrations_are_encoded_once(make, dataset, monkeypatch):
 def test_demonstrations_are_the_first_and_the_last_frame(make, dataset):
     policy, before, _ = make()
     policy(before(batch_of(dataset, [0])))
-    pictures = policy.trained_on.pictures(torch.arange(6), 2, torch.Generator())
-    shades = (pictures[:, :, 0, 0, 0] * 255).round().int().tolist()
+    frames = policy.train_demonstrations.sample_frames(torch.arange(6), 2, torch.Generator())
+    shades = (frames[:, :, 0, 0, 0] * 255).round().int().tolist()
     assert shades == [[10 * episode, 10 * episode + LENGTH - 1] for episode in range(6)]
 
 
@@ -367,10 +369,10 @@ def test_what_acts_is_what_was_trained_last(make, dataset, options):
         policy.begin_evaluation()
         policy.reset()
         acted.append(policy.select_action(seen))
-        told = policy._told[threading.get_ident()]
-        concatenated = policy._concatenated(seen, told.concat)
-        motion, gripper = policy.policy(policy._images(seen), told.film, concatenated)
-        expected = policy._joined(motion.mean, gripper.sigmoid())
+        conditioning = policy._conditioning[threading.get_ident()]
+        concatenated = policy._concatenated(seen, conditioning.concat)
+        motion, gripper = policy.model(policy._images(seen), conditioning.film, concatenated)
+        expected = policy._join_action(motion.mean, gripper.sigmoid())
         torch.testing.assert_close(acted[-1], expected, atol=1e-5, rtol=1e-4)
     assert not torch.allclose(acted[1], acted[2], atol=1e-4)
 

@@ -22,11 +22,11 @@ from small_policies import EPISODES_PER_TASK, REPO_ID, TASKS, small_policy, use_
 
 from gym_deltaco import ENV_ID
 from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
+from lerobot_deltaco.cards.policy_card import MAX_TASKS_LISTED, METHOD_TEXTS, policy_card
 from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
-from lerobot_deltaco.configuration_env import DeltacoEnv
 from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
-from lerobot_deltaco.policy.model_card import MAX_TASKS_LISTED, METHOD_TEXTS, model_card
 
 POLICY_ID = f"{USER}/policy"
 
@@ -77,7 +77,7 @@ def benchmark_card(train_config=None, plan=None, shown_tasks=(), **options):
         robot_type="widowx_250",
         fps=10,
     )
-    return model_card(config, shown_tasks, 0, f"{USER}/t11", train_config=train_config, meta=meta)
+    return policy_card(config, shown_tasks, 0, f"{USER}/t11", train_config=train_config, meta=meta)
 
 
 def words_of(card):
@@ -216,7 +216,7 @@ def test_a_policy_of_the_benchmark_names_its_version():
     card = benchmark_card()
     text = words_of(card)
     assert f'Benchmark version: {ENV_ID}, ambiguity scheme "container"' in text
-    assert "Pictures by: PyBullet" in text
+    assert "Images by: PyBullet" in text
     assert "22 episodes of 11 tasks" in text
     evaluation = commands(card)[0]
     assert "--env.task=TASKS" in evaluation
@@ -233,7 +233,7 @@ def test_the_card_says_only_what_is_known():
         output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
     )
     config.resolve(None)
-    text = model_card(config, [], 0, None).text
+    text = policy_card(config, [], 0, None).text
     for unknown in ("Trained on", "Benchmark version", "| steps |", "| seed |", "None"):
         assert unknown not in text
     assert "| learning rate | 0.0003, constant |" in text
@@ -306,9 +306,9 @@ for name in (policy_id, policy_id + "-bare"):
         policy.state_dict().items(), fetched.state_dict().items(), strict=True
     ):
         assert key == other and torch.equal(value, twin), key
-    assert fetched.shown.tasks == policy.shown.tasks
-    assert torch.equal(fetched.shown.frames, policy.shown.frames)
-    assert torch.equal(fetched.shown.episodes, policy.shown.episodes)
+    assert fetched.eval_demonstrations.tasks == policy.eval_demonstrations.tasks
+    assert torch.equal(fetched.eval_demonstrations.frames, policy.eval_demonstrations.frames)
+    assert torch.equal(fetched.eval_demonstrations.episodes, policy.eval_demonstrations.episodes)
     assert fetched.instructions.rows == policy.instructions.rows
     assert torch.equal(fetched.instructions.embeddings, policy.instructions.embeddings)
     assert fetched.config.demo_repo_id is None

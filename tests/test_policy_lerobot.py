@@ -16,6 +16,7 @@ from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
+from safetensors.torch import load_file, save_file
 from small_policies import (
     EPISODES_PER_TASK,
     LENGTH,
@@ -30,7 +31,7 @@ from small_policies import (
 )
 
 from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
-from lerobot_deltaco.configuration_env import DeltacoEnv
+from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy import language
 from lerobot_deltaco.policy.language import InstructionTable
@@ -130,6 +131,17 @@ def test_a_policy_and_its_configuration_survive_saving(make, tmp_path, options):
     assert PreTrainedConfig.from_pretrained(tmp_path) == policy.config
 
 
+def test_weights_with_names_of_an_earlier_version_say_what_to_do(make, tmp_path):
+    policy, _, _ = make(method="language_only")
+    policy.save_pretrained(tmp_path)
+    weights = load_file(tmp_path / "model.safetensors")
+    assert any(name.startswith("model.") for name in weights)
+    old = {name.replace("model.", "policy.", 1): value for name, value in weights.items()}
+    save_file(old, tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match=r"earlier version.*Train the policy again.*`policy.` by `model.`"):
+        DeltacoPolicy.from_pretrained(tmp_path)
+
+
 def test_a_configuration_survives_its_own_file(make, tmp_path):
     config = make()[0].config
     config.save_pretrained(tmp_path)
@@ -218,14 +230,14 @@ def test_the_optimizer_has_every_weight_of_the_networks_and_no_other(make, datas
     assert (group["lr"], group["weight_decay"]) == (3e-4, 0)
     expected = {
         id(parameter)
-        for network in (policy.policy, policy.demo_encoder, policy.project_language)
+        for network in (policy.model, policy.demo_encoder, policy.project_language)
         if network is not None
         for parameter in network.parameters()
     }
     assert {id(parameter) for parameter in group["params"]} == expected
     assert len(group["params"]) == len(expected)
     # Neither demonstrations nor embeddings are weights: a checkpoint of the networks stays small.
-    assert not any("shown" in name or "trained_on" in name for name in policy.state_dict())
+    assert not any("demonstrations" in name for name in policy.state_dict())
 
 
 # Evaluation by several threads
@@ -292,15 +304,17 @@ def test_an_episode_that_is_held_back_is_shown_by_any_of_its_task(make, dataset)
     loss, _ = policy(held_back)
     assert torch.isfinite(loss)
     # As `deltaco-train` gives them.
-    policy.demonstrate_with(policy.trained_on)
+    policy.set_train_demonstrations(policy.train_demonstrations)
     assert policy(held_back)[0] == loss
 
-    shown, generator = policy.trained_on, torch.Generator().manual_seed(0)
+    demonstrations, generator = policy.train_demonstrations, torch.Generator().manual_seed(0)
     drawn = {}
     tasks = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
     for episode, task in enumerate(tasks):
-        rows = shown.others(torch.full((100,), episode), generator, tasks=[task] * 100)
-        drawn[episode] = set(shown.episodes[rows].tolist())
+        rows = demonstrations.sample_other_episodes(
+            torch.full((100,), episode), generator, tasks=[task] * 100
+        )
+        drawn[episode] = set(demonstrations.episodes[rows].tolist())
     assert drawn == {0: {1}, 1: {0}, 2: {0, 1}, 3: {3}, 4: {3}, 5: {5}}
 
 
@@ -347,7 +361,7 @@ def test_a_dataset_of_videos_trains_and_demonstrates(tmp_path, codec):
     loss.backward()
     assert torch.isfinite(loss)
     # Each demonstration is the first and the last frame of its own episode, as well as the codec keeps them.
-    for demonstrations in (policy.trained_on, policy.shown):
+    for demonstrations in (policy.train_demonstrations, policy.eval_demonstrations):
         shades = demonstrations.frames.float().mean(dim=(2, 3, 4))
         expected = [[60.0 * number, 60.0 * number + 10 * (LENGTH - 1)] for number in range(3)]
         torch.testing.assert_close(shades, torch.tensor(expected), atol=6, rtol=0)

@@ -16,7 +16,6 @@ from gym_deltaco import ENV_ID
 from gym_deltaco.tasks import CONTAINER_WORDS, TASKS
 from gym_deltaco.workspace import QUADRANTS
 from lerobot_deltaco.commands import report as report_command
-from lerobot_deltaco.evaluation.authors import PUBLISHED, TITLES, in_order, label_of
 from lerobot_deltaco.evaluation.record import (
     EpisodeResult,
     EvaluationRecord,
@@ -25,9 +24,10 @@ from lerobot_deltaco.evaluation.record import (
     record_path,
     write_record,
 )
-from lerobot_deltaco.evaluation.report import FILES, write_report
-from lerobot_deltaco.evaluation.series import ReportError, counted, find_records, make_report
-from lerobot_deltaco.evaluation.statistics import (
+from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS, TITLES, in_order, label_of
+from lerobot_deltaco.reporting.report import FILES, write_report
+from lerobot_deltaco.reporting.series import ReportError, counted, find_records, make_report
+from lerobot_deltaco.reporting.statistics import (
     breakdown,
     followed,
     paper_rate,
@@ -324,20 +324,20 @@ def test_sentences_of_no_task():
 
 def test_experiments_stand_as_in_the_papers_tables():
     mine = ["z", "scenario_a/z", "mine/a"]
-    published = list(PUBLISHED)
+    published = list(PAPER_RESULTS)
     end_of_a = published.index("scenario_b/deltaco")
     expected = [*published[:end_of_a], "scenario_a/z", *published[end_of_a:], "z", "mine/a"]
     assert sorted([*mine, *reversed(published)], key=in_order) == expected
 
 
 def test_the_authors_numbers():
-    assert PUBLISHED["scenario_a/deltaco"][1:] == pytest.approx((0.258, 0.034))
-    assert PUBLISHED["scenario_b/oracle"][1:] == pytest.approx((0.617, 0.14))
-    assert PUBLISHED["ablations/clip_mlp_1"].rate < PUBLISHED["ablations/clip_mlp_2"].rate
-    groups = Counter(name.partition("/")[0] for name in PUBLISHED)
+    assert PAPER_RESULTS["scenario_a/deltaco"][1:] == pytest.approx((0.258, 0.034))
+    assert PAPER_RESULTS["scenario_b/oracle"][1:] == pytest.approx((0.617, 0.14))
+    assert PAPER_RESULTS["ablations/clip_mlp_1"].rate < PAPER_RESULTS["ablations/clip_mlp_2"].rate
+    groups = Counter(name.partition("/")[0] for name in PAPER_RESULTS)
     assert groups == {"scenario_a": 15, "scenario_b": 5, "ambiguity_object": 3, "ablations": 11}
     assert set(groups) == set(TITLES)
-    assert all(0 < item.sd < item.rate < 1 for item in PUBLISHED.values())
+    assert all(0 < item.sd < item.rate < 1 for item in PAPER_RESULTS.values())
     assert label_of("mine/my_method") == "my method"
 
 
@@ -582,11 +582,11 @@ def test_the_files(runs, tmp_path, capsys):
     ) == int(deltaco["last_count"])
 
     assert len(rows(out / "counterfactual.csv")) == 2 * 6
-    with Image.open(out / "curves.png") as picture:
-        assert picture.format == "PNG"
-        assert 1000 < picture.width < 3000
-        assert 400 < picture.height < 3000
-        assert len(picture.convert("RGB").getcolors(1 << 24)) > 10
+    with Image.open(out / "curves.png") as image:
+        assert image.format == "PNG"
+        assert 1000 < image.width < 3000
+        assert 400 < image.height < 3000
+        assert len(image.convert("RGB").getcolors(1 << 24)) > 10
 
 
 def test_the_text(runs, tmp_path):

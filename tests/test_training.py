@@ -85,7 +85,7 @@ def test_frames_equal_those_that_lerobot_reads(dataset, episodes):
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         if name in chosen.meta.camera_keys:
-            # LeRobot's loop does the same to pictures of bytes.
+            # LeRobot's loop does the same to images of bytes.
             found[name] = found[name].to(torch.float32) / 255
         if isinstance(value, torch.Tensor):
             torch.testing.assert_close(found[name], value, rtol=0, atol=0, msg=name)
@@ -124,11 +124,11 @@ def test_features_of_any_shape_are_held(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "BMP"])
-def test_pictures_of_any_format_are_decoded(kind):
-    picture = np.random.default_rng(0).integers(0, 255, (9, 7, 3), dtype=np.uint8)
+def test_images_of_any_format_are_decoded(kind):
+    image = np.random.default_rng(0).integers(0, 255, (9, 7, 3), dtype=np.uint8)
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, kind)
-    assert torch.equal(decoded(file.getvalue()), torch.from_numpy(picture).permute(2, 0, 1))
+    Image.fromarray(image).save(file, kind)
+    assert torch.equal(decoded(file.getvalue()), torch.from_numpy(image).permute(2, 0, 1))
 
 
 def test_demonstrations_equal_those_that_are_read(dataset):
@@ -142,7 +142,7 @@ def test_demonstrations_equal_those_that_are_read(dataset):
 
 def test_training_equals_that_of_lerobots_own_loop(train):
     # The same seed: the same weights, the same samples, and the same demonstrations of them. (At this size,
-    # pictures are kept as they are; smaller ones would be rounded once more.)
+    # images are kept as they are; smaller ones would be rounded once more.)
     stock = train("--policy.image_size=32", name="stock", in_memory=False)
     memory = train("--policy.image_size=32", name="memory")
     assert_same(weights(stock / "000004"), weights(memory / "000004"))

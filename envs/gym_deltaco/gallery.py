@@ -1,14 +1,12 @@
-"""The command `deltaco-gallery`: pictures of the objects, scenes and expert, and a page that shows them."""
+"""Images of the benchmark's objects, scenes and expert, and a page that shows them."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,13 +32,13 @@ from gym_deltaco.sheets import (
     enlarged,
     framed,
     grid,
-    picture,
     save_gif,
     save_png,
+    to_image,
     write_whole,
 )
 from gym_deltaco.simulation import Camera, Simulation
-from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, Task, get_task, select_tasks
+from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, Task, get_task
 from gym_deltaco.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 
 # Every kind of task, each with various containers: six names, three colors, three shapes.
@@ -54,7 +52,7 @@ _CLOSE_UP = Camera(
     target=(*TRAY_CENTER, TRAY_FLOOR + 0.033), distance=0.21, yaw=CAMERA.yaw, pitch=-35, fov=30, near=0.02
 )
 _CLOSE_UP_SIZE = 136  # px
-_CROP_SIZE = 14  # px of the policy's picture, around an object
+_CROP_SIZE = 14  # px of the policy's image, around an object
 _CROP_ZOOM = 6
 _SCENE_ZOOM = 4
 _N_COLUMNS = 6  # objects in a row
@@ -88,56 +86,15 @@ class Episode(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """A picture of the page."""
+    """An image of the page."""
 
     file: str
     title: str
     text: str
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command.
-
-    Args:
-        arguments: Of the command line; None takes the process's own.
-    """
-    parser = argparse.ArgumentParser(
-        prog="deltaco-gallery",
-        description="Draws the benchmark's objects, scenes and expert, and writes a page that shows them.",
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder to write to; made if missing"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of the scenes, at least 0; default: %(default)s")
-    parser.add_argument(
-        "--tasks",
-        default=DEFAULT_TASKS,
-        metavar="SELECTION",
-        help="tasks to show: indices and ranges of 0 to 299, such as 4,50-73, or a set, such as "
-        f"scenario_a_test. Of more than {MAX_SCENES}, so many are drawn at random. Default: %(default)s",
-    )
-    options = parser.parse_args(arguments)
-
-    def fail(message: str) -> NoReturn:
-        parser.exit(2, f"{parser.prog}: error: {message}\n")
-
-    if options.seed < 0:
-        fail(f"--seed must be at least 0. Got {options.seed}.")
-    try:
-        task_ids = select_tasks(options.tasks)
-    except ValueError as error:
-        fail(f"--tasks: {error}")
-    if options.out.exists() and not options.out.is_dir():
-        fail(f"--out must be a folder. {options.out} is a file.")
-    try:
-        draw_gallery(options.out, options.seed, task_ids)
-    except OSError as error:
-        fail(f"cannot write to {options.out}: {error.strerror or error}.")
-    sys.stdout.write(f"The pictures are in {options.out}. Start with {options.out / 'index.md'}.\n")
-
-
 def draw_gallery(out: Path, seed: int, task_ids: Sequence[int]) -> None:
-    """Draws all pictures, and the page `index.md`, which links to them, last.
+    """Draws all images, and the page `index.md`, which links to them, last.
 
     Args:
         out: Folder to write to.
@@ -152,8 +109,8 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int]) -> None:
         pass  # so that a folder that cannot be written to is an error before anything is drawn
     shown = _drawn(task_ids, MAX_SCENES, seed)
     filmed = shown[:: max(1, len(shown) // N_EPISODES)][:N_EPISODES]
-    n_pictures = len(OBJECTS) + len(shown) + len(filmed) + 2
-    progress = tqdm(total=n_pictures, desc="gallery", unit="picture")
+    n_images = len(OBJECTS) + len(shown) + len(filmed) + 2
+    progress = tqdm(total=n_images, desc="gallery", unit="image")
     with progress, closing(Simulation()) as simulation:
         cells = []
         for index in range(len(OBJECTS)):
@@ -175,10 +132,10 @@ def page(figures: Iterable[Figure]) -> str:
     introduction = (
         "A WidowX 250 stands at a shallow tray with three objects and two bins, one green and one red. An "
         "instruction says which object to put into which bin; front is near the camera, back is near the "
-        f"robot, left and right are the picture's. A policy sees {POLICY_SIZE} x {POLICY_SIZE} pixels. All "
-        "pictures are drawn by `deltaco-gallery`, from code alone."
+        f"robot, left and right are the image's. A policy sees {POLICY_SIZE} x {POLICY_SIZE} pixels. All "
+        "images are drawn by `deltaco-gallery`, from code alone."
     )
-    return "\n\n".join(["# The benchmark in pictures", introduction, *sections]) + "\n"
+    return "\n\n".join(["# The benchmark in images", introduction, *sections]) + "\n"
 
 
 # Objects
@@ -191,7 +148,7 @@ def draw_objects(out: Path, what: str, names: Sequence[str], cells: Sequence[Ima
         out: Folder to write to.
         what: "shape" or "color".
         names: Of the groups.
-        cells: A picture for each object.
+        cells: An image for each object.
     """
     groups = []
     for name in names:
@@ -204,7 +161,7 @@ def draw_objects(out: Path, what: str, names: Sequence[str], cells: Sequence[Ima
     save_png(framed(down(shelves, gap=2 * GAP), thickness=GAP), out / file)
     text = (
         f"All 32 objects, by {what}. Large: seen from nearby. Small: the same in the {POLICY_SIZE} px "
-        "picture that a policy sees. Framed in orange: the 8 that scenario A does not train on by name."
+        "image that a policy sees. Framed in orange: the 8 that scenario A does not train on by name."
     )
     return Figure(file, f"Objects by {what}", text)
 
@@ -230,7 +187,7 @@ def object_views(simulation: Simulation, model: ObjectModel | None) -> tuple[Ima
         simulation.add_free_body(model.mesh, model.parts, middle, yaw, mass=1.0)
     simulation.add_static_body(tray_mesh(), TRAY_BOXES, (*TRAY_CENTER, TRAY_FLOOR))
     simulation.add_static_body(table_mesh(), TABLE_BOXES)
-    close_up = picture(simulation.render(_CLOSE_UP, 3 * _CLOSE_UP_SIZE), _CLOSE_UP_SIZE)
+    close_up = to_image(simulation.render(_CLOSE_UP, 3 * _CLOSE_UP_SIZE), _CLOSE_UP_SIZE)
     seen = simulation.render(CAMERA, POLICY_SIZE)
     x, y = np.rint(_pixel_of(middle, POLICY_SIZE) - _CROP_SIZE / 2).astype(int)
     return close_up, enlarged(seen[y : y + _CROP_SIZE, x : x + _CROP_SIZE], _CROP_ZOOM)
@@ -251,7 +208,7 @@ def _shelves(groups: Iterable[tuple[int, Image.Image]]) -> list[list[Image.Image
 
 
 def _pixel_of(point: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Where the benchmark's camera sees a point of the world, (3,), m: (x, y) in a picture of `size` px."""
+    """Where the benchmark's camera sees a point of the world, (3,), m: (x, y) in an image of `size` px."""
     view, projection = (np.reshape(matrix, (4, 4)).T for matrix in CAMERA.matrices)
     x, y, _, w = projection @ view @ [*point, 1.0]
     return np.array([1 + x / w, 1 - y / w]) * size / 2
@@ -284,7 +241,7 @@ def _environment(ambiguity: Ambiguity) -> PickPlaceEnv:
 
 
 def _view(env: PickPlaceEnv) -> Image.Image:
-    return picture(env.scene.render(PEOPLE_SIZE))
+    return to_image(env.scene.render(PEOPLE_SIZE))
 
 
 def _seed(seed: int, task_id: int, number: int = 0) -> int:
@@ -439,7 +396,7 @@ def _object_scheme(seed: int) -> Image.Image:
 
 
 def _demonstration(env: PickPlaceEnv, task: Task, seed: int) -> tuple[Image.Image, Image.Image, Layout]:
-    """The first and the last picture of an episode in which the expert succeeds, and its scene."""
+    """The first and the last image of an episode in which the expert succeeds, and its scene."""
     for number in range(_TRIES):
         if _is_in_view(_new_layout(env, task, seed, number)):
             episode = record(env, task.index, _seed(seed, task.index, number))
@@ -465,7 +422,7 @@ def _new_layout(env: PickPlaceEnv, task: Task, seed: int, number: int) -> Layout
 
 
 def _is_in_view(layout: Layout) -> bool:
-    """Whether the edges of the picture cut no object much. They do cut some that stand far in front."""
+    """Whether the edges of the image cut no object much. They do cut some that stand far in front."""
     middles = [
         _pixel_of(np.array([*item.xy, TRAY_FLOOR + item.model.height / 2]), 1) for item in layout.objects
     ]
@@ -484,7 +441,3 @@ def _row(title: str, *panels: tuple[Image.Image, str]) -> Image.Image:
     cells = [down([image, caption(text, PEOPLE_SIZE, n_lines=3)], gap=4) for image, text in panels]
     sheet = across(cells, gap=2 * GAP)
     return down([caption(title, sheet.width, size=18), sheet])
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""Contact sheets: pictures with captions, put together into larger ones, and written to files in one go."""
+"""Contact sheets: images with captions, put together into larger ones, and written to files in one go."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RGB = tuple[int, int, int]
 Align = Literal["start", "middle", "end"]
 
 
-def picture(pixels: NDArray[np.uint8], size: int | None = None) -> Image.Image:
+def to_image(pixels: NDArray[np.uint8], size: int | None = None) -> Image.Image:
     """An image of an array (H, W, 3), smoothly shrunk to `size` px where that is given."""
     image = Image.fromarray(pixels)
     return image if size is None else image.resize((size, size), Image.Resampling.BOX)
@@ -39,13 +39,13 @@ def caption(text: str, width: int, size: int = 15, color: RGB = INK, n_lines: in
 
     Args:
         text: May have line breaks of its own.
-        width: Of the picture, px.
+        width: Of the image, px.
         size: Of the font, px.
         color: Of the text.
         n_lines: Leave room for at least so many lines, so that captions in a row are equally high.
 
     Returns:
-        A picture, as high as its lines.
+        An image, as high as its lines.
     """
     font = _font(size)
     lines = [line for paragraph in text.split("\n") for line in _wrapped(paragraph, width, font)]
@@ -58,7 +58,7 @@ def caption(text: str, width: int, size: int = 15, color: RGB = INK, n_lines: in
 
 
 def across(images: Sequence[Image.Image], gap: int = GAP, align: Align = "start") -> Image.Image:
-    """Pictures from left to right."""
+    """Images from left to right."""
     width = sum(image.width for image in images) + gap * (len(images) - 1)
     height = max(image.height for image in images)
     sheet, x = Image.new("RGB", (width, height), PAPER), 0
@@ -69,7 +69,7 @@ def across(images: Sequence[Image.Image], gap: int = GAP, align: Align = "start"
 
 
 def down(images: Sequence[Image.Image], gap: int = GAP, align: Align = "start") -> Image.Image:
-    """Pictures from top to bottom."""
+    """Images from top to bottom."""
     width = max(image.width for image in images)
     height = sum(image.height for image in images) + gap * (len(images) - 1)
     sheet, y = Image.new("RGB", (width, height), PAPER), 0
@@ -80,20 +80,20 @@ def down(images: Sequence[Image.Image], gap: int = GAP, align: Align = "start") 
 
 
 def grid(images: Sequence[Image.Image], n_columns: int, gap: int = 2 * GAP) -> Image.Image:
-    """Pictures in rows."""
+    """Images in rows."""
     rows = [images[first : first + n_columns] for first in range(0, len(images), n_columns)]
     return down([across(row, gap) for row in rows], gap)
 
 
 def framed(image: Image.Image, color: RGB = PAPER, thickness: int = 4) -> Image.Image:
-    """A picture in a frame, which makes it larger."""
+    """An image in a frame, which makes it larger."""
     sheet = Image.new("RGB", (image.width + 2 * thickness, image.height + 2 * thickness), color)
     sheet.paste(image, (thickness, thickness))
     return sheet
 
 
 def circled(image: Image.Image, center: NDArray[np.float64], radius: float) -> Image.Image:
-    """A copy of a picture with a white ring, edged in black, about a point (x, y)."""
+    """A copy of an image with a white ring, edged in black, about a point (x, y)."""
     copy = image.copy()
     draw = ImageDraw.Draw(copy)
     x, y = center
@@ -104,7 +104,7 @@ def circled(image: Image.Image, center: NDArray[np.float64], radius: float) -> I
 
 
 def save_png(image: Image.Image, path: Path) -> None:
-    """Writes a picture with all of its colors: by a palette, small objects would change theirs."""
+    """Writes an image with all of its colors: by a palette, small objects would change theirs."""
     write_whole(path, lambda file: image.save(file, format="PNG", optimize=True))
 
 

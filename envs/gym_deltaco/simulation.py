@@ -1,6 +1,6 @@
 """A PyBullet client behind a small interface: the only module that imports pybullet.
 
-Bodies are made from arrays, never from asset files: pictures from triangle meshes with a color for each face,
+Bodies are made from arrays, never from asset files: images from triangle meshes with a color for each face,
 contacts from boxes and convex hulls. A scene is built anew for every episode, because a rebuilt world repeats
 to the last bit, and one that is restored from a saved state does not.
 """
@@ -65,10 +65,10 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera that looks at a point; the picture is square.
+    """A pinhole camera that looks at a point; the image is square.
 
     Attributes:
-        target: The point in the middle of the picture, m.
+        target: The point in the middle of the image, m.
         distance: From the target, m.
         yaw: About the vertical, degrees; 0 looks along +y.
         pitch: Degrees; negative looks down.
@@ -398,7 +398,7 @@ class Simulation:
         )
 
     def render(self, camera: Camera, size: int) -> NDArray[np.uint8]:
-        """A picture, (size, size, 3), by PyBullet's software renderer (the same on every machine)."""
+        """An image, (size, size, 3), by PyBullet's software renderer (the same on every machine)."""
         view, projection = camera.matrices
         pixels = pybullet.getCameraImage(
             size,

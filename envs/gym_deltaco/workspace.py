@@ -1,7 +1,7 @@
 """Where things are: the table, the tray, its four quadrants, the containers and the camera.
 
 The origins of the numbers are the paper's appendix and the authors' published settings. A quadrant is a pair
-(i, j): i is 0 on the right of the picture and 1 on its left, j is 0 at the back, near the robot, 1 in front.
+(i, j): i is 0 on the right of the image and 1 on its left, j is 0 at the back, near the robot, 1 in front.
 """
 
 from __future__ import annotations

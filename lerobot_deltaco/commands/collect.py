@@ -67,7 +67,7 @@ def _check_sharing(parser: argparse.ArgumentParser, options: argparse.Namespace)
 
 def _share(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Writes the card of the finished dataset, and pushes it if that is wanted."""
-    from lerobot_deltaco.data.dataset_card import has_current_card, write_card
+    from lerobot_deltaco.cards.dataset_card import has_current_card, write_card
     from lerobot_deltaco.data.hub import HubError, push_dataset
 
     try:

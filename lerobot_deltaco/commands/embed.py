@@ -10,7 +10,8 @@ from safetensors.torch import save_file
 
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS, InstructionTable, LanguageEncoderError
+from lerobot_deltaco.policy.language import InstructionTable, LanguageEncoderError
+from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""`deltaco-experiment`: a row of the tables, from its data to its evaluation."""
+"""`deltaco-experiment`: runs experiments, from collecting the data to the evaluation."""
 
 from __future__ import annotations
 
@@ -6,28 +6,30 @@ import argparse
 from pathlib import Path
 
 from lerobot_deltaco.evaluation.record import RecordError
-from lerobot_deltaco.evaluation.report import write_report
-from lerobot_deltaco.evaluation.series import ReportError
 from lerobot_deltaco.experiments.command_runner import ExperimentError
-from lerobot_deltaco.experiments.rows import RowError, read_row
-from lerobot_deltaco.experiments.run import Experiment
+from lerobot_deltaco.experiments.config import ExperimentConfigError, read_experiment
+from lerobot_deltaco.experiments.run import ExperimentRun
 from lerobot_deltaco.experiments.side_by_side import run_side_by_side
+from lerobot_deltaco.reporting.report import write_report
+from lerobot_deltaco.reporting.series import ReportError
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs what of the row is not done yet."""
+    """Runs the steps of the experiments that are not finished yet."""
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.jobs < 1:
         parser.error(f"--jobs must be at least 1. Got {options.jobs}.")
     try:
-        names = dict.fromkeys(options.rows)
-        rows = [read_row(options.experiments, name, options.settings) for name in names]
-    except RowError as error:
+        names = dict.fromkeys(options.names)
+        configs = [read_experiment(options.experiments, name, options.settings) for name in names]
+    except ExperimentConfigError as error:
         parser.error(str(error))
     try:
         experiments = [
-            Experiment(row, seed, options.out) for seed in dict.fromkeys(options.seed) for row in rows
+            ExperimentRun(config, seed, options.out)
+            for seed in dict.fromkeys(options.seed)
+            for config in configs
         ]
         done: list[Path] = []
 
@@ -41,8 +43,8 @@ def main(arguments: list[str] | None = None) -> None:
             run_side_by_side(experiments, options.jobs, report)
         else:
             for experiment in experiments:
-                experiment.do()
-                report(experiment.run)
+                experiment.run()
+                report(experiment.folder)
     except (ExperimentError, ReportError, RecordError, OSError) as error:
         parser.exit(1, f"{parser.prog}: {error}\n")
     except KeyboardInterrupt:
@@ -52,10 +54,10 @@ def main(arguments: list[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="deltaco-experiment",
-        description="Collects the data of rows, trains, and evaluates every checkpoint. Interrupted, it "
-        "goes on when the same command is given again.",
+        description="Collects the data of experiments, trains, and evaluates every checkpoint. After an "
+        "interruption, the same command continues.",
     )
-    parser.add_argument("rows", nargs="+", metavar="ROW", help="such as scenario_a/deltaco")
+    parser.add_argument("names", nargs="+", metavar="EXPERIMENT", help="such as scenario_a/deltaco")
     parser.add_argument(
         "--seed", type=int, nargs="+", default=[0], metavar="SEED", help="one or more, of the training (0)"
     )
@@ -65,7 +67,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="SECTION.NAME=VALUE",
-        help="what differs from the rows' files, such as training.steps=2000; may be given several times",
+        help="a setting that overrides the experiments' files, such as training.steps=2000; may be repeated",
     )
     parser.add_argument(
         "--jobs",
@@ -79,14 +81,14 @@ def _parser() -> argparse.ArgumentParser:
         "--report",
         type=Path,
         metavar="DIR",
-        help="also write the report of these rows, as deltaco-report does",
+        help="also write the report on these experiments, as deltaco-report does",
     )
     parser.add_argument(
         "--experiments",
         type=Path,
         default=Path("experiments"),
         metavar="DIR",
-        help="with the rows' files (%(default)s)",
+        help="folder of the experiments' files (%(default)s)",
     )
     parser.add_argument(
         "--out", type=Path, default=Path("outputs/experiments"), metavar="DIR", help="where to (%(default)s)"

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from lerobot_deltaco.data.dataset_card import CARD_FILE, write_card
+from lerobot_deltaco.cards.dataset_card import CARD_FILE, write_card
 from lerobot_deltaco.data.hub import HubError, check_dataset, check_repo_id, push_dataset
 
 
@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--card-only",
         action="store_true",
-        help="push nothing: only write README.md and its pictures into the folder",
+        help="push nothing: only write README.md and its images into the folder",
     )
     return parser
 

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 from lerobot_deltaco.evaluation.record import RecordError
-from lerobot_deltaco.evaluation.report import REPORT_FILE, last_text, rate_text, write_report
-from lerobot_deltaco.evaluation.series import Report, ReportError, counted
-from lerobot_deltaco.evaluation.statistics import paper_rate
+from lerobot_deltaco.reporting.report import REPORT_FILE, last_text, rate_text, write_report
+from lerobot_deltaco.reporting.series import Report, ReportError, counted
+from lerobot_deltaco.reporting.statistics import paper_rate
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -271,7 +271,7 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
         )
     elif json.loads(json.dumps(plan.features)) != base.features:
         raise CollectionError(
-            f"{root} holds a dataset whose pictures differ in size, ambiguity, renderer or version of the "
+            f"{root} holds a dataset whose images differ in size, ambiguity, renderer or version of the "
             "benchmark. Name a new folder."
         )
 

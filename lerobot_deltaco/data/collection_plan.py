@@ -59,7 +59,7 @@ class CollectionPlan:
             of the data set, or "validation" for test and validation tasks and "train" for all else.
         ambiguity: "container" or "object", the paper's schemes i and ii.
         noise: Standard deviation of the noise on the expert's motions, at least 0.
-        image_size: Height and width of the pictures, px.
+        image_size: Height and width of the images, px.
 
     Raises:
         ValueError: An argument is not valid; the message says what is.
@@ -116,7 +116,7 @@ class CollectionPlan:
                 "dtype": "image",
                 "shape": [self.image_size, self.image_size, 3],
                 "names": ["height", "width", "channels"],
-                # Policies do not transfer from one renderer's pictures to another's.
+                # Policies do not transfer from one renderer's images to another's.
                 "info": {"renderer": renderer(), "benchmark": ENV_ID, "ambiguity": self.ambiguity},
             },
             "observation.state": {"dtype": "float32", "shape": [10], "names": STATE_NAMES},
@@ -140,7 +140,7 @@ def _default_split(tasks: str, task_ids: tuple[int, ...]) -> Split:
 
 
 def renderer() -> str:
-    """What made the pictures."""
+    """What made the images."""
     return f"PyBullet {version('pybullet')}, TinyRenderer"
 
 

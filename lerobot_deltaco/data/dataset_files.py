@@ -1,6 +1,6 @@
 """The files of a LeRobotDataset v3, written directly.
 
-LeRobot's own writer spends most of its time on turning pictures from one form into another, and cannot be
+LeRobot's own writer spends most of its time on turning images from one form into another, and cannot be
 shared by processes. Here, each process writes files of its own, whose indices are known beforehand. This
 module knows the format, and neither LeRobot nor torch, whose import takes 10 s in each process; the tests
 hold it against LeRobot's reader, statistics and editing tools.
@@ -96,14 +96,12 @@ def episode_columns(
 
 
 def episode_table(columns: Mapping[str, NDArray], schema: pa.Schema) -> pa.Table:
-    """An episode's frames as a table; pictures, (N, H, W, 3) uint8, as PNG."""
+    """An episode's frames as a table; images, (N, H, W, 3) uint8, as PNG."""
     arrays = []
     for field in schema:
         values = columns[field.name]
         if pa.types.is_struct(field.type):
-            cells = [
-                {"bytes": _png(picture), "path": f"frame-{i:06d}.png"} for i, picture in enumerate(values)
-            ]
+            cells = [{"bytes": _png(image), "path": f"frame-{i:06d}.png"} for i, image in enumerate(values)]
             arrays.append(pa.array(cells, field.type))
         elif pa.types.is_fixed_size_list(field.type):
             flat = pa.array(values.ravel(), field.type.value_type)
@@ -113,9 +111,9 @@ def episode_table(columns: Mapping[str, NDArray], schema: pa.Schema) -> pa.Table
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def _png(picture: NDArray[np.uint8]) -> bytes:
+def _png(image: NDArray[np.uint8]) -> bytes:
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "png", compress_level=_PNG_COMPRESSION)
+    Image.fromarray(image).save(buffer, "png", compress_level=_PNG_COMPRESSION)
     return buffer.getvalue()
 
 

@@ -1,6 +1,6 @@
 """Statistics of a LeRobotDataset: of an episode from its frames, of many episodes from theirs.
 
-They mean what LeRobot's mean: population standard deviation, pictures in 0..1 and by channel. A quantile of
+They mean what LeRobot's mean: population standard deviation, images in 0..1 and by channel. A quantile of
 an episode is the smallest of its values which a sufficient share does not exceed (LeRobot estimates it from
 bins); that of several episodes is, as LeRobot has it, the mean of theirs, weighted by count.
 """
@@ -22,13 +22,13 @@ def feature_statistics(values: NDArray) -> Statistics:
     """Statistics of one feature in one episode.
 
     Args:
-        values: Numbers or booleans, (N,) or (N, D), or pictures, (N, H, W, 3) uint8.
+        values: Numbers or booleans, (N,) or (N, D), or images, (N, H, W, 3) uint8.
 
     Returns:
-        Each statistic: (D,), (1,) for values of shape (N,), or (3, 1, 1) for pictures; the count is (1,).
+        Each statistic: (D,), (1,) for values of shape (N,), or (3, 1, 1) for images; the count is (1,).
     """
     if values.ndim == 4:
-        return _picture_statistics(values)
+        return _image_statistics(values)
     numbers = values.astype(np.float64).reshape(len(values), -1)
     quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=0, method="inverted_cdf")
     return {
@@ -41,12 +41,10 @@ def feature_statistics(values: NDArray) -> Statistics:
     }
 
 
-def _picture_statistics(pictures: NDArray[np.uint8]) -> Statistics:
+def _image_statistics(images: NDArray[np.uint8]) -> Statistics:
     # Everything follows from how often each of the 256 levels occurs in each channel.
     levels = np.arange(256) / 255
-    histograms = np.stack(
-        [np.bincount(pictures[..., channel].ravel(), minlength=256) for channel in range(3)]
-    )
+    histograms = np.stack([np.bincount(images[..., channel].ravel(), minlength=256) for channel in range(3)])
     shares = histograms / histograms.sum(axis=1, keepdims=True)  # (3, 256)
     mean = shares @ levels
     reached = shares.cumsum(axis=1)
@@ -59,7 +57,7 @@ def _picture_statistics(pictures: NDArray[np.uint8]) -> Statistics:
     }
     return {
         **{name: value.reshape(3, 1, 1) for name, value in statistics.items()},
-        "count": np.array([len(pictures)]),
+        "count": np.array([len(images)]),
     }
 
 

@@ -15,9 +15,9 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, co
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, RevisionNotFoundError
 from huggingface_hub.utils import validate_repo_id
 
+from lerobot_deltaco.cards.dataset_card import CARD_FILES, write_card
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import STAGING, UNFINISHED
-from lerobot_deltaco.data.dataset_card import CARD_FILES, write_card
 
 # What belongs to a dataset: nothing of a collection under way, nothing that only lies in the folder.
 DATASET_PATTERNS = ("data/*.parquet", "meta/*.parquet", "meta/*.json")

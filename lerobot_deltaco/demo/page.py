@@ -12,19 +12,19 @@ import jinja2
 import numpy as np
 from lerobot.datasets import LeRobotDataset
 
-from gym_deltaco.sheets import across, enlarged, framed, grid, picture, save_gif, save_png
+from gym_deltaco.sheets import across, enlarged, framed, grid, save_gif, save_png, to_image
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.demo import recipe
 from lerobot_deltaco.demo.steps import DEMONSTRATIONS, Demo
 from lerobot_deltaco.evaluation.record import Counterfactual, read_record, record_path
 from lerobot_deltaco.evaluation.runs import checkpoints
-from lerobot_deltaco.evaluation.statistics import followed
+from lerobot_deltaco.reporting.statistics import followed
 
-# Examples of each kind, and pictures of an episode.
+# Examples of each kind, and images of an episode.
 N_EXAMPLES = 4
-N_PICTURES = 7
-PICTURE_SIZE = 96  # px
-FILM_SIZE = 128  # px
+N_IMAGES = 7
+IMAGE_SIZE = 96  # px
+VIDEO_SIZE = 128  # px
 FRAME_DURATION = 120  # ms
 GREEN, RED = (20, 117, 44), (164, 22, 26)
 
@@ -46,7 +46,7 @@ class TaskResult(NamedTuple):
     task_id: int
     is_new: bool
     successes: list[bool]
-    films: list[Path]
+    videos: list[Path]
 
 
 class Rate(NamedTuple):
@@ -57,7 +57,7 @@ class Rate(NamedTuple):
 
 
 def write_page(demo: Demo) -> Path:
-    """Writes the page, its pictures and `summary.json` into the demo's folder.
+    """Writes the page, its images and `summary.json` into the demo's folder.
 
     Args:
         demo: All of its steps are done.
@@ -167,52 +167,52 @@ def _followed(demo: Demo) -> list[dict[str, Any]]:
 def _draw_examples(demo: Demo, results: list[TaskResult]) -> list[dict[str, Any]]:
     """Draws a strip for each example, and all of them as one animation."""
     shown = LeRobotDataset(DEMONSTRATIONS, root=demo.folder / "demonstrations")
-    examples, films = [], []
+    examples, videos = [], []
     for number, result in enumerate(results):
         instruction = get_task(result.task_id).instruction
-        frames = read_film(result.films[0])
+        frames = read_video(result.videos[0])
         success = result.successes[0]
         color = GREEN if success else RED
-        chosen = np.linspace(0, len(frames) - 1, N_PICTURES).round().astype(int)
+        chosen = np.linspace(0, len(frames) - 1, N_IMAGES).round().astype(int)
         strip = across(
             [
                 framed(across([enlarged(pixels, 2) for pixels in _demonstration(shown, instruction)])),
-                framed(across([picture(frames[n], PICTURE_SIZE) for n in chosen]), color),
+                framed(across([to_image(frames[n], IMAGE_SIZE) for n in chosen]), color),
             ],
             gap=24,
             align="middle",
         )
         name = f"example_{number + 1}.png"
         save_png(strip, demo.folder / name)
-        films.append([framed(picture(frame, FILM_SIZE), color) for frame in frames])
+        videos.append([framed(to_image(frame, VIDEO_SIZE), color) for frame in frames])
         examples.append(
             {
                 "strip": name,
                 "instruction": instruction,
                 "is_new": result.is_new,
                 "success": success,
-                "film": result.films[0].resolve().relative_to(demo.folder.resolve()).as_posix(),
+                "video": result.videos[0].resolve().relative_to(demo.folder.resolve()).as_posix(),
             }
         )
-    n_frames = min(map(len, films))
-    animation = [grid([film[n] for film in films], N_EXAMPLES, gap=8) for n in range(n_frames)]
+    n_frames = min(map(len, videos))
+    animation = [grid([video[n] for video in videos], N_EXAMPLES, gap=8) for n in range(n_frames)]
     durations = [*[FRAME_DURATION] * (n_frames - 1), 10 * FRAME_DURATION]
-    save_gif(animation, durations, demo.folder / "films.gif")
+    save_gif(animation, durations, demo.folder / "videos.gif")
     return examples
 
 
-def read_film(path: Path) -> list[np.ndarray]:
-    """Frames of a film, (height, width, 3) uint8 each."""
-    with av.open(str(path)) as film:
-        return [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+def read_video(path: Path) -> list[np.ndarray]:
+    """Frames of a video, (height, width, 3) uint8 each."""
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
 def _demonstration(shown: LeRobotDataset, instruction: str) -> list[np.ndarray]:
-    """The first and the last picture of the demonstration of a task."""
+    """The first and the last image of the demonstration of a task."""
     episode = next(row for row in shown.meta.episodes if row["tasks"] == [instruction])
     ends = episode["dataset_from_index"], episode["dataset_to_index"] - 1
-    pictures = [shown[index]["observation.image"] for index in ends]
-    return [(image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8) for image in pictures]
+    images = [shown[index]["observation.image"] for index in ends]
+    return [(image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8) for image in images]
 
 
 def _command(demo: Demo) -> str:

@@ -1,1 +1,1 @@
-"""Evaluations: how they are run, what is recorded of them, and what is reported."""
+"""Evaluations: how they are run, and the records that they write."""

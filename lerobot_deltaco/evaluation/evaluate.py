@@ -18,11 +18,11 @@ from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, Task, get_task, select_tasks
 from gym_deltaco.workspace import Quadrant
-from lerobot_deltaco.configuration_env import DeltacoEnv
+from lerobot_deltaco.envs.configuration_env import DeltacoEnv
+from lerobot_deltaco.envs.vector_env import make_task_vector_envs
 from lerobot_deltaco.evaluation.record import BENCHMARK, COUNTERFACTUALS, Counterfactual, EpisodeResult
-from lerobot_deltaco.evaluation.recorded_env import RecordedTask
+from lerobot_deltaco.evaluation.recording_env import RecordingVectorEnv
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.vector_env import make_task_vector_envs
 
 PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
 
@@ -83,7 +83,7 @@ def evaluate(
     """
     task_ids = select_tasks(plan.tasks)
     # What another task's instruction or demonstration asks for depends on the scene, so that each episode of
-    # a counterfactual evaluation is told something else.
+    # a counterfactual evaluation has its own demonstration or instruction.
     n_envs = 1 if plan.counterfactual != "none" else plan.trials
     gym_kwargs = {**DeltacoEnv(ambiguity=plan.ambiguity).gym_kwargs, "render_mode": None}
     envs = make_task_vector_envs(ENV_ID, gym_kwargs, task_ids, n_envs)
@@ -94,15 +94,14 @@ def evaluate(
         for env in tqdm(envs, desc=f"Evaluating step {set_number}", unit="task"):
             for trials in _chunks(range(plan.trials), n_envs):
                 seeds = [episode_seed(plan.seed, "evaluation", env.task_id, set_number, t) for t in trials]
-                told = _Told(policy, get_task(env.task_id), task_ids, plan.counterfactual, seeds[0])
-                recorded = RecordedTask(env, seeds, told.instruct)
-                try:
-                    with torch.no_grad():
-                        rollout(recorded, policy, identity, identity, preprocessor, postprocessor, seeds)
-                finally:
-                    policy.shown_as.clear()
+                sampler = CounterfactualSampler(
+                    policy, get_task(env.task_id), task_ids, plan.counterfactual, seeds[0]
+                )
+                recorded = RecordingVectorEnv(env, seeds, sampler.sample_instructions)
+                with torch.no_grad(), policy.demonstrated_as(sampler.demonstrated_as):
+                    rollout(recorded, policy, identity, identity, preprocessor, postprocessor, seeds)
                 results += [
-                    _result(recorded, index, trial, seed, told.demonstration)
+                    _result(recorded, index, trial, seed, sampler.demonstration)
                     for index, (trial, seed) in enumerate(zip(trials, seeds, strict=True))
                 ]
             env.close()
@@ -118,8 +117,8 @@ def versions(policy: DeltacoPolicy) -> dict[str, str]:
     return {BENCHMARK: ENV_ID, **packages, "language_encoder": policy.config.language_encoder}
 
 
-class _Told:
-    """What the policy is told in the episodes of a task: the task's own, or in part another one's."""
+class CounterfactualSampler:
+    """Chooses the demonstration and the instruction of an episode: the task's own, or one of another task."""
 
     def __init__(
         self,
@@ -130,32 +129,34 @@ class _Told:
         seed: int,
     ) -> None:
         self.demonstration = task.instruction if policy.config.uses_demo else None
-        self._policy = policy
+        self.demonstrated_as: dict[str, str] = {}  # the task that demonstrates an instruction
         self._task = task
         self._counterfactual = counterfactual
         self._others = [get_task(index) for index in task_ids if index != task.index]
-        if counterfactual == "demo" and policy.shown is not None:
-            self._others = [other for other in self._others if other.instruction in policy.shown.rows]
+        if counterfactual == "demo" and policy.eval_demonstrations is not None:
+            self._others = [
+                other for other in self._others if other.instruction in policy.eval_demonstrations.rows
+            ]
         self._random = random.Random(seed)
 
-    def instruct(self, infos: list[dict[str, Any]]) -> list[str]:
+    def sample_instructions(self, infos: list[dict[str, Any]]) -> list[str]:
         """The instructions for scenes, once they are drawn."""
         own = self._task.instruction
         if self._counterfactual == "none":
             return [own] * len(infos)
         (info,) = infos
-        other = other_task(self._others, info, self._random).instruction
+        other = counterfactual_task(self._others, info, self._random).instruction
         if self._counterfactual == "instruction":
-            self._policy.shown_as[other] = own
+            self.demonstrated_as[other] = own
             return [other]
-        self._policy.shown_as[own] = other
+        self.demonstrated_as[own] = other
         if self.demonstration is not None:
             self.demonstration = other
         return [own]
 
 
-def other_task(others: Sequence[Task], info: dict[str, Any], rng: random.Random) -> Task:
-    """Another task that can be told in a scene.
+def counterfactual_task(others: Sequence[Task], info: dict[str, Any], rng: random.Random) -> Task:
+    """Another task whose demonstration or instruction fits a scene.
 
     If there is one, it asks for another object that stands there, and for the other container; else, at least
     for the other container.
@@ -170,7 +171,7 @@ def other_task(others: Sequence[Task], info: dict[str, Any], rng: random.Random)
     """
     if not others:
         raise ValueError(
-            "A counterfactual evaluation needs at least two tasks that the policy can be told. Evaluate more "
+            "A counterfactual evaluation needs at least two tasks that the policy can perform. Evaluate more "
             "tasks, and give demonstrations of them."
         )
     labels = [OBJECTS[index] for index in info["objects"]]
@@ -192,7 +193,7 @@ def other_task(others: Sequence[Task], info: dict[str, Any], rng: random.Random)
 
 
 def _result(
-    recorded: RecordedTask, index: int, trial: int, seed: int, demonstration: str | None
+    recorded: RecordingVectorEnv, index: int, trial: int, seed: int, demonstration: str | None
 ) -> EpisodeResult:
     info = recorded.infos[index]
     return EpisodeResult(

@@ -1,1 +1,1 @@
-"""Experiments: the rows of the paper's tables as configuration files, and running one."""
+"""Experiments: the rows of the paper's tables and ours as configuration files, and their execution."""

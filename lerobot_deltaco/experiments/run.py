@@ -1,4 +1,4 @@
-"""Runs a row: collects its data, trains, evaluates every checkpoint. What is done is not done again."""
+"""Runs an experiment: collects its data, trains, evaluates every checkpoint. Finished steps are skipped."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
-from lerobot_deltaco.experiments.rows import Row
+from lerobot_deltaco.experiments.config import ExperimentConfig
 
 LAST = Path("checkpoints", "last", "pretrained_model")
 
 
-class Experiment:
-    """A row with a seed, in a folder of experiments' outputs.
+class ExperimentRun:
+    """An experiment with a seed, in a folder for the outputs of experiments.
 
     Args:
-        row: The row.
+        config: The experiment.
         seed: Of the training: the weights, the order of the data, the draws.
-        outputs: Where everything goes: `data/` is shared by all rows, `ROW/seed_SEED` is the run's.
+        outputs: Folder of all outputs: experiments share `data/`; a run's folder is `EXPERIMENT/seed_SEED`.
     """
 
-    def __init__(self, row: Row, seed: int, outputs: Path) -> None:
-        self.row = row
+    def __init__(self, config: ExperimentConfig, seed: int, outputs: Path) -> None:
+        self.config = config
         self.seed = seed
         self.outputs = outputs
-        self.run = run_folder(outputs, row.name, seed)
-        self.log = self.run.with_name(f"{self.run.name}.log")  # where several run at a time
+        self.folder = run_folder(outputs, config.name, seed)
+        self.log = self.folder.with_name(f"{self.folder.name}.log")  # where several run at a time
 
-    def do(self) -> None:
+    def run(self) -> None:
         """Everything that is not done yet.
 
         Raises:
@@ -51,13 +51,13 @@ class Experiment:
         for section, values in settings.items():
             if there[section] != values:
                 raise ExperimentError(
-                    f"{self.run} was begun with other settings: {section} was {there[section]}, and now is "
-                    f"{values}. Ask for the same, name another --out, or move the run and {file.name} away."
+                    f"{self.folder} was started with other settings: {section} was {there[section]}, now "
+                    f"{values}. Use the same settings or another --out, or move the run and {file.name} away."
                 )
 
     def collect(self) -> None:
-        """Collects the datasets that the row needs and that are not there."""
-        for plan in (self.row.data, self.row.demonstrations):
+        """Collects the datasets that the experiment needs and that are missing."""
+        for plan in (self.config.data, self.config.demonstrations):
             options = [f"--{key.replace('_', '-')}={value}" for key, value in plan.items()]
             CommandRunner().run("collect", [*options, f"--root={dataset_folder(self.outputs, plan)}"])
 
@@ -68,15 +68,15 @@ class Experiment:
         self._evaluate(commands)
 
     def _settings_file(self) -> Path:
-        return self.run.with_name(f"{self.run.name}.json")
+        return self.folder.with_name(f"{self.folder.name}.json")
 
     def _settings(self) -> dict[str, Any]:
         return {
-            "data": dict(self.row.data),
-            "demonstrations": dict(self.row.demonstrations),
-            "policy": dict(self.row.policy),
-            "training": dict(self.row.training),
-            "start_from": self.row.start_from,
+            "data": dict(self.config.data),
+            "demonstrations": dict(self.config.demonstrations),
+            "policy": dict(self.config.policy),
+            "training": dict(self.config.training),
+            "start_from": self.config.start_from,
         }
 
     def _keep_settings(self) -> None:
@@ -88,58 +88,58 @@ class Experiment:
 
     def _train(self, commands: CommandRunner) -> None:
         """Trains, from the last checkpoint if there is one."""
-        last = self.run / LAST / "train_config.json"
+        last = self.folder / LAST / "train_config.json"
         if last.exists():
-            if _steps_done(self.run) >= self.row.training["steps"]:
+            if _steps_done(self.folder) >= self.config.training["steps"]:
                 return
             commands.run("train", [f"--config_path={last}", "--resume=true"])
             return
         # What an interrupted training left before its first checkpoint.
-        shutil.rmtree(self.run, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
         options = {
-            **{f"policy.{name}": value for name, value in self.row.policy.items() if value is not None},
+            **{f"policy.{name}": value for name, value in self.config.policy.items() if value is not None},
             "policy.seed": self.seed,
             "policy.demo_repo_id": "deltaco/demonstrations",
-            "policy.demo_root": dataset_folder(self.outputs, self.row.demonstrations),
+            "policy.demo_root": dataset_folder(self.outputs, self.config.demonstrations),
             "dataset.repo_id": "deltaco/training",
-            "dataset.root": dataset_folder(self.outputs, self.row.data),
-            **self.row.training,
+            "dataset.root": dataset_folder(self.outputs, self.config.data),
+            **self.config.training,
             "seed": self.seed,
-            "job_name": self.row.name,
-            "output_dir": self.run,
+            "job_name": self.config.name,
+            "output_dir": self.folder,
         }
-        if self.row.training.get("env_eval_freq"):
+        if self.config.training.get("env_eval_freq"):
             options |= {
                 "env.type": "deltaco",
-                "env.task": self.row.evaluation["tasks"],
-                "env.ambiguity": self.row.evaluation.get("ambiguity", "container"),
-                "eval.n_episodes": self.row.evaluation["trials"],
+                "env.task": self.config.evaluation["tasks"],
+                "env.ambiguity": self.config.evaluation.get("ambiguity", "container"),
+                "eval.n_episodes": self.config.evaluation["trials"],
             }
-        if self.row.start_from is None:
+        if self.config.start_from is None:
             options = {"policy.type": "deltaco", **options}
         else:
-            start = run_folder(self.outputs, self.row.start_from, self.seed)
+            start = run_folder(self.outputs, self.config.start_from, self.seed)
             if not (start / LAST).exists():
                 raise ExperimentError(
-                    f"{self.row.name} starts from {self.row.start_from}, which was not trained with the seed "
-                    f"{self.seed}. Run that row first."
+                    f"{self.config.name} starts from {self.config.start_from}, which was not trained with "
+                    f"seed {self.seed}. Run that experiment first."
                 )
             options = {"policy.path": start / LAST, **options}
         commands.run("train", [f"--{name}={_text(value)}" for name, value in options.items()])
 
     def _evaluate(self, commands: CommandRunner) -> None:
         """Evaluates the checkpoints that were not evaluated in training."""
-        options = [f"--{name}={value}" for name, value in self.row.evaluation.items()]
-        commands.run("evaluate", [str(self.run), *options, f"--experiment={self.row.name}"])
+        options = [f"--{name}={value}" for name, value in self.config.evaluation.items()]
+        commands.run("evaluate", [str(self.folder), *options, f"--experiment={self.config.name}"])
 
 
-def run_folder(outputs: Path, row_name: str, seed: int) -> Path:
-    """Where a row's run with a seed is."""
-    return outputs / row_name / f"seed_{seed}"
+def run_folder(outputs: Path, experiment_name: str, seed: int) -> Path:
+    """The folder of an experiment's run with a seed."""
+    return outputs / experiment_name / f"seed_{seed}"
 
 
 def dataset_folder(outputs: Path, plan: Mapping[str, Any]) -> Path:
-    """Where the dataset of a collection is, which rows share."""
+    """Where the dataset of a collection is, which experiments share."""
     return outputs / "data" / "_".join(f"{key}-{value}" for key, value in sorted(plan.items()))
 
 

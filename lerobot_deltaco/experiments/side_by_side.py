@@ -18,7 +18,7 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from lerobot_deltaco.experiments.command_runner import CommandRunner
-from lerobot_deltaco.experiments.run import Experiment, run_folder
+from lerobot_deltaco.experiments.run import ExperimentRun, run_folder
 
 SECONDS_BETWEEN_LOOKS = 1.0
 SECONDS_BETWEEN_LINES = 60.0  # where what is printed goes to a file
@@ -28,14 +28,14 @@ _PROGRESS = re.compile(r"(\d+)%\|[^|]*\|[^\]\r\n]*<([\d:?]+)[^\]\r\n]*\]")
 
 
 class _Running(NamedTuple):
-    experiment: Experiment
+    experiment: ExperimentRun
     commands: CommandRunner
 
 
-def run_side_by_side(experiments: Sequence[Experiment], jobs: int, report: Callable[[Path], None]) -> None:
+def run_side_by_side(experiments: Sequence[ExperimentRun], jobs: int, report: Callable[[Path], None]) -> None:
     """Collects what is missing, one dataset after the other; trains and evaluates several runs at a time.
 
-    Each run prints to its log. A row that starts from another of these waits for it.
+    Each run prints to its log. An experiment that starts from another one of these waits for it.
 
     Args:
         experiments: What to run; each is another run.
@@ -49,7 +49,7 @@ def run_side_by_side(experiments: Sequence[Experiment], jobs: int, report: Calla
         experiment.check_settings()
     collected = []
     for experiment in experiments:
-        plans = (experiment.row.data, experiment.row.demonstrations)
+        plans = (experiment.config.data, experiment.config.demonstrations)
         if plans not in collected:
             experiment.collect()
             collected.append(plans)
@@ -74,7 +74,7 @@ def run_side_by_side(experiments: Sequence[Experiment], jobs: int, report: Calla
                     try:
                         future.result()
                         progress.update()
-                        report(experiment.run)
+                        report(experiment.folder)
                     except Exception as error:
                         progress.write(f"{_label(experiment)}: {error}")
                         failure = failure or error
@@ -112,7 +112,7 @@ class _Progress(tqdm):
         super().__init__(total=n_runs, bar_format=form, dynamic_ncols=True)
         self._shown_at = -SECONDS_BETWEEN_LINES
 
-    def show(self, running: Sequence[Experiment]) -> None:
+    def show(self, running: Sequence[ExperimentRun]) -> None:
         """Says how far those that run have come."""
         states = (f"{_label(experiment)} {last_progress(experiment.log)}" for experiment in running)
         self.set_postfix_str("; ".join(states), refresh=False)
@@ -122,15 +122,15 @@ class _Progress(tqdm):
             self.refresh()
 
 
-def _next(waiting: Sequence[Experiment], running: Collection[_Running]) -> Experiment | None:
+def _next(waiting: Sequence[ExperimentRun], running: Collection[_Running]) -> ExperimentRun | None:
     """The first that does not start from one that is still to be completed."""
-    incomplete = {experiment.run for experiment in (*waiting, *(now.experiment for now in running))}
+    incomplete = {experiment.folder for experiment in (*waiting, *(now.experiment for now in running))}
     for experiment in waiting:
-        start = experiment.row.start_from
+        start = experiment.config.start_from
         if start is None or run_folder(experiment.outputs, start, experiment.seed) not in incomplete:
             return experiment
     return waiting[0] if waiting and not running else None  # one that says what it lacks
 
 
-def _label(experiment: Experiment) -> str:
-    return f"{experiment.row.name} {experiment.seed}"
+def _label(experiment: ExperimentRun) -> str:
+    return f"{experiment.config.name} {experiment.seed}"

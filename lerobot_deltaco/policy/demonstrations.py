@@ -64,7 +64,7 @@ class DemonstrationSet(torch.nn.Module):
                 single[0],
             )
 
-    def others(
+    def sample_other_episodes(
         self,
         episodes: Tensor,
         generator: torch.Generator,
@@ -100,7 +100,7 @@ class DemonstrationSet(torch.nn.Module):
             place = torch.where(held_back, (draws * count).long(), place)
         return self._order[self._start[rows] + place]
 
-    def shared(
+    def sample_shared_episodes(
         self,
         episodes: Tensor,
         column: Tensor,
@@ -172,7 +172,7 @@ class DemonstrationSet(torch.nn.Module):
             rows[sample] = self.rows[tasks[sample]][0]
         return torch.tensor(rows, device=wanted.device)
 
-    def pictures(self, rows: Tensor, n_frames: int, generator: torch.Generator) -> Tensor:
+    def sample_frames(self, rows: Tensor, n_frames: int, generator: torch.Generator) -> Tensor:
         """Frames of demonstrations in the order of time: the first, random ones between, and the last.
 
         Args:
@@ -205,7 +205,7 @@ def load_demonstrations(
         repo_id: Of the dataset.
         root: Its folder, None for LeRobot's cache.
         episodes: Which of its episodes, None for all.
-        camera: Key of the pictures, such as "observation.image".
+        camera: Key of the images, such as "observation.image".
         image_size: Height and width to which they are scaled.
         n_demo_frames: Frames of a demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
 
@@ -224,14 +224,16 @@ def load_demonstrations(
     frames, tasks = [], []
     for episode in tqdm(episodes, desc="Reading demonstrations", unit="episode", leave=False):
         row = dataset.meta.episodes[episode]
-        indices = kept_frames(row["dataset_from_index"], row["dataset_to_index"] - 1, n_demo_frames).tolist()
-        pictures = torch.stack([dataset[index][camera] for index in indices])  # (kept, 3, h, w)
-        frames.append(scaled_pictures(pictures, image_size))
+        indices = kept_frame_indices(
+            row["dataset_from_index"], row["dataset_to_index"] - 1, n_demo_frames
+        ).tolist()
+        images = torch.stack([dataset[index][camera] for index in indices])  # (kept, 3, h, w)
+        frames.append(resize_images(images, image_size))
         tasks.append(row["tasks"][0])
     return DemonstrationSet(torch.stack(frames), tasks, episodes)
 
 
-def kept_frames(first: int, last: int, n_demo_frames: int) -> Tensor:
+def kept_frame_indices(first: int, last: int, n_demo_frames: int) -> Tensor:
     """Which frames of an episode are kept for demonstrations, (kept,) int64.
 
     Args:
@@ -244,18 +246,18 @@ def kept_frames(first: int, last: int, n_demo_frames: int) -> Tensor:
     return torch.linspace(first, last, n_kept, dtype=torch.float64).round().long()
 
 
-def as_bytes(pictures: Tensor) -> Tensor:
-    """Pictures, uint8 or 0..1, as uint8."""
-    if pictures.dtype == torch.uint8:
-        return pictures
-    return (pictures * 255).round().clamp(0, 255).to(torch.uint8)
+def to_uint8(images: Tensor) -> Tensor:
+    """Images, uint8 or 0..1, as uint8."""
+    if images.dtype == torch.uint8:
+        return images
+    return (images * 255).round().clamp(0, 255).to(torch.uint8)
 
 
-def scaled_pictures(pictures: Tensor, size: int) -> Tensor:
-    """Pictures (..., 3, H, W), uint8 or 0..1, as uint8 (..., 3, size, size)."""
-    pictures = as_bytes(pictures)
-    if pictures.shape[-2:] == (size, size):
-        return pictures
-    flat = pictures.flatten(0, -4).float()
+def resize_images(images: Tensor, size: int) -> Tensor:
+    """Images (..., 3, H, W), uint8 or 0..1, as uint8 (..., 3, size, size)."""
+    images = to_uint8(images)
+    if images.shape[-2:] == (size, size):
+        return images
+    flat = images.flatten(0, -4).float()
     flat = F.interpolate(flat, (size, size), mode="bilinear", antialias=True).round().clamp(0, 255)
-    return flat.to(torch.uint8).view(*pictures.shape[:-2], size, size)
+    return flat.to(torch.uint8).view(*images.shape[:-2], size, size)

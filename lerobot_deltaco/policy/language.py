@@ -1,7 +1,7 @@
-"""Frozen sentence encoders: which there are, and how each is loaded.
+"""Loads frozen sentence encoders, and keeps the embeddings of instructions.
 
-A new kind of encoder (CLIP's, say) is one more row of `LANGUAGE_ENCODERS` and, if sentence-transformers does
-not know it, a branch of `load_language_encoder`.
+A new kind of encoder (CLIP's, for example) needs an entry of `LANGUAGE_ENCODERS` and, if
+sentence-transformers does not support it, a branch of `load_language_encoder`.
 """
 
 from __future__ import annotations
@@ -10,42 +10,16 @@ import json
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import MappingProxyType
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from lerobot_deltaco.policy.packaged_encoders import (
-    MINILM_L3,
-    MINILM_L6,
-    LanguageEncoderError,
-    packaged_l3,
-    packaged_l6,
-)
+from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6
+from lerobot_deltaco.policy.packaged_encoders import LanguageEncoderError, packaged_l3, packaged_l6
 
 BATCH_SIZE = 64
-
-
-class LanguageEncoderSpec(NamedTuple):
-    """A sentence encoder."""
-
-    repo_id: str  # on the Hugging Face Hub
-    embedding_dim: int
-
-
-LANGUAGE_ENCODERS = MappingProxyType(
-    {
-        # The authors' "miniLM", "DistilRoBERTa" and "DistilBERT". The first, and ours below, also come as
-        # Python packages, with the extra `offline`.
-        MINILM_L3: LanguageEncoderSpec("sentence-transformers/paraphrase-MiniLM-L3-v2", 384),
-        "all-distilroberta-v1": LanguageEncoderSpec("sentence-transformers/all-distilroberta-v1", 768),
-        "distilbert-base-uncased": LanguageEncoderSpec("distilbert/distilbert-base-uncased", 768),
-        MINILM_L6: LanguageEncoderSpec("sentence-transformers/all-MiniLM-L6-v2", 384),
-    }
-)
 
 # From sentences to unit embeddings, (sentences, embedding), on the CPU.
 LanguageEncoder = Callable[[Sequence[str]], Tensor]

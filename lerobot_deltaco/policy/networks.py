@@ -1,6 +1,6 @@
 """The policy's network (the paper's figure 3, appendix B), which task embeddings condition.
 
-    picture (3, H, W)
+    image (3, H, W)
         |
     conv 7x7, batch norm, pool
         |
@@ -51,10 +51,10 @@ class Motion(NamedTuple):
 
 
 class ConditionedPolicy(nn.Module):
-    """From a picture, task embeddings and proprioception to an action.
+    """From an image, task embeddings and proprioception to an action.
 
     Args:
-        n_cameras: Number of pictures of an observation; their feature points are concatenated.
+        n_cameras: Number of images of an observation; their feature points are concatenated.
         film_dim: Size of the embedding that goes through FiLM, 0 for none.
         concat_dim: Size of what is concatenated to the feature points: embeddings and proprioception.
         motion_dim: Size of the action without the gripper.
@@ -136,7 +136,7 @@ class FilmResNet(nn.Module):
     Args:
         film_dim: Size of the embedding, 0 for no FiLM.
         channels: Of the blocks.
-        stem_stride: Of the first convolution. With the paper's 1, the maps have half the picture's size.
+        stem_stride: Of the first convolution. With the paper's 1, the maps have half the image's size.
     """
 
     def __init__(self, film_dim: int, channels: Sequence[int], stem_stride: int = 1) -> None:
@@ -253,10 +253,10 @@ def multilayer_perceptron(dims: Sequence[int]) -> nn.Sequential:
 
 
 def random_crop(images: Tensor, padding: int, generator: torch.Generator | None = None) -> Tensor:
-    """Shifts each picture at random by up to `padding` pixels; what comes in at the edges is black.
+    """Shifts each image at random by up to `padding` pixels; what comes in at the edges is black.
 
     Args:
-        images: (batch, ..., H, W). All pictures of a sample are shifted alike.
+        images: (batch, ..., H, W). All images of a sample are shifted alike.
         padding: px.
         generator: Source of the shifts, on the CPU.
 

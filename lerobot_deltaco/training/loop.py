@@ -27,7 +27,7 @@ from lerobot.scripts import lerobot_train
 from torch import Tensor
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.configuration_env import DeltacoEnv
+from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
 from lerobot_deltaco.evaluation.sets import run_set
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
@@ -37,7 +37,7 @@ from lerobot_deltaco.training.task_batches import TaskBatchSampler
 logger = logging.getLogger(__name__)
 
 
-class _Places(torch.utils.data.Dataset):
+class FrameIndexDataset(torch.utils.data.Dataset):
     """Stands for a dataset where LeRobot loads batches: what it gives are places of frames, no frames."""
 
     def __init__(self, dataset: LeRobotDataset) -> None:
@@ -79,7 +79,7 @@ class InMemoryTraining:
         ):
             yield
 
-    def make_datasets(self, config: TrainPipelineConfig) -> tuple[_Places, LeRobotDataset | None]:
+    def make_datasets(self, config: TrainPipelineConfig) -> tuple[FrameIndexDataset, LeRobotDataset | None]:
         """LeRobot's datasets, the first of them read into memory.
 
         Raises:
@@ -96,13 +96,13 @@ class InMemoryTraining:
         # The loader has nothing to do: it gives places, and the frames are gathered on the device.
         config.num_workers = 0
         train, evaluation = self._make_datasets(config)
-        # Scaled beforehand where that takes less memory than the pictures as they are.
+        # Scaled beforehand where that takes less memory than the images as they are.
         size: int | None = config.policy.image_size
         shapes = [train.meta.features[camera]["shape"] for camera in train.meta.camera_keys]
         if all(3 * size**2 >= np.prod(shape) for shape in shapes):
             size = None
         self._frames = FramesInMemory(train, self._device(config.policy), size)
-        return _Places(train), evaluation
+        return FrameIndexDataset(train), evaluation
 
     def make_policy(self, **arguments: Any) -> PreTrainedPolicy:
         """LeRobot's policy, which draws its demonstrations from the frames in memory."""
@@ -112,7 +112,9 @@ class InMemoryTraining:
         assert frames is not None
         if config.uses_demo and config.demo_episodes is None:
             camera = next(iter(config.image_features))
-            policy.demonstrate_with(frames.demonstrations(camera, config.image_size, config.n_demo_frames))
+            policy.set_train_demonstrations(
+                frames.demonstrations(camera, config.image_size, config.n_demo_frames)
+            )
         return policy
 
     def make_sampler(self, from_indices: Any, to_indices: Any, **options: Any) -> Any:
@@ -167,7 +169,7 @@ class InMemoryTraining:
         assert config is not None
         if not self._records(config):
             return self._evaluate(**arguments)
-        # The folder for films is all that knows the step.
+        # Only the folder for videos tells the step.
         step = int(arguments["videos_dir"].name.rsplit("_", 1)[1])
         policy: DeltacoPolicy = arguments["policy"]
         policy.eval()
@@ -189,7 +191,7 @@ class InMemoryTraining:
 
     @staticmethod
     def _records(config: TrainPipelineConfig) -> bool:
-        # With wandb, LeRobot's own evaluation, since its films are sent there.
+        # With wandb, LeRobot's own evaluation, since its videos are uploaded there.
         return isinstance(config.env, DeltacoEnv) and not config.wandb.enable
 
     @staticmethod

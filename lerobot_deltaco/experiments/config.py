@@ -1,4 +1,4 @@
-"""Rows of the tables, as files: what a row says, over what its folder shares, over what all share."""
+"""Experiments as YAML files. Each overrides what its folder shares, which overrides what all share."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ SHARED = "shared.yaml"
 _SECTIONS = ("data", "demonstrations", "policy", "training", "evaluation")
 
 
-class RowError(ValueError):
-    """There is no such row, or its file is wrong; the message says what is."""
+class ExperimentConfigError(ValueError):
+    """An experiment does not exist or its file is invalid; the message says why."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """A row of a table.
+class ExperimentConfig:
+    """An experiment: one row of one of the paper's tables, or one of ours.
 
     Args:
         name: Such as "scenario_a/deltaco".
@@ -28,7 +28,8 @@ class Row:
         policy: Options of `--policy`.
         training: Further options of `deltaco-train`.
         evaluation: Arguments of the evaluation sets, as `EvaluationPlan` has them.
-        start_from: The row whose last checkpoint, of the same seed, is trained on; None for a new policy.
+        start_from: Name of the experiment whose last checkpoint, with the same seed, is fine-tuned; None to
+            train from scratch.
     """
 
     name: str
@@ -40,8 +41,8 @@ class Row:
     start_from: str | None = None
 
 
-def row_names(folder: Path) -> list[str]:
-    """The rows in a folder of experiments."""
+def experiment_names(folder: Path) -> list[str]:
+    """Names of the experiments in a folder."""
     return sorted(
         path.relative_to(folder).with_suffix("").as_posix()
         for path in folder.glob("*/*.yaml")
@@ -49,8 +50,8 @@ def row_names(folder: Path) -> list[str]:
     )
 
 
-def read_row(folder: Path, name: str, settings: Sequence[str] = ()) -> Row:
-    """Reads a row.
+def read_experiment(folder: Path, name: str, settings: Sequence[str] = ()) -> ExperimentConfig:
+    """Reads an experiment.
 
     Args:
         folder: Of the experiments.
@@ -58,11 +59,13 @@ def read_row(folder: Path, name: str, settings: Sequence[str] = ()) -> Row:
         settings: What differs from the files: "training.steps=2000", "policy.device=cuda".
 
     Raises:
-        RowError: There is no such row, a file has something in it that is not known, or a setting has.
+        ExperimentConfigError: The experiment does not exist, or a file or a setting has an unknown section.
     """
     file = folder / f"{name}.yaml"
-    if name not in row_names(folder):
-        raise RowError(f"There is no row {name!r} in {folder}. There are {', '.join(row_names(folder))}.")
+    if name not in experiment_names(folder):
+        raise ExperimentConfigError(
+            f"There is no experiment {name!r} in {folder}. There are {', '.join(experiment_names(folder))}."
+        )
     merged: dict[str, Any] = {}
     for path in (folder / SHARED, file.parent / SHARED, file):
         if path.is_file():
@@ -70,14 +73,14 @@ def read_row(folder: Path, name: str, settings: Sequence[str] = ()) -> Row:
     for setting in settings:
         merged = _merged(merged, _parsed(setting))
     sections = {section: merged.get(section, {}) for section in _SECTIONS}
-    return Row(name, **sections, start_from=merged.get("start_from"))
+    return ExperimentConfig(name, **sections, start_from=merged.get("start_from"))
 
 
 def _read(path: Path) -> dict[str, Any]:
     content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     unknown = set(content) - {*_SECTIONS, "start_from"}
     if unknown:
-        raise RowError(
+        raise ExperimentConfigError(
             f"{path} has the unknown section {sorted(unknown)[0]!r}. Valid are {', '.join(_SECTIONS)} and "
             "start_from."
         )
@@ -89,7 +92,7 @@ def _parsed(setting: str) -> dict[str, dict[str, Any]]:
     key, equals, value = setting.partition("=")
     section, _, name = key.partition(".")
     if section not in _SECTIONS or not name or not equals:
-        raise RowError(
+        raise ExperimentConfigError(
             f"A setting is SECTION.NAME=VALUE, such as training.steps=2000. The sections are "
             f"{', '.join(_SECTIONS)}. Got {setting!r}."
         )

@@ -15,7 +15,7 @@ from gym_deltaco import ENV_ID, EPISODE_STEPS
 from gym_deltaco.env import CONTROL_FPS, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.tasks import TASKS, select_tasks
-from lerobot_deltaco.vector_env import make_task_vector_envs
+from lerobot_deltaco.envs.vector_env import make_task_vector_envs
 
 
 @EnvConfig.register_subclass("deltaco")
@@ -28,14 +28,14 @@ class DeltacoEnv(EnvConfig):
     Args:
         task: Which tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_b_test,
             scenario_b_train, all), or indices and ranges of 0 to 299, such as 4,50-73.
-        fps: Frames per second at which films of episodes play. The simulation knows no frame rate.
+        fps: Frames per second of the videos of episodes. The simulation has no frame rate of its own.
         episode_length: Number of steps after which an episode ends. The benchmark's is 30.
         ambiguity: "container" (the paper's scheme i: the instruction is clear, a demonstration leaves open
             which container is meant) or "object" (scheme ii: there are two of the object that the instruction
             asks for, and only a demonstration tells which is meant).
-        image_size: Height and width of the policy's picture, in pixels. The benchmark's is 48.
-        render_size: Height and width of films. LeRobot films up to 10 episodes of every task, and a frame of
-            256 pixels takes several times as long as one of 96.
+        image_size: Height and width of the policy's image, in pixels. The benchmark's is 48.
+        render_size: Height and width of videos, in pixels. LeRobot records up to 10 episodes of every task,
+            and a frame of 256 pixels takes several times as long to render as one of 96.
     """
 
     task: str = "scenario_a_test"

@@ -1,4 +1,4 @@
-"""A dataset's card: README.md and its pictures, made from the dataset itself."""
+"""A dataset's card: README.md and its images, made from the dataset itself."""
 
 from __future__ import annotations
 
@@ -22,17 +22,27 @@ from PIL import Image
 
 from gym_deltaco import EPISODE_STEPS
 from gym_deltaco.env import ACTION_SCALE, PickPlaceEnv
-from gym_deltaco.sheets import caption, down, enlarged, framed, grid, picture, save_gif, save_png, write_whole
+from gym_deltaco.sheets import (
+    caption,
+    down,
+    enlarged,
+    framed,
+    grid,
+    save_gif,
+    save_png,
+    to_image,
+    write_whole,
+)
 from gym_deltaco.tasks import SCENARIOS, TASKS, Task
+from lerobot_deltaco.cards.templates import env_options, render
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import HISTORY_FILE
 from lerobot_deltaco.data.collection_plan import CollectionPlan
-from lerobot_deltaco.templates import env_options, render
 
 CARD_FILE = Path("README.md")
-TASKS_PICTURE = Path("assets/tasks.png")
-EPISODE_PICTURE = Path("assets/episode.gif")
-CARD_FILES = (CARD_FILE, TASKS_PICTURE, EPISODE_PICTURE)
+TASKS_IMAGE = Path("assets/tasks.png")
+EPISODE_IMAGE = Path("assets/episode.gif")
+CARD_FILES = (CARD_FILE, TASKS_IMAGE, EPISODE_IMAGE)
 TAGS = (
     "LeRobot",
     *("deltaco", "gym_deltaco", "imitation-learning", "demonstrations", "language-conditioned"),
@@ -42,7 +52,7 @@ MAX_TASKS_SHOWN = 12
 
 # What each feature is, and its unit. Names, types and shapes come from the dataset.
 DESCRIPTIONS = {
-    "observation.image": ("picture of the front camera, before the action", "RGB, PNG of 8 bits"),
+    "observation.image": ("image of the front camera, before the action", "RGB, PNG of 8 bits"),
     "observation.state": (
         "angles of the arm's 6 joints, position of the end effector in the world, state of the gripper",
         "rad; m; 1 open, 0 closed",
@@ -67,7 +77,7 @@ DESCRIPTIONS = {
 
 _TEMPLATE = "benchmark_dataset.md"
 _VIEW_SIZE = 256  # px, of what people see
-_STORED_SIZE = 96  # px, about, of a stored picture beside it
+_STORED_SIZE = 96  # px, about, of a stored image beside it
 _N_COLUMNS = 3
 _FRAME_MS = 125  # three times slower than nominal
 _LAST_FRAME_MS = 1500
@@ -87,15 +97,15 @@ def write_card(root: Path, folder: Path | None = None, repo_id: str | None = Non
         OSError: A file cannot be read or written.
     """
     folder = folder or root
-    (folder / TASKS_PICTURE).parent.mkdir(parents=True, exist_ok=True)
+    (folder / TASKS_IMAGE).parent.mkdir(parents=True, exist_ok=True)
     info = json.loads((root / files.INFO_FILE).read_text())
     episodes = list(_first_episodes(root, info))
     image_info = info["features"]["observation.image"]["info"]
     with closing(
-        PickPlaceEnv(ambiguity=image_info["ambiguity"], image_size=episodes[0].pictures.shape[1])
+        PickPlaceEnv(ambiguity=image_info["ambiguity"], image_size=episodes[0].images.shape[1])
     ) as env:
-        save_png(_tasks_picture(episodes, env), folder / TASKS_PICTURE)
-        _save_episode(episodes[0], env, folder / EPISODE_PICTURE)
+        save_png(_tasks_image(episodes, env), folder / TASKS_IMAGE)
+        _save_episode(episodes[0], env, folder / EPISODE_IMAGE)
     text = card_text(root, repo_id)
     write_whole(folder / CARD_FILE, lambda file: file.write_text(text, encoding="utf-8"))
 
@@ -145,8 +155,8 @@ def card_text(root: Path, repo_id: str | None = None) -> str:
         benchmark=image["info"],
         action_scale=ACTION_SCALE,
         episode_steps=EPISODE_STEPS,
-        tasks_picture=TASKS_PICTURE,
-        episode_picture=EPISODE_PICTURE,
+        tasks_image=TASKS_IMAGE,
+        episode_image=EPISODE_IMAGE,
         tasks=tasks,
         kinds=_kinds(tasks),
         scenarios=_scenarios(tasks),
@@ -257,7 +267,7 @@ def _size_category(n_rows: int) -> str:
     return next((name for limit, name in _SIZE_CATEGORIES if n_rows < limit), _LARGEST_CATEGORY)
 
 
-# Pictures
+# Images
 
 
 @dataclass(frozen=True)
@@ -266,7 +276,7 @@ class _Episode:
 
     task: Task
     seed: int | None  # None if it was removed from the dataset
-    pictures: NDArray[np.uint8]  # (N, H, W, 3)
+    images: NDArray[np.uint8]  # (N, H, W, 3)
     actions: NDArray[np.float32]  # (N, 4)
 
 
@@ -287,16 +297,16 @@ def _first_episodes(root: Path, info: Mapping[str, Any]) -> Iterator[_Episode]:
         yield _Episode(
             task=TASKS[frames["benchmark.task_id"].iloc[0]],
             seed=int(frames["benchmark.seed"].iloc[0]) if "benchmark.seed" in frames else None,
-            pictures=np.stack([_decoded(cell) for cell in frames["observation.image"]]),
+            images=np.stack([_decoded(cell) for cell in frames["observation.image"]]),
             actions=np.stack(list(frames["action"])),
         )
 
 
-def _tasks_picture(episodes: Sequence[_Episode], env: PickPlaceEnv) -> Image.Image:
+def _tasks_image(episodes: Sequence[_Episode], env: PickPlaceEnv) -> Image.Image:
     """The start of each episode, for people where it can be drawn again, and as it is stored."""
     cells = []
     for episode in episodes:
-        stored = episode.pictures[0]
+        stored = episode.images[0]
         (view,) = list(islice(_replayed(episode, env), 1)) or [_enlarged(stored, _VIEW_SIZE)]
         # In this corner, there is nothing to hide at the start.
         view.paste(framed(_enlarged(stored, _STORED_SIZE), thickness=2), (0, 0))
@@ -307,8 +317,8 @@ def _tasks_picture(episodes: Sequence[_Episode], env: PickPlaceEnv) -> Image.Ima
 def _save_episode(episode: _Episode, env: PickPlaceEnv, path: Path) -> None:
     """An animation of an episode: replayed for people, or else as it is stored."""
     views = list(_replayed(episode, env))
-    if len(views) < len(episode.pictures):
-        views = [_enlarged(stored, _VIEW_SIZE) for stored in episode.pictures]
+    if len(views) < len(episode.images):
+        views = [_enlarged(stored, _VIEW_SIZE) for stored in episode.images]
     heading = caption(episode.task.instruction, views[0].width, size=14, n_lines=3)
     frames = [framed(down([heading, view], gap=2)) for view in views]
     save_gif(frames, [_FRAME_MS] * (len(frames) - 1) + [_LAST_FRAME_MS], path)
@@ -319,10 +329,10 @@ def _replayed(episode: _Episode, env: PickPlaceEnv) -> Iterator[Image.Image]:
     if episode.seed is None:
         return
     observation, _ = env.reset(seed=episode.seed, options={"task_id": episode.task.index})
-    for stored, action in zip(episode.pictures, episode.actions, strict=True):
+    for stored, action in zip(episode.images, episode.actions, strict=True):
         if not np.array_equal(observation["pixels"], stored):
             return
-        yield picture(env.scene.render(_VIEW_SIZE))
+        yield to_image(env.scene.render(_VIEW_SIZE))
         observation, *_ = env.step(action)
 
 

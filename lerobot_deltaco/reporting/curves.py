@@ -1,4 +1,4 @@
-"""The picture of the learning curves."""
+"""The image of the learning curves."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_deltaco.evaluation.authors import CHANCE, PUBLISHED, label_of
+from lerobot_deltaco.reporting.paper_results import CHANCE, PAPER_RESULTS, label_of
 
 PANEL_SIZE = (9.0, 4.4)  # inches
 DOTS_PER_INCH = 140
-# The same method has the same color in every picture.
+# The same method has the same color in every image.
 COLORS = MappingProxyType(
     {
         "deltaco": "#c8102e",
@@ -78,9 +78,9 @@ def draw_curves(panels: Sequence[tuple[str, Sequence[Curve]]], authors_levels: b
     for ax, (title, curves) in zip(axes, panels, strict=True):
         _draw_panel(ax, curves, authors_levels)
         ax.set_title(title, loc="left", fontsize=12)
-    picture = io.BytesIO()
-    canvas.print_png(picture)
-    return picture.getvalue()
+    image = io.BytesIO()
+    canvas.print_png(image)
+    return image.getvalue()
 
 
 def _draw_panel(ax, curves: Sequence[Curve], authors_levels: bool) -> None:
@@ -104,7 +104,7 @@ def _draw_panel(ax, curves: Sequence[Curve], authors_levels: bool) -> None:
                 curve.steps, mean, line, color=color, marker=marker, markersize=3.5, linewidth=2, label=label
             )
         highest = max(highest, (mean + sd).max())
-        published = PUBLISHED.get(curve.experiment)
+        published = PAPER_RESULTS.get(curve.experiment)
         if authors_levels and published is not None:
             ax.axhline(published.rate, color=color, linewidth=1, linestyle=_DASHED, alpha=0.8)
             highest, has_levels = max(highest, published.rate), True

@@ -15,11 +15,11 @@ NOTE = "measured in another simulation, with other objects"
 CHANCE = 1 / 6
 
 
-class PublishedRate(NamedTuple):
+class PaperResult(NamedTuple):
     """A row of one of the paper's tables.
 
     Attributes:
-        label: What the row is called in tables and pictures.
+        label: What the row is called in tables and images.
         rate: Success rate as the paper reports it (`statistics.paper_rate`), 0..1.
         sd: Its standard deviation over three seeds, 0..1.
     """
@@ -77,21 +77,21 @@ TITLES: Mapping[str, str] = MappingProxyType(
         "ablations": "Ablations, in scenario A",
     }
 )
-PUBLISHED: Mapping[str, PublishedRate] = MappingProxyType(
-    {name: PublishedRate(label, rate / 100, sd / 100) for name, (label, rate, sd) in _PERCENT.items()}
+PAPER_RESULTS: Mapping[str, PaperResult] = MappingProxyType(
+    {name: PaperResult(label, rate / 100, sd / 100) for name, (label, rate, sd) in _PERCENT.items()}
 )
 
 
 def label_of(experiment: str) -> str:
-    """What an experiment is called in tables and pictures: the paper's name for it, else its own."""
-    published = PUBLISHED.get(experiment)
+    """What an experiment is called in tables and images: the paper's name for it, else its own."""
+    published = PAPER_RESULTS.get(experiment)
     return experiment.rpartition("/")[2].replace("_", " ") if published is None else published.label
 
 
 def in_order(experiment: str) -> tuple[int, str, int, str]:
     """A key that sorts experiments as they stand above, and others after those with which they belong."""
     comparison = experiment.rpartition("/")[0]
-    titles, names = list(TITLES), list(PUBLISHED)
+    titles, names = list(TITLES), list(PAPER_RESULTS)
     return (
         titles.index(comparison) if comparison in titles else len(titles),
         comparison,

@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_deltaco.evaluation.authors import CHANCE, NOTE, PUBLISHED, TITLES, label_of
-from lerobot_deltaco.evaluation.curves import Curve, draw_curves
-from lerobot_deltaco.evaluation.series import Report, Series, counted, find_records, make_report
-from lerobot_deltaco.evaluation.statistics import (
+from lerobot_deltaco.reporting.curves import Curve, draw_curves
+from lerobot_deltaco.reporting.paper_results import CHANCE, NOTE, PAPER_RESULTS, TITLES, label_of
+from lerobot_deltaco.reporting.series import Report, Series, counted, find_records, make_report
+from lerobot_deltaco.reporting.statistics import (
     CUES,
     KINDS,
     N_BEST_SETS,
@@ -28,9 +28,9 @@ from lerobot_deltaco.evaluation.statistics import (
 )
 
 REPORT_FILE = "report.md"
-CURVES_PICTURE = "curves.png"
+CURVES_IMAGE = "curves.png"
 FILES = (
-    CURVES_PICTURE,
+    CURVES_IMAGE,
     "curves.csv",
     "rates.csv",
     "breakdown.csv",
@@ -42,14 +42,14 @@ _NAMED_OPTIONS = ("language_encoder", "demo_encoder", "backbone", "motion_modes"
 
 
 def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = False) -> Report:
-    """Reports on all evaluations of some runs, in Markdown, CSV files and a picture.
+    """Reports on all evaluations of some runs, in Markdown, CSV files and an image.
 
     All files are written, or none. Those of an earlier report are replaced.
 
     Args:
         folders: Of runs, or folders with such folders in them, however deep.
         out: The report's folder, which is made.
-        authors_levels: Draw the authors' rates into the picture.
+        authors_levels: Draw the authors' rates into the image.
 
     Returns:
         What was reported. Without ordinary evaluations, there are no rates and no curves; without
@@ -71,7 +71,7 @@ def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = Fals
             (_title(name), [Curve(series.experiment, series.steps, series.rates) for series in group])
             for name, group in report.comparisons.items()
         ]
-        contents[CURVES_PICTURE] = draw_curves(panels, authors_levels)
+        contents[CURVES_IMAGE] = draw_curves(panels, authors_levels)
     if report.counterfactual:
         contents["counterfactual.csv"] = _csv(_counterfactual_rows(report))
     contents[REPORT_FILE] = _markdown(report).encode()
@@ -86,7 +86,7 @@ def _rate_rows(report: Report) -> list[dict[str, Any]]:
     rows = []
     for series in report.regular:
         paper, last = paper_rate(series.rates), series.last
-        published = PUBLISHED.get(series.experiment)
+        published = PAPER_RESULTS.get(series.experiment)
         rows.append(
             {
                 "experiment": series.experiment,
@@ -195,7 +195,7 @@ def _markdown(report: Report) -> str:
     if report.regular:
         sections.append(
             "## Learning curves\n\n"
-            f"![Success rates over training steps]({CURVES_PICTURE})\n\n"
+            f"![Success rates over training steps]({CURVES_IMAGE})\n\n"
             "Lines are means over seeds, bands one standard deviation to both sides. Nothing is smoothed.\n"
         )
     if report.counterfactual:
@@ -273,7 +273,7 @@ def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
 
 
 def _rate_cells(series: Series) -> list[str]:
-    paper, published = paper_rate(series.rates), PUBLISHED.get(series.experiment)
+    paper, published = paper_rate(series.rates), PAPER_RESULTS.get(series.experiment)
     return [
         label_of(series.experiment),
         ", ".join(map(str, series.seeds)),

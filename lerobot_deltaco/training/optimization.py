@@ -11,7 +11,7 @@ from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from torch.optim.lr_scheduler import LambdaLR
 
 
-@OptimizerConfig.register_subclass("fused_adamw")
+@OptimizerConfig.register_subclass("deltaco_fused_adamw")
 @dataclass
 class FusedAdamWConfig(AdamWConfig):
     """AdamW (Adam, where `weight_decay` is 0), updated in one pass over the weights.
@@ -27,7 +27,7 @@ class FusedAdamWConfig(AdamWConfig):
         return torch.optim.AdamW(params, fused=True, **options)
 
 
-@LRSchedulerConfig.register_subclass("cosine")
+@LRSchedulerConfig.register_subclass("deltaco_cosine")
 @dataclass
 class CosineSchedulerConfig(LRSchedulerConfig):
     """From the learning rate down to 0, along half a cosine that lasts as long as the training.

@@ -7,25 +7,27 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_deltaco.vector_env import TaskVectorEnv
+from lerobot_deltaco.envs.vector_env import TaskVectorEnv
 
-# What each environment's policy is told, given the info of the scene that was drawn.
-Instruct = Callable[[list[dict[str, Any]]], list[str]]
+# From the infos of the scenes of the environments to the instructions that the policy receives there.
+SampleInstructions = Callable[[list[dict[str, Any]]], list[str]]
 
 
-class RecordedTask:
+class RecordingVectorEnv:
     """Stands between LeRobot's rollout and the vector environment of a task.
 
     Args:
         env: The vector environment.
         seeds: Of the environments' resets, just as they are.
-        instruct: Tells the instructions of the drawn scenes; None leaves them to the environment.
+        sample_instructions: Tells the instructions of the drawn scenes; None leaves them to the environment.
     """
 
-    def __init__(self, env: TaskVectorEnv, seeds: Sequence[int], instruct: Instruct | None = None) -> None:
+    def __init__(
+        self, env: TaskVectorEnv, seeds: Sequence[int], sample_instructions: SampleInstructions | None = None
+    ) -> None:
         self._env = env
         self._seeds = list(seeds)
-        self._instruct = instruct
+        self._sample_instructions = sample_instructions
         self.infos: list[dict[str, Any]] = []  # of each environment, after its last step
         self.instructions: list[str] = []
 
@@ -34,10 +36,12 @@ class RecordedTask:
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts the episodes, of the seeds that were given before."""
-        observations, infos = self._env.reset_to(self._seeds, options)
+        observations, infos = self._env.reset_with_seeds(self._seeds, options)
         self.infos = _of_each(infos, self._env.num_envs)
-        told = self._instruct(self.infos) if self._instruct is not None else None
-        self.instructions = list(self._env.call("task_description")) if told is None else told
+        if self._sample_instructions is None:
+            self.instructions = list(self._env.call("task_description"))
+        else:
+            self.instructions = self._sample_instructions(self.infos)
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:

@@ -49,19 +49,19 @@ class SimulatorPool:
         # Reentrant, since the garbage collector may close a forgotten task in the middle of any statement.
         self._lock = threading.RLock()
 
-    def enroll(self) -> None:
-        """Counts one more task; each has to `leave` once."""
+    def register(self) -> None:
+        """Counts one more task; each has to call `release` once."""
         with self._lock:
             self._n_tasks += 1
 
-    def borrow(self) -> VectorEnv:
-        """A vector environment that no one else uses until it is returned by `leave`."""
+    def acquire(self) -> VectorEnv:
+        """A vector environment that no one else uses until it is returned by `release`."""
         with self._lock:
             if self._idle:
                 return self._idle.pop()
         return self._build()
 
-    def leave(self, borrowed: VectorEnv | None = None) -> None:
+    def release(self, borrowed: VectorEnv | None = None) -> None:
         """Ends one task, which returns what it borrowed. The last one closes all that was lent."""
         with self._lock:
             if borrowed is not None:
@@ -93,7 +93,7 @@ class TaskVectorEnv(VectorEnv):
         task_id: Index of the task, 0..299.
         pool: Where simulators come from.
         example: An environment as the pool makes them. Only its spaces and metadata are read.
-        fps: Frames per second at which LeRobot's films of episodes play.
+        fps: Frames per second at which LeRobot's videos of episodes play.
     """
 
     def __init__(self, task_id: int, pool: SimulatorPool, example: gym.Env, fps: int):
@@ -111,7 +111,7 @@ class TaskVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._simulators: VectorEnv | None = None
         self._pool = pool
-        pool.enroll()
+        pool.register()
 
     def reset(
         self,
@@ -125,39 +125,39 @@ class TaskVectorEnv(VectorEnv):
             seed: The seed of the first environment (each next one has the next seed), or all of them.
             options: Passed on to the environments.
         """
-        return self.reset_to(self._episode_seeds(seed), options)
+        return self.reset_with_seeds(self._episode_seeds(seed), options)
 
-    def reset_to(
+    def reset_with_seeds(
         self, seeds: Sequence[int | None], options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Starts the episodes that the environments' own seeds stand for, of `gym_deltaco.seeding`."""
         if self._simulators is None and not self.closed:
-            self._simulators = self._pool.borrow()
+            self._simulators = self._pool.acquire()
         options = {**(options or {}), NEW_ROLLOUT_OPTION: True, "task_id": self.task_id}
-        return self._ask("reset", seed=list(seeds), options=options)
+        return self._call_simulators("reset", seed=list(seeds), options=options)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Does one action, of shape (4,), in each environment."""
-        return self._ask("step", actions)
+        return self._call_simulators("step", actions)
 
     def render(self) -> tuple[Any, ...]:
-        """One picture of each environment."""
-        return self._ask("call", "render")
+        """One image of each environment."""
+        return self._call_simulators("call", "render")
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Calls a method of each environment, or reads an attribute."""
-        return self._ask("call", name, *args, **kwargs)
+        return self._call_simulators("call", name, *args, **kwargs)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Reads an attribute of each environment."""
-        return self._ask("get_attr", name)
+        return self._call_simulators("get_attr", name)
 
     def close_extras(self) -> None:
         """Hands the simulators back. `close` calls this once."""
         simulators, self._simulators = self._simulators, None
-        self._pool.leave(simulators)
+        self._pool.release(simulators)
 
-    def _ask(self, method: str, *args: Any, **kwargs: Any) -> Any:
+    def _call_simulators(self, method: str, *args: Any, **kwargs: Any) -> Any:
         if self.closed:
             raise gym.error.ClosedEnvironmentError(
                 f"The environment of task {self.task_id} is closed. Make a new one with `create_envs`."
@@ -198,7 +198,7 @@ def make_task_vector_envs(
         task_ids: Indices of the tasks.
         n_envs: Number of environments for each task.
         use_async_envs: Whether each environment has its own process, if there are several.
-        fps: Frames per second at which LeRobot's films of episodes play.
+        fps: Frames per second at which LeRobot's videos of episodes play.
     """
     make_simulator = partial(_make_simulator, env_id, env_kwargs)
     pool = SimulatorPool(make_simulator, n_envs, use_async_envs)

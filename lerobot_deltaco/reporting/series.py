@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_deltaco.evaluation.authors import in_order
 from lerobot_deltaco.evaluation.record import (
     BENCHMARK,
     COUNTERFACTUALS,
@@ -22,7 +21,8 @@ from lerobot_deltaco.evaluation.record import (
     EvaluationRecord,
     read_record,
 )
-from lerobot_deltaco.evaluation.statistics import Proportion, unknown_sentences
+from lerobot_deltaco.reporting.paper_results import in_order
+from lerobot_deltaco.reporting.statistics import Proportion, unknown_sentences
 
 # Of a policy's configuration: what may differ between the runs of an experiment.
 _OPTIONS_OF_A_RUN = {"seed", "device", "pretrained_path", "demo_root", "repo_id", "push_to_hub"}

@@ -13,10 +13,10 @@ from huggingface_hub import ModelCard, ModelCardData
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 
+from lerobot_deltaco.cards.templates import env_options, render
 from lerobot_deltaco.configuration_deltaco import Conditioning, DeltacoConfig
-from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
 from lerobot_deltaco.policy.training_episodes import kept_episodes
-from lerobot_deltaco.templates import env_options, render
 
 TAGS = ("robotics", "lerobot", "deltaco", "imitation-learning")
 MAX_TASKS_LISTED = 10
@@ -60,7 +60,7 @@ _DEMO_ENCODER_TEXTS = {
 }
 
 
-def model_card(
+def policy_card(
     config: DeltacoConfig,
     shown_tasks: Sequence[str],
     n_instructions: int,
@@ -154,7 +154,7 @@ def _training_tasks(
 
 
 def _benchmark_image(meta: LeRobotDatasetMetadata | None) -> dict[str, Any] | None:
-    """The feature of the pictures, if the dataset is of the benchmark."""
+    """The feature of the images, if the dataset is of the benchmark."""
     image = meta.features.get("observation.image", {}) if meta is not None else {}
     return image if "benchmark" in (image.get("info") or {}) else None
 
@@ -204,7 +204,7 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
     options |= {
         "seed of demonstrations and crops": config.seed,
         "backbone": config.backbone,
-        "size of the pictures": f"{config.image_size} x {config.image_size}",
+        "size of the images": f"{config.image_size} x {config.image_size}",
         "random shifts": f"up to {config.crop_padding} pixels",
         "arithmetic": config.dtype,
     }

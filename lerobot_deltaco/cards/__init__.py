@@ -1,0 +1,1 @@
+"""The cards of datasets and policies on the Hugging Face Hub."""

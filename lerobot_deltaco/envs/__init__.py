@@ -1,0 +1,1 @@
+"""The benchmark's environment as LeRobot's training and evaluation use it."""

@@ -1,0 +1,1 @@
+"""Workarounds that rely on LeRobot's internals."""

@@ -1,0 +1,1 @@
+"""Reports on evaluations: their statistics, tables, curves and notes."""
