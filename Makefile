@@ -25,7 +25,7 @@ REPORT ?= results/scenario_a
 export UV_PYTHON_DOWNLOADS := never
 
 .PHONY: help install demo experiment gpu-scenario-a small-scenario-a test test-slow lint
-.PHONY: benchmark-env benchmark-policy benchmark-train
+.PHONY: benchmark-env benchmark-policy benchmark-train coverage docs release
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 22
@@ -55,6 +55,15 @@ test: $(INSTALLED) ## Run the default tests: a few minutes, no network, no GPU
 
 test-slow: $(INSTALLED) ## Run the slow tests: the expert on all 300 tasks, for example
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+coverage: $(INSTALLED) ## Run the default tests and report which lines they reach: htmlcov/index.html
+	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered --cov-report=html $(ARGS)
+
+docs: $(INSTALLED) ## Build the documentation, warnings being errors: docs/_build/html/index.html
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs docs/_build/html
+
+release: $(INSTALLED) ## Check everything that a release needs, in an empty environment
+	$(BIN)/python scripts/check_release.py $(ARGS)
 
 lint: $(INSTALLED) ## Check style and types
 	$(BIN)/ruff check .
