@@ -132,8 +132,7 @@ def environment() -> str:
     """The specification of the environment: its docstring, with its arguments as a table."""
     spec = documented(ENVIRONMENT)
     rows = [
-        (f"`{name}`", f"`{spec.defaults[name]}`", description)
-        for name, description in spec.arguments.items()
+        (f"`{name}`", f"`{spec.defaults[name]}`", description) for name, description in spec.arguments.items()
     ]
     return f"{spec.text}\n\n## Arguments\n\n{table(('argument', 'default', 'meaning'), rows)}"
 
