@@ -39,9 +39,8 @@ html_css_files = ["site.css"]
 html_theme_options = {"navigation_with_keys": True}
 copybutton_exclude = ".linenos, .gp"
 
-# Packages that are not installed are mocked, so that the site also builds without PyBullet or PyTorch.
-_HEAVY = ("datasets", "lerobot", "pybullet", "pybullet_data", "sentence_transformers", "torch", "torchvision")
-autodoc_mock_imports = [name for name in _HEAVY if find_spec(name) is None]
+# The site also builds without the simulator.
+autodoc_mock_imports = [name for name in ("pybullet",) if find_spec(name) is None]
 autodoc_default_options = {"members": True, "show-inheritance": True, "member-order": "bysource"}
 autodoc_typehints_format = "short"
 napoleon_numpy_docstring = False

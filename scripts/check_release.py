@@ -153,7 +153,7 @@ def build_wheel(dist: Path) -> None:
                 target = Path(folder, name)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, target)
-        _run([_uv(), "build", "--out-dir", str(dist.resolve())], Path(folder))
+        _run([_uv(), "build", "--python", sys.executable, "--out-dir", str(dist.resolve())], Path(folder))
     names = set(zipfile.ZipFile(find_wheel(dist)).namelist())
     for needed in (f"{DISTRIBUTION}.py", "gym_deltaco/env.py", "lerobot_deltaco/modeling_deltaco.py"):
         if needed not in names:

@@ -10,6 +10,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import redirect_stderr
+from functools import cache
 from io import StringIO
 from pathlib import Path
 
@@ -107,9 +108,16 @@ LEROBOT_CONFIGURATIONS = {
 }
 
 
+@cache
+def draccus_parser(configuration):
+    """The parser of a configuration, which takes seconds to make."""
+    from draccus.argparsing import ArgumentParser
+
+    return ArgumentParser(configuration)
+
+
 def check_lerobot(words, monkeypatch):
     """Parses a command's configuration with draccus, as LeRobot does, but reads no checkpoint."""
-    import draccus
     from lerobot.configs import PreTrainedConfig
 
     import lerobot_policy_deltaco  # noqa: F401
@@ -129,8 +137,7 @@ def check_lerobot(words, monkeypatch):
     if any(word.startswith("--policy.path=") for word in arguments):
         overrides = [word.replace("--policy.", "--") for word in arguments if word.startswith("--policy.")]
         overrides = [word for word in overrides if not word.startswith("--path=")]
-        deltaco = PreTrainedConfig.get_choice_class("deltaco")
-        draccus.parse(deltaco, args=overrides)
+        draccus_parser(PreTrainedConfig.get_choice_class("deltaco")).parse_args(overrides)
         arguments = [word for word in arguments if not word.startswith("--policy.")]
         if command == "lerobot-rollout":
             arguments.append("--policy.type=deltaco")
@@ -141,7 +148,7 @@ def check_lerobot(words, monkeypatch):
     errors = StringIO()
     with redirect_stderr(errors):
         try:
-            draccus.parse(configuration, args=arguments)
+            draccus_parser(configuration).parse_args(arguments)
         except SystemExit:
             raise AssertionError(errors.getvalue()) from None
 
