@@ -16,6 +16,7 @@ from collections import Counter
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +35,10 @@ from gym_deltaco.tasks import SCENARIOS, TASKS
 from lerobot_deltaco.commands.collect import main
 from lerobot_deltaco.data import collection, collection_plan
 from lerobot_deltaco.data import dataset_files as files
-from lerobot_deltaco.data.collection import HISTORY_FILE, STAGING, CollectionError, collect
+from lerobot_deltaco.data.collection import CollectionError, collect
 from lerobot_deltaco.data.collection_plan import DATA_SETS, CollectionPlan, collect_episode
+from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, STAGING, verify_dataset
+from lerobot_deltaco.data.integrity import DIGESTS_FILE
 
 # Two tasks of different kinds, not in the benchmark's order, in files that end where no task does.
 PLAN = CollectionPlan("90,4", 3)
@@ -760,16 +763,28 @@ def test_workers_of_a_killed_run_are_waited_for(tmp_path, in_process):
 # Damaged files
 
 
+def flipped(path, share):
+    """Flips a bit of a file, at a share of its length."""
+    stored = bytearray(path.read_bytes())
+    stored[int(share * len(stored))] ^= 1
+    path.write_bytes(stored)
+
+
 def test_a_damaged_episode_is_named_and_can_be_collected_anew(finished, tmp_path, monkeypatch, in_process):
     join = collection._join
     monkeypatch.setattr(collection, "_join", fail_with(OSError("full")))
     with pytest.raises(OSError, match="full"):
         collect(tmp_path, PLAN)
     monkeypatch.setattr(collection, "_join", join)
-    for damage in (lambda old: old[: len(old) // 2], lambda old: b"", lambda old: old[:-10] + bytes(10)):
-        damaged = tmp_path / STAGING / "episodes" / "0000002.arrow"
-        old = damaged.read_bytes()
-        damaged.write_bytes(damage(old))
+    damaged = tmp_path / STAGING / "episodes" / "0000002.arrow"
+    old = damaged.read_bytes()
+    for damage in (
+        lambda: damaged.write_bytes(old[: len(old) // 2]),
+        lambda: damaged.write_bytes(b""),
+        lambda: damaged.write_bytes(old[:-10] + bytes(10)),
+        *(partial(flipped, damaged, share) for share in (0.01, 0.3, 0.6, 0.999)),
+    ):
+        damage()
         with pytest.raises(CollectionError, match="damaged.*Delete it and run the command again") as error:
             collect(tmp_path, PLAN)
         assert str(damaged) in str(error.value)
@@ -779,6 +794,76 @@ def test_a_damaged_episode_is_named_and_can_be_collected_anew(finished, tmp_path
     collect(tmp_path, PLAN)
     assert in_process.count((90, 2)) == 1
     assert contents(tmp_path) == contents(finished)
+
+
+@pytest.mark.parametrize("damaged", ["joined/data/chunk-000/file-001.parquet", "parts/00001.json"])
+def test_a_damaged_file_that_waits_is_named_and_can_be_collected_anew(
+    finished, tmp_path, monkeypatch, in_process, damaged
+):
+    prepare = collection._prepare_commit
+    monkeypatch.setattr(collection, "_prepare_commit", fail_with(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        collect(tmp_path, PLAN)
+    monkeypatch.setattr(collection, "_prepare_commit", prepare)
+    path = tmp_path / STAGING / damaged
+    flipped(path, 0.4)
+    part_file = tmp_path / STAGING / "parts/00001.json"
+    with pytest.raises(CollectionError, match="damaged.*collected anew") as error:
+        collect(tmp_path, PLAN)
+    assert str(path) in str(error.value)
+    assert f"Delete {part_file}" in str(error.value)
+    part_file.unlink()
+    in_process.clear()
+    collect(tmp_path, PLAN)
+    assert len(in_process) == PLAN.n_episodes - EPISODES_PER_FILE
+    assert contents(tmp_path) == contents(finished)
+
+
+def test_a_collection_whose_arguments_are_lost_is_not_continued(copy, tmp_path, monkeypatch, in_process):
+    monkeypatch.setattr(collection, "_join", fail_with(OSError("full")))
+    new, added = tmp_path / "new", copy
+    for root, plan, append in ((new, PLAN, False), (added, CollectionPlan("32", 2), True)):
+        with pytest.raises(OSError, match="full"):
+            collect(root, plan, append=append)
+        plan_file = root / STAGING / "plan.json"
+        kept = plan_file.read_bytes()
+        flipped(plan_file, 0.5)
+        with pytest.raises(CollectionError, match=r"plan\.json is damaged"):
+            collect(root, plan, append=append)
+        plan_file.unlink()
+        before = contents(root)
+        for asked in (plan, replace(plan, seed=7)):
+            with pytest.raises(CollectionError, match=r"arguments are lost: .*plan\.json is missing"):
+                collect(root, asked, append=append)
+        assert contents(root) == before
+        plan_file.write_bytes(kept)
+        with pytest.raises(OSError, match="full"):
+            collect(root, plan, append=append)
+
+
+def test_an_addition_that_was_interrupted_at_its_end_is_not_mistaken_for_a_new_dataset(
+    copy, monkeypatch, in_process
+):
+    write_tasks = files.write_tasks
+    monkeypatch.setattr(files, "write_tasks", fail_with(OSError("full")))
+    added = CollectionPlan("32", 1)
+    with pytest.raises(OSError, match="full"):
+        collect(copy, added, append=True)
+    assert not is_finished(copy)
+    commit = copy / STAGING / "commit.json"
+    kept = commit.read_bytes()
+    flipped(commit, 0.5)
+    with pytest.raises(CollectionError, match=r"commit\.json is damaged"):
+        collect(copy, added, append=True)
+    commit.unlink()
+    before = contents(copy)
+    with pytest.raises(CollectionError, match=r"commit\.json.* is missing"):
+        collect(copy, added, append=True)
+    assert contents(copy) == before
+    commit.write_bytes(kept)
+    monkeypatch.setattr(files, "write_tasks", write_tasks)
+    assert collect(copy, added, append=True).episodes == PLAN.n_episodes + 1
+    assert verify_dataset(copy).has_digests
 
 
 @pytest.mark.parametrize(
@@ -794,6 +879,55 @@ def test_a_damaged_file_of_the_dataset_is_named(copy, in_process, file, append):
     with pytest.raises(CollectionError, match="damaged") as error:
         collect(copy, PLAN, append=append)
     assert str(copy / file) in str(error.value)
+
+
+def with_unknown_argument(history):
+    return [{**history[0], "plan": {**history[0]["plan"], "wings": 2}}]
+
+
+def with_other_attempts(history):
+    return [{**history[0], "attempts": {"4": 3}}]
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "reason"),
+    [
+        *((files.INFO_FILE, lambda _, new=new: new, "must be a") for new in ([], {}, None, 3)),
+        (files.INFO_FILE, lambda info: {**info, "total_frames": "180"}, "`total_frames` must be an integer"),
+        (files.INFO_FILE, lambda info: {**info, "features": {"action": []}}, "`features` must be a mapping"),
+        *(
+            (HISTORY_FILE, lambda _, new=new: new, "must be a list|no collection|plan")
+            for new in ({}, [], [{}])
+        ),
+        (HISTORY_FILE, with_unknown_argument, r"the unknown \['wings'\]; it may be of a later version"),
+        (HISTORY_FILE, with_other_attempts, "those of the plan's tasks"),
+        *((files.STATS_FILE, lambda _, new=new: new, "must be a|lacks") for new in ([], {}, {"action": {}})),
+        (
+            files.STATS_FILE,
+            lambda stats: {**stats, "action": {**stats["action"], "mean": [None]}},
+            "finite numbers",
+        ),
+    ],
+)
+def test_a_file_of_the_wrong_shape_is_named(copy, in_process, file, change, reason):
+    path = copy / file
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    for append in (False, True):
+        with pytest.raises(CollectionError, match=f"damaged.*({reason})") as error:
+            collect(copy, PLAN, append=append)
+        assert str(path) in str(error.value)
+
+
+def test_a_changed_file_of_the_dataset_is_not_added_to(copy, in_process):
+    stats = json.loads((copy / files.STATS_FILE).read_text())
+    stats["action"]["mean"][0] += 1
+    (copy / files.STATS_FILE).write_text(json.dumps(stats))
+    with pytest.raises(CollectionError, match=r"stats\.json is damaged.*SHA-256.*delete meta/SHA256SUMS"):
+        collect(copy, PLAN, append=True)
+    (copy / DIGESTS_FILE).unlink()
+    collect(copy, CollectionPlan("4", 1), append=True)
+    # From then on, all files have a checksum.
+    assert verify_dataset(copy).has_digests
 
 
 def test_a_missing_data_file_is_reported(copy, in_process):
@@ -892,7 +1026,8 @@ def test_the_dataset_records_how_it_was_made(finished):
 
 def test_a_finished_dataset_has_no_other_files(finished):
     assert {path for path in contents(finished) if not path.startswith(("data/", "meta/episodes/"))} == {
-        str(file) for file in (files.INFO_FILE, files.STATS_FILE, files.TASKS_FILE, HISTORY_FILE)
+        str(file)
+        for file in (files.INFO_FILE, files.STATS_FILE, files.TASKS_FILE, HISTORY_FILE, DIGESTS_FILE)
     }
     assert sorted(path.name for path in finished.iterdir()) == ["data", "meta"]
     n_rows = [pq.read_metadata(path).num_rows for path in sorted((finished / "data").rglob("*.parquet"))]

@@ -28,9 +28,10 @@ from lerobot_deltaco.cards.dataset_card import (
 )
 from lerobot_deltaco.commands import collect as collect_command
 from lerobot_deltaco.commands import push as push_command
-from lerobot_deltaco.data.collection import HISTORY_FILE, UNFINISHED, CollectionError, collect
+from lerobot_deltaco.data.collection import CollectionError, collect
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.dataset_files import INFO_FILE
+from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, UNFINISHED
 from lerobot_deltaco.data.hub import HubError, check_credentials, check_dataset, check_repo_id
 
 REPO_ID = f"{USER}/three.tasks"
@@ -289,6 +290,13 @@ def without_a_file(root):
     (root / "data/chunk-000/file-001.parquet").unlink()
 
 
+def with_a_flipped_bit(root):
+    path = root / "data/chunk-000/file-000.parquet"
+    stored = bytearray(path.read_bytes())
+    stored[len(stored) // 2] ^= 1
+    path.write_bytes(stored)
+
+
 def without_statistics(root):
     (root / "meta/stats.json").unlink()
 
@@ -301,7 +309,8 @@ def without_statistics(root):
         (empty, r"holds no dataset: meta/info\.json is missing"),
         (of_others, "`deltaco-collect` did not make"),
         (cut_off, r"file-000\.parquet is damaged"),
-        (without_a_file, "120 rows, and .* says 150"),
+        (without_a_file, "120 frames instead of 150"),
+        (with_a_flipped_bit, r"file-000\.parquet is damaged.*SHA-256"),
         (without_statistics, r"stats\.json is damaged or missing"),
     ],
 )

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import io
-import json
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields
 from itertools import islice
 from pathlib import Path
@@ -36,8 +35,9 @@ from gym_deltaco.sheets import (
 from gym_deltaco.tasks import SCENARIOS, TASKS, Task
 from lerobot_deltaco.cards.templates import env_options, render
 from lerobot_deltaco.data import dataset_files as files
-from lerobot_deltaco.data.collection import HISTORY_FILE
 from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, read_history, read_info
+from lerobot_deltaco.data.integrity import damaged
 
 CARD_FILE = Path("README.md")
 TASKS_IMAGE = Path("assets/tasks.png")
@@ -94,11 +94,12 @@ def write_card(root: Path, folder: Path | None = None, repo_id: str | None = Non
         repo_id: Of the dataset on the Hub, which the card's examples then name. None: they name a folder.
 
     Raises:
-        OSError: A file cannot be read or written.
+        DatasetError: A file of the dataset is damaged.
+        OSError: A file cannot be written.
     """
     folder = folder or root
     (folder / TASKS_IMAGE).parent.mkdir(parents=True, exist_ok=True)
-    info = json.loads((root / files.INFO_FILE).read_text())
+    info = read_info(root)
     episodes = list(_first_episodes(root, info))
     image_info = info["features"]["observation.image"]["info"]
     with closing(
@@ -128,8 +129,8 @@ def card_text(root: Path, repo_id: str | None = None) -> str:
         root: The dataset's folder.
         repo_id: Of the dataset on the Hub; None if it is only in a folder.
     """
-    info = json.loads((root / files.INFO_FILE).read_text())
-    history = json.loads((root / HISTORY_FILE).read_text()) if (root / HISTORY_FILE).exists() else []
+    info = read_info(root)
+    history = read_history(root) if (root / HISTORY_FILE).exists() else []
     plans = [CollectionPlan(**entry["plan"]) for entry in history]
     tasks = _tasks(root)
     name = ", ".join(dict.fromkeys(plan.tasks for plan in plans)) or f"{len(tasks)} tasks"
@@ -182,7 +183,8 @@ def _tasks(root: Path) -> list[Task]:
     """The dataset's tasks, ascending."""
     ids: set[int] = set()
     for path in sorted((root / "data").glob("*/*.parquet")):
-        ids.update(pq.read_table(path, columns=["benchmark.task_id"])[0].unique().to_pylist())
+        with _named(path):
+            ids.update(pq.read_table(path, columns=["benchmark.task_id"])[0].unique().to_pylist())
     return [TASKS[index] for index in sorted(ids)]
 
 
@@ -283,23 +285,38 @@ class _Episode:
 def _first_episodes(root: Path, info: Mapping[str, Any]) -> Iterator[_Episode]:
     """The first episode of each of some tasks, which are spread evenly over the dataset's."""
     columns = ["episode_index", "tasks", "data/chunk_index", "data/file_index"]
-    paths = sorted((root / "meta/episodes").glob("*/*.parquet"))
-    table = pd.concat([pd.read_parquet(path, columns=columns) for path in paths])
+    parts = []
+    for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
+        with _named(path):
+            parts.append(pd.read_parquet(path, columns=columns))
+    table = pd.concat(parts)
     table["task"] = table["tasks"].str[0]
     firsts = table.drop_duplicates("task")
     shown = np.unique(np.linspace(0, len(firsts) - 1, MAX_TASKS_SHOWN).round().astype(int))
     for row in firsts.iloc[shown].to_dict("records"):
-        path = info["data_path"].format(
+        path = root / info["data_path"].format(
             chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
         )
-        frames = pq.read_table(root / path, filters=[("episode_index", "==", row["episode_index"])])
-        frames = frames.sort_by("frame_index").to_pandas()
-        yield _Episode(
-            task=TASKS[frames["benchmark.task_id"].iloc[0]],
-            seed=int(frames["benchmark.seed"].iloc[0]) if "benchmark.seed" in frames else None,
-            images=np.stack([_decoded(cell) for cell in frames["observation.image"]]),
-            actions=np.stack(list(frames["action"])),
-        )
+        with _named(path):
+            frames = pq.read_table(path, filters=[("episode_index", "==", row["episode_index"])])
+            frames = frames.sort_by("frame_index").to_pandas()
+            episode = _Episode(
+                task=TASKS[frames["benchmark.task_id"].iloc[0]],
+                seed=int(frames["benchmark.seed"].iloc[0]) if "benchmark.seed" in frames else None,
+                images=np.stack([_decoded(cell) for cell in frames["observation.image"]]),
+                actions=np.stack(list(frames["action"])),
+            )
+        yield episode
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Names the file of the dataset that cannot be read."""
+    try:
+        yield
+    # PyArrow's errors are among the first three, and Pillow's among the others.
+    except (OSError, ValueError, KeyError, IndexError, SyntaxError) as error:
+        raise damaged(path, error, "Check the dataset with `deltaco-collect --verify --root DIR`.") from None
 
 
 def _tasks_image(episodes: Sequence[_Episode], env: PickPlaceEnv) -> Image.Image:

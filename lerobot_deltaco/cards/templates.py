@@ -1,5 +1,6 @@
 """The templates of cards: where they are, and how they are filled in."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,10 @@ def template_folder() -> Path:
 
 
 def render(template: str, **values: Any) -> str:
-    """A template of that folder, filled in. It must use no value that is not given."""
+    """A template of that folder, filled in. It must use no value that is not given.
+
+    Templates have the filters `text` and `code` for strings from outside, such as the tasks of a dataset.
+    """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(template_folder(), encoding="utf-8"),
         undefined=jinja2.StrictUndefined,
@@ -24,7 +28,25 @@ def render(template: str, **values: Any) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    environment.filters |= {"text": markdown_text, "code": markdown_code}
     return environment.get_template(template).render(**values)
+
+
+def markdown_text(text: str) -> str:
+    """A string as Markdown that shows it as it is, in one line: without markup, HTML or the end of a cell."""
+    line = " ".join(str(text).split())
+    line = line.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    line = re.sub(r"([\\`*_\[\]|~])", r"\\\1", line)
+    # At the start, these would begin a list or a heading.
+    return re.sub(r"^(\d*)([-+#=.)])", r"\1\\\2", line)
+
+
+def markdown_code(text: str) -> str:
+    """A string as Markdown's code in a line, between as many backticks as it takes."""
+    line = " ".join(str(text).split()).replace("|", "\\|") or " "
+    longest = max(map(len, re.findall(r"`+", line)), default=0)
+    fence, space = "`" * (longest + 1), " " if longest else ""
+    return f"{fence}{space}{line}{space}{fence}"
 
 
 def env_options(image: dict[str, Any]) -> str:

@@ -13,9 +13,15 @@ from gym_deltaco.layout import AMBIGUITIES
 from lerobot_deltaco.data.collection import CollectionError, Summary, collect
 from lerobot_deltaco.data.collection_plan import COLLECTED_SPLITS, DATA_SETS, CollectionPlan
 
+_VERIFY_HELP = "only check every byte of a finished dataset, of which just --root is named"
+
 
 def main(arguments: list[str] | None = None) -> None:
-    """Collects, and shows what it came to."""
+    """Collects, and shows what it came to; or verifies what was collected."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if "--verify" in arguments:
+        _verify(arguments)
+        return
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.workers < 1:
@@ -69,15 +75,44 @@ def _share(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None
     """Writes the card of the finished dataset, and pushes it if that is wanted."""
     from lerobot_deltaco.cards.dataset_card import has_current_card, write_card
     from lerobot_deltaco.data.hub import HubError, push_dataset
+    from lerobot_deltaco.data.integrity import DatasetError
 
     try:
         if not has_current_card(options.root):
             write_card(options.root, repo_id=options.repo_id if options.push_to_hub else None)
         if options.push_to_hub:
             sys.stdout.write(f"It is now at {push_dataset(options.root, options.repo_id)}.\n")
+    except DatasetError as error:
+        parser.exit(1, f"{parser.prog}: {error}\n")
     except (HubError, OSError, KeyboardInterrupt) as error:
         reason = str(error) or "Interrupted."
         parser.exit(1, f"{parser.prog}: {reason} The dataset itself is finished; `deltaco-push` shares it.\n")
+
+
+def _verify(arguments: list[str]) -> None:
+    """Checks every byte of a finished dataset, and says what was found."""
+    from lerobot_deltaco.data.finished_dataset import verify_dataset
+    from lerobot_deltaco.data.integrity import DatasetError
+
+    parser = argparse.ArgumentParser(
+        prog="deltaco-collect", description="Verifies a finished dataset: it is only read."
+    )
+    parser.add_argument("--verify", action="store_true", required=True, help=_VERIFY_HELP)
+    parser.add_argument("--root", type=Path, required=True, help="the dataset's folder")
+    options = parser.parse_args(arguments)
+    try:
+        found = verify_dataset(options.root)
+    except (DatasetError, OSError) as error:
+        parser.exit(1, f"{parser.prog}: {error}\n")
+    how = (
+        "each has the checksum that was written down when it was collected"
+        if found.has_digests
+        else "all of them can be read; there are no checksums to compare them with"
+    )
+    sys.stdout.write(
+        f"{options.root}: {found.episodes} episodes in {found.n_files} files, {found.n_bytes / 1e6:.1f} MB: "
+        f"{how}.\n"
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -122,6 +157,7 @@ def _parser() -> argparse.ArgumentParser:
         help="then push it there, as deltaco-push does; that needs HF_TOKEN or `hf auth login`",
     )
     parser.add_argument("--append", action="store_true", help="add to a finished dataset")
+    parser.add_argument("--verify", action="store_true", help=_VERIFY_HELP)
     parser.add_argument("--summary", type=Path, metavar="FILE", help="also write the summary as JSON")
     return parser
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lerobot_deltaco.cards.dataset_card import CARD_FILE, write_card
 from lerobot_deltaco.data.hub import HubError, check_dataset, check_repo_id, push_dataset
+from lerobot_deltaco.data.integrity import DatasetError
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -26,7 +27,7 @@ def main(arguments: list[str] | None = None) -> None:
         else:
             url = push_dataset(options.root, options.repo_id, options.private, options.branch)
             sys.stdout.write(f"{options.root} is now at {url}.\n")
-    except (HubError, OSError) as error:
+    except (HubError, DatasetError, OSError) as error:
         parser.exit(1, f"{parser.prog}: {error}\n")
     except KeyboardInterrupt:
         parser.exit(130, f"\n{parser.prog}: Interrupted. The same command pushes again.\n")

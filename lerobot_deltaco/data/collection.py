@@ -4,11 +4,15 @@ Each finished episode is stored at once, in a file of its own in the folder `.co
 of a data file are there, a worker joins them. The dataset's own files change only at the end: first all that
 shall be done is written down, then it is done, each step of which may be repeated. So whatever happens, the
 next run with the same arguments goes on, and the result is a function of the arguments alone.
+
+All files of that folder are written with their checksums, and read only if they still have them.
 """
 
 from __future__ import annotations
 
 import fcntl
+import hashlib
+import io
 import json
 import multiprocessing
 import os
@@ -28,7 +32,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 from tqdm import tqdm
 
 from gym_deltaco import ENV_ID
@@ -47,16 +50,37 @@ from lerobot_deltaco.data.collection_plan import (
     renderer,
 )
 from lerobot_deltaco.data.dataset_statistics import Statistics, merged_statistics
+from lerobot_deltaco.data.finished_dataset import (
+    HISTORY_FILE,
+    STAGING,
+    UNFINISHED,
+    check_counts,
+    check_metadata_digests,
+    read_history,
+    read_info,
+    read_json,
+    read_statistics,
+    read_tasks,
+)
+from lerobot_deltaco.data.integrity import (
+    DatasetError,
+    damaged,
+    file_digest,
+    read_checked,
+    read_checked_json,
+    read_digests,
+    write_checked,
+    write_checked_json,
+    write_digests,
+)
 
-STAGING = ".collecting"
 # The same folder once all is done; it is renamed before it is removed, so that it never counts half-removed.
 FINISHED_STAGING = ".collecting.finished"
 JOINED = "joined"
 # Each worker holds it as long as it lives.
 WORKERS_LOCK = "workers"
-HISTORY_FILE = Path("meta/deltaco.json")
-# LeRobot reads this as a version number, and names it in the error: that is what a user then reads.
-UNFINISHED = "this dataset is unfinished; run its `deltaco-collect` command again to go on"
+# What a collection under way has in its folder, once its plan is written down.
+_STAGED = ("episodes", "parts", JOINED, "commit.json")
 # What an episode's own file knows of it, in its table's metadata.
 _KNOWN = b"deltaco"
 # So that none waits for the main process to hear of its last one.
@@ -94,6 +118,7 @@ class _Base:
     n_files: int
     features: dict[str, Any]
     history: list[dict[str, Any]]
+    digests: dict[str, str]
 
     @property
     def plans(self) -> list[CollectionPlan]:
@@ -131,6 +156,11 @@ class _Job:
         """What is known of a complete data file; it is written after the file itself."""
         return self.staging / "parts" / f"{part:05d}.json"
 
+    def files_of_part(self, part: int) -> tuple[Path, Path]:
+        """The data file and the file of its episodes, in the dataset's folder."""
+        number = self.base_files + part
+        return files.numbered(files.DATA_FILE, number), files.numbered(files.EPISODES_FILE, number)
+
     def part(self, part: int) -> range:
         """The episodes of a data file."""
         first = part * self.episodes_per_file
@@ -164,6 +194,13 @@ def collect(root: Path, plan: CollectionPlan, n_workers: int = 1, append: bool =
             process ended, or a file is damaged.
         OSError: The folder cannot be written to, or is full. What is finished is kept.
     """
+    try:
+        return _collect_into(root, plan, n_workers, append)
+    except DatasetError as error:
+        raise CollectionError(str(error)) from None
+
+
+def _collect_into(root: Path, plan: CollectionPlan, n_workers: int, append: bool) -> Summary:
     root.mkdir(parents=True, exist_ok=True)
     base = _read_base(root)
     staging = root / STAGING
@@ -179,7 +216,7 @@ def collect(root: Path, plan: CollectionPlan, n_workers: int = 1, append: bool =
                 f"Another process has just finished collecting into {root}. Look at it first."
             )
         _check_may_begin(root, base, plan, append)
-        files.write_json(staging / "plan.json", _identity(plan, append))
+        write_checked_json(staging / "plan.json", _identity(plan, append))
         seconds = n_collected = 0.0
         if not (staging / "commit.json").exists():
             if base is None:
@@ -201,41 +238,29 @@ def _read_base(root: Path) -> _Base | None:
     info_file, history_file = root / files.INFO_FILE, root / HISTORY_FILE
     if not info_file.exists():
         return None
-    info = _read(info_file)
-    codebase_version = info.get("codebase_version")
+    codebase_version = read_json(info_file, dict[str, Any]).get("codebase_version")
     if codebase_version == UNFINISHED:
         return None
-    if codebase_version != files.CODEBASE_VERSION or not history_file.exists():
+    if codebase_version is not None and (
+        codebase_version != files.CODEBASE_VERSION or not history_file.exists()
+    ):
         raise CollectionError(
             f"{root} holds a dataset that `deltaco-collect` did not make. Name a new folder."
         )
-    data_files = sorted((root / "data").glob("*/*.parquet"))
-    n_frames = sum(_read(path).num_rows for path in data_files)
-    if n_frames != info["total_frames"]:
-        raise CollectionError(
-            f"The files in {root / 'data'} have {n_frames} frames instead of {info['total_frames']}: some "
-            "are missing, or too many. Collect the dataset again, in a new folder."
-        )
-    for file in (files.STATS_FILE, files.TASKS_FILE):
-        _read(root / file)
-    return _Base(
-        tasks=files.read_tasks(root / files.TASKS_FILE),
+    info = read_info(root)
+    check_counts(root, info)
+    read_statistics(root, info["features"])
+    base = _Base(
+        tasks=read_tasks(root, info["total_tasks"]),
         n_episodes=info["total_episodes"],
-        n_frames=n_frames,
-        n_files=len(data_files),
+        n_frames=info["total_frames"],
+        n_files=len(list((root / "data").glob("*/*.parquet"))),
         features=info["features"],
-        history=_read(history_file),
+        history=read_history(root),
+        digests=read_digests(root) or {},
     )
-
-
-def _read(path: Path) -> Any:
-    """Contents of a JSON file, or a Parquet file's own description of them."""
-    try:
-        return pq.read_metadata(path) if path.suffix == ".parquet" else json.loads(path.read_text())
-    except (ValueError, OSError) as error:  # PyArrow's errors are ValueErrors
-        raise CollectionError(
-            f"The file {path} is damaged or missing ({error}). Collect the dataset again, in a new folder."
-        ) from None
+    check_metadata_digests(root)
+    return base
 
 
 def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, append: bool) -> None:
@@ -246,7 +271,8 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
     """
     plan_file = root / STAGING / "plan.json"
     if plan_file.exists():
-        begun, wanted = _read(plan_file), _identity(plan, append)
+        remedy = f"The arguments of the collection are lost: delete {root}, and collect again."
+        begun, wanted = read_checked_json(plan_file, remedy), _identity(plan, append)
         differences = [
             f"{name}: {begun.get(name)} there, {wanted[name]} now"
             for name in wanted
@@ -257,7 +283,18 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
                 f"{root} holds an unfinished collection of other arguments ({'; '.join(differences)}). Go "
                 "on with its own arguments, or name a new folder."
             )
+        if append and base is None and not (root / STAGING / "commit.json").exists():
+            raise CollectionError(
+                f"The addition to {root} was interrupted while its files were put into place, and "
+                f"{STAGING}/commit.json, which says how, is missing. Put the file back, or restore the "
+                "dataset from a copy."
+            )
         return
+    if any((root / STAGING / name).exists() for name in _STAGED) or (base is None and _is_begun(root)):
+        raise CollectionError(
+            f"{root} holds an unfinished collection whose arguments are lost: {plan_file} is missing. Put "
+            f"the file back, or delete {root if base is None else root / STAGING}, and collect again."
+        )
     if base is None:
         if append:
             raise CollectionError(f"{root} holds no finished dataset to add to. Run without --append first.")
@@ -274,6 +311,12 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
             f"{root} holds a dataset whose images differ in size, ambiguity, renderer or version of the "
             "benchmark. Name a new folder."
         )
+
+
+def _is_begun(root: Path) -> bool:
+    """Whether a folder is marked as that of an unfinished collection."""
+    info_file = root / files.INFO_FILE
+    return info_file.exists() and read_json(info_file, dict[str, Any]).get("codebase_version") == UNFINISHED
 
 
 def _identity(plan: CollectionPlan, append: bool) -> dict[str, Any]:
@@ -310,7 +353,7 @@ def _locked(staging: Path) -> Iterator[None]:
 
 
 def _make_job(root: Path, plan: CollectionPlan, base: _Base | None) -> _Job:
-    base = base or _Base([], 0, 0, 0, {}, [])
+    base = base or _Base([], 0, 0, 0, {}, [], {})
     instructions = dict.fromkeys([*base.tasks, *(TASKS[task_id].instruction for task_id in plan.task_ids)])
     order = {instruction: index for index, instruction in enumerate(instructions)}
     taken = first_numbers(plan, base.plans)
@@ -439,11 +482,10 @@ def _collect(index: int) -> None:
     known = {"attempts": episode.attempts, "statistics": statistics}
     table = files.episode_table(columns, _worker.schema)
     table = table.replace_schema_metadata({**table.schema.metadata, _KNOWN: json.dumps(known)})
-    with (
-        files.new_file(job.episode_file(index)) as temporary,
-        pa.ipc.new_file(temporary, table.schema) as writer,
-    ):
+    buffer = io.BytesIO()
+    with pa.ipc.new_file(buffer, table.schema) as writer:
         writer.write_table(table)
+    write_checked(job.episode_file(index), buffer.getvalue())
 
 
 def _join(part: int) -> None:
@@ -460,11 +502,12 @@ def _join(part: int) -> None:
             yield table.replace_schema_metadata(schema.metadata)
 
     number = job.base_files + part
-    files.write_data_file(job.joined / files.numbered(files.DATA_FILE, number), tables(), schema)
+    data_file, episodes_file = job.files_of_part(part)
+    files.write_data_file(job.joined / data_file, tables(), schema)
     statistics = [files.statistics_from_json(item["statistics"]) for item in known]
     task_ids = [job.task_and_number(index)[0] for index in episodes]
     files.write_episodes_file(
-        job.joined / files.numbered(files.EPISODES_FILE, number),
+        job.joined / episodes_file,
         file_number=number,
         first_episode=job.base_episodes + episodes.start,
         first_index=job.base_frames + episodes.start * EPISODE_LENGTH,
@@ -475,23 +518,25 @@ def _join(part: int) -> None:
     attempts: Counter[int] = Counter()
     for task_id, item in zip(task_ids, known, strict=True):
         attempts[task_id] += item["attempts"]
-    files.write_json(
+    write_checked_json(
         job.part_file(part),
-        {"attempts": attempts, "statistics": files.statistics_to_json(_merged(statistics))},
+        {
+            "attempts": attempts,
+            "statistics": files.statistics_to_json(_merged(statistics)),
+            "sha256": {str(file): file_digest(job.joined / file) for file in (data_file, episodes_file)},
+        },
     )
     for index in episodes:
         job.episode_file(index).unlink()
 
 
 def _read_episode(path: Path) -> pa.Table:
+    remedy = "Delete it and run the command again: its episode is then collected anew."
     try:
-        with pa.ipc.open_file(path) as reader:
+        with pa.ipc.open_file(read_checked(path, remedy)) as reader:
             return reader.read_all()
-    except (pa.ArrowException, OSError) as error:
-        raise CollectionError(
-            f"The file {path} is damaged ({error}). Delete it and run the command again: its episode is then "
-            "collected anew."
-        ) from None
+    except pa.ArrowException as error:
+        raise damaged(path, error, remedy) from None
 
 
 def _merged(parts: Sequence[dict[str, Statistics]]) -> dict[str, Statistics]:
@@ -503,11 +548,18 @@ def _merged(parts: Sequence[dict[str, Statistics]]) -> dict[str, Statistics]:
 
 def _prepare_commit(job: _Job, base: _Base | None) -> None:
     """Writes down the dataset's metadata as they shall be."""
-    known = [_read(job.part_file(part)) for part in range(job.n_parts)]
+    known = [_read_part(job, part) for part in range(job.n_parts)]
     statistics = [files.statistics_from_json(item["statistics"]) for item in known]
+    digests: dict[str, str] = {}
     if base is not None:
-        before = _read(job.root / files.STATS_FILE)
-        statistics.insert(0, files.statistics_from_json(before))
+        statistics.insert(0, read_statistics(job.root, base.features))
+        # Datasets of earlier versions have no checksums; theirs are taken as their files are now.
+        for number in range(base.n_files):
+            for file in (files.DATA_FILE, files.EPISODES_FILE):
+                name = str(files.numbered(file, number))
+                digests[name] = base.digests.get(name) or file_digest(job.root / name)
+    for item in known:
+        digests |= item["sha256"]
     attempts: Counter[str] = Counter()
     for item in known:
         attempts.update(item["attempts"])
@@ -525,15 +577,29 @@ def _prepare_commit(job: _Job, base: _Base | None) -> None:
         "stats": files.statistics_to_json(_merged(statistics)),
         "tasks": job.tasks,
         "history": [*(base.history if base else []), entry],
+        "sha256": digests,
     }
-    files.write_json(job.staging / "commit.json", contents)
+    write_checked_json(job.staging / "commit.json", contents)
+
+
+def _read_part(job: _Job, part: int) -> dict[str, Any]:
+    """What is known of a complete data file, which still is as it was written."""
+    part_file = job.part_file(part)
+    remedy = f"Delete {part_file} and run the command again: its episodes are then collected anew."
+    known = read_checked_json(part_file, remedy)
+    for name, digest in known["sha256"].items():
+        path = job.joined / name
+        if not path.exists() or file_digest(path) != digest:
+            raise damaged(path, "its contents do not have their checksum", remedy)
+    return known
 
 
 def _commit(root: Path) -> None:
     """Makes the dataset what was written down. Interrupted, it is simply done again."""
     staging = root / STAGING
-    contents = _read(staging / "commit.json")
-    info = contents["info"]
+    remedy = f"Put it back from a copy, or delete {root}, and collect again."
+    contents = read_checked_json(staging / "commit.json", remedy)
+    info, digests = contents["info"], contents["sha256"]
     files.write_json(root / files.INFO_FILE, {**info, "codebase_version": UNFINISHED})
     for path in sorted((staging / JOINED).rglob("*.parquet")):
         target = root / path.relative_to(staging / JOINED)
@@ -542,6 +608,10 @@ def _commit(root: Path) -> None:
     files.write_tasks(root / files.TASKS_FILE, contents["tasks"])
     files.write_json(root / files.STATS_FILE, contents["stats"])
     files.write_json(root / HISTORY_FILE, contents["history"])
+    metadata = (files.TASKS_FILE, files.STATS_FILE, HISTORY_FILE)
+    digests |= {str(file): file_digest(root / file) for file in metadata}
+    digests[str(files.INFO_FILE)] = hashlib.sha256(files.json_text(info).encode()).hexdigest()
+    write_digests(root, digests)
     files.write_json(root / files.INFO_FILE, info)
     os.replace(staging, root / FINISHED_STAGING)
     shutil.rmtree(root / FINISHED_STAGING)

@@ -223,7 +223,12 @@ def statistics_from_json(contents: Mapping[str, Mapping[str, Any]]) -> dict[str,
 def write_json(path: Path, contents: Any) -> None:
     """Writes a JSON file."""
     with new_file(path) as temporary:
-        temporary.write_text(json.dumps(contents, indent=4) + "\n")
+        temporary.write_text(json_text(contents))
+
+
+def json_text(contents: Any) -> str:
+    """The text of a JSON file, as `write_json` writes it."""
+    return json.dumps(contents, indent=4) + "\n"
 
 
 class new_file:  # noqa: N801  (used like a function)

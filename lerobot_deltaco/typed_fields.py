@@ -1,0 +1,79 @@
+"""Values against the types that are declared for them: of a dataclass's fields, and of what JSON gives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from functools import cache
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+
+def check_field_types(instance: Any, but: tuple[str, ...] = ()) -> None:
+    """Checks that the fields of a dataclass have values of their declared types.
+
+    Numbers are finite; an integer stands for a float, but a boolean for no number.
+
+    Args:
+        instance: The dataclass's instance.
+        but: Names of fields that are not checked.
+
+    Raises:
+        ValueError: A field has a value of another type; the message names it and says what is valid.
+    """
+    kinds = type_hints(type(instance))
+    for field in fields(instance):
+        value, kind = getattr(instance, field.name), kinds[field.name]
+        if field.name not in but and not is_a(value, kind):
+            raise ValueError(f"`{field.name}` must be {in_words(kind)}. Got {value!r}.")
+
+
+@cache
+def type_hints(kind: type[Any]) -> dict[str, Any]:
+    """The declared types of a class's attributes, by name."""
+    return get_type_hints(kind)
+
+
+def is_a(value: Any, kind: Any) -> bool:
+    """Whether a value is of a declared type."""
+    origin, options = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return True
+    if origin is Literal:
+        return type(value) is str and value in options
+    if origin in (UnionType, Union):
+        return any(is_a(value, option) for option in options)
+    if origin is list:
+        return isinstance(value, list) and all(is_a(item, options[0]) for item in value)
+    if origin is dict:
+        return isinstance(value, dict) and all(
+            is_a(name, options[0]) and is_a(item, options[1]) for name, item in value.items()
+        )
+    if kind is NoneType:
+        return value is None
+    if kind is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    if kind in (int, bool):
+        return type(value) is kind  # True is no integer here
+    return isinstance(value, kind)
+
+
+def in_words(kind: Any) -> str:
+    """A declared type as an error names it."""
+    origin, options = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return f"one of {', '.join(options)}"
+    if origin in (UnionType, Union):
+        return " or ".join(in_words(option) for option in options)
+    if origin is list:
+        return f"a list whose items are each {in_words(options[0])}"
+    if origin is dict:
+        return f"a mapping from {in_words(options[0])} to {in_words(options[1])}"
+    names = {
+        int: "an integer",
+        float: "a finite number",
+        str: "a string",
+        bool: "true or false",
+        NoneType: "None",
+    }
+    return names.get(kind) or getattr(kind, "__name__", str(kind))
