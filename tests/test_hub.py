@@ -1,11 +1,13 @@
 """A dataset's card, and the way to the Hub and back, with real clients and a fake Hub."""
 
+import argparse
 import json
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,7 @@ from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.dataset_files import INFO_FILE
 from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, UNFINISHED
 from lerobot_deltaco.data.hub import HubError, check_credentials, check_dataset, check_repo_id
+from lerobot_deltaco.data.integrity import DIGESTS_FILE
 
 REPO_ID = f"{USER}/three.tasks"
 KEY = "dataset", REPO_ID
@@ -60,10 +63,11 @@ def hub():
         yield hub
 
 
-def start(program, *arguments, environment):
-    """Starts a Python program, with the card's check at the real Hub left out."""
+def start(program, *arguments, environment, with_card_check=False):
+    """Starts a Python program, with the card's check at the real Hub left out unless it is wanted."""
+    before = "" if with_card_check else WITHOUT_CARD_CHECK
     return subprocess.Popen(
-        [sys.executable, "-c", WITHOUT_CARD_CHECK + program, *map(str, arguments)],
+        [sys.executable, "-c", before + program, *map(str, arguments)],
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -213,7 +217,8 @@ def test_the_wheel_has_the_templates():
 
 
 def test_a_dataset_that_was_edited_has_a_card_too(copy):
-    (copy / HISTORY_FILE).unlink()
+    for file in (HISTORY_FILE, DIGESTS_FILE):
+        (copy / file).unlink()
     check_dataset(copy)
     text = card_text(copy)
     assert "LeRobot's dataset tools" in text
@@ -358,6 +363,25 @@ def test_missing_credentials_are_found_before_collecting(hub, tmp_path):
     assert KEY not in hub.repos
 
 
+def test_an_image_that_cannot_be_shown_is_no_finished_dataset(copy, capsys):
+    path = copy / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    column = table.schema.get_field_index("observation.image")
+    cells = [{"bytes": b"no image", "path": cell["path"]} for cell in table["observation.image"].to_pylist()]
+    pq.write_table(table.set_column(column, table.schema.field(column), [cells]), path)
+    for file in CARD_FILES:
+        (copy / file).unlink()
+    with pytest.raises(SystemExit, match="1"):
+        collect_command._share(
+            argparse.ArgumentParser("deltaco-collect"),
+            argparse.Namespace(root=copy, repo_id=None, push_to_hub=False),
+        )
+    errors = capsys.readouterr().err
+    assert "file-000.parquet is damaged" in errors
+    assert "--verify" in errors
+    assert "finished" not in errors
+
+
 # The way to the Hub and back
 
 
@@ -399,6 +423,34 @@ for fetched, kept in zip(dataset, local, strict=True):
 """
     output = run(compare, copy, environment=hub.environment(tmp_path / "b"))
     assert TASKS[4].instruction in output
+
+
+def test_a_push_that_stops_says_what_has_arrived(copy, tmp_path):
+    cases = [
+        ("repos/create", "Nothing has arrived.", False),
+        ("POST /api/datasets/.*/commit/", f"{REPO_ID} has either all of the new files or none", False),
+        ("POST /api/datasets/.*/tag/", "All files have arrived, but the tag 'v3.0'", True),
+    ]
+    with ExitStack() as stack:
+        running = []
+        for number, (refused, message, has_arrived) in enumerate(cases):
+            hub = stack.enter_context(FakeHub())
+            hub.refused = refused
+            # The card's check at a fixed address is not needed: this Hub is another one.
+            process = start(
+                *(PUSH, "--root", copy, "--repo-id", REPO_ID),
+                environment=hub.environment(tmp_path / str(number)),
+                with_card_check=True,
+            )
+            running.append((process, hub, message, has_arrived))
+        for process, hub, message, has_arrived in running:
+            _, errors = process.communicate(timeout=120)
+            assert process.returncode == 1, errors
+            assert message in errors.splitlines()[-1]
+            assert "cannot be reached" not in errors
+            assert "Traceback" not in errors
+            stored = set(hub.repos[KEY].files()) if KEY in hub.repos else set()
+            assert (str(DIGESTS_FILE) in stored) == (str(CARD_FILE) in stored) == has_arrived
 
 
 def test_collecting_starts_without_heavy_imports():
