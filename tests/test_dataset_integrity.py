@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from lerobot_deltaco.cards.templates import markdown_code, markdown_text
 from lerobot_deltaco.commands.collect import main
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import EPISODE_LENGTH, FPS, CollectionPlan
@@ -24,7 +25,6 @@ from lerobot_deltaco.data.integrity import (
     write_checked_json,
     write_digests,
 )
-from lerobot_deltaco.templates import markdown_code, markdown_text
 
 PLAN = CollectionPlan("90,4", 1)
 
