@@ -120,8 +120,9 @@ def check_lerobot(words, monkeypatch):
     """Parses a command's configuration with draccus, as LeRobot does, but reads no checkpoint."""
     from lerobot.configs import PreTrainedConfig
 
-    import lerobot_policy_deltaco  # noqa: F401
-
+    # These register the policies and environments, before the first parser is made.
+    for module in ("lerobot.policies", "lerobot.envs", "lerobot_policy_deltaco"):
+        importlib.import_module(module)
     command, *arguments = words
     if command == "lerobot-dataset-viz":
         from lerobot.scripts.lerobot_dataset_viz import main
