@@ -88,7 +88,7 @@ def check_deltaco(words, monkeypatch):
     module, function = PROJECT["scripts"][words[0]].split(":")
     main = getattr(importlib.import_module(module), function)
     options = parse_with_argparse(main, words[1:], monkeypatch)
-    if words[0] == "deltaco-collect":
+    if words[0] == "deltaco-collect" and "--verify" not in words:
         from lerobot_deltaco.data.collection_plan import CollectionPlan
 
         CollectionPlan(options.tasks, options.episodes_per_task)
