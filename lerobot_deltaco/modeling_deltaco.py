@@ -1,29 +1,30 @@
 """The policy of DeL-TaCo (Yu & Mooney, ICLR 2023), and the baselines and ablations of the paper."""
 
-from __future__ import annotations
+# No `from __future__ import annotations`: LeRobot's tests expect the annotation of `config` to be a class.
 
-import json
 import logging
-import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from huggingface_hub import ModelCard, hf_hub_download
+from huggingface_hub import ModelCard
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from lerobot_deltaco.cards.policy_card import policy_card
 from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
+from lerobot_deltaco.policy.demonstration_choice import (
+    choose_episode,
+    choose_eval_demonstrations,
+    choose_training_demonstrations,
+)
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.language import InstructionTable
@@ -37,36 +38,33 @@ from lerobot_deltaco.policy.losses import (
 from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
 from lerobot_deltaco.policy.scalars import LoggedScalars
+from lerobot_deltaco.policy.task_conditioning import EpisodeTasks, TaskConditioning
+from lerobot_deltaco.policy.task_file import TASK_FILE, find_task_file, read_demonstrations, write_task_file
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
 logger = logging.getLogger(__name__)
 
-# Beside the weights: embeddings of instructions, and the demonstrations for evaluation.
-TASKS_FILE = "tasks.safetensors"
-# Of the names that the weights of `DeltacoPolicy.model` had before version 0.2.
+# Prefix that the names of the weights of `DeltacoPolicy.model` had in version 0.1.
 OLD_MODEL_PREFIX = "policy."
 
 
-class TaskConditioning(NamedTuple):
-    """What the networks receive about the tasks of a batch, computed once per episode."""
-
-    tasks: tuple[str, ...]
-    film: Tensor  # (batch, film_dim)
-    concat: Tensor | None  # (batch, concatenated embeddings)
-    model: nn.Module  # the network that acts
-
-
 class DeltacoPolicy(PreTrainedPolicy):
-    """A policy that is told its task by a demonstration, an instruction, or both.
+    """A policy that performs the task of a demonstration, an instruction, or both.
 
-    In training, each sample's demonstration is another episode of its task, from the training dataset. At
+    In training, each sample's demonstration is another episode of its task in the training dataset. In
     evaluation, demonstrations come from the dataset that the configuration names, or from the checkpoint.
     The instruction is the batch's `task`.
 
     Args:
-        config: The configuration. Features that it lacks are filled in by LeRobot beforehand.
-        dataset_stats: Unused; normalization is the processors' business.
-        dataset_meta: Of the training dataset; None at evaluation.
+        config: Configuration of the policy. LeRobot fills in its input and output features beforehand.
+        dataset_stats: Unused: the processors normalize.
+        dataset_meta: Metadata of the training dataset; None in evaluation.
+
+    Attributes:
+        model: Network that predicts actions.
+        instructions: Embeddings of instructions.
+        eval_demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
+        train_demonstrations: Demonstrations for training; None until the first training batch.
     """
 
     config_class = DeltacoConfig
@@ -86,9 +84,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         if config.instruction_embeddings is not None:
             self.instructions.read(Path(config.instruction_embeddings))
         self.eval_demonstrations: DemonstrationSet | None = None
-        self.train_demonstrations: DemonstrationSet | None = None  # read with the first training batch
+        self.train_demonstrations: DemonstrationSet | None = None
         self._train_demonstrations_are_complete = False  # whether they surely include every training episode
         self._demonstrated_as: Mapping[str, str] = {}
+        self._episode_tasks = EpisodeTasks()
         if config.demo_repo_id is not None:
             self.eval_demonstrations = self._load_demonstrations(config.demo_repo_id, config.demo_root, None)
         if config.method == "one_hot" and not config.one_hot_tasks:
@@ -128,9 +127,6 @@ class DeltacoPolicy(PreTrainedPolicy):
                 if network is not None:
                     network.compile()
         self._folded = FoldedPolicy(self.model)
-        self._conditioning: dict[int, TaskConditioning] = {}
-        self._n_episodes: dict[str, int] = {}  # of each task
-        self.reset()
 
     def _make_demo_encoder(self) -> nn.Module:
         config = self.config
@@ -140,25 +136,25 @@ class DeltacoPolicy(PreTrainedPolicy):
         return ArrayEncoder(size, size, config.demo_rows, config.demo_columns, config.embedding_dim, stride)
 
     def get_optim_params(self) -> list[nn.Parameter]:
-        """All weights; the language encoder is not among them."""
+        """All weights. The language encoder is frozen, and not among them."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     # Training
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, LoggedScalars]:
-        """The loss of a batch: L = L_pi + lambda L_demo (the paper's equation 4).
+        """The loss of a batch: L = L_pi + alpha_d L_demo (the paper's equation 3).
 
         Args:
-            batch: Of the preprocessor; it is left as it is.
+            batch: Batch from the preprocessor; it is not changed.
                 `observation.image`, or any cameras: (batch, 3, H, W) float in 0..1.
-                `observation.state`: (batch, state), normalized, if there is one.
+                `observation.state`, if there is one: (batch, state), normalized.
                 `action`: (batch, action), -1..1.
                 `task`: list of instructions, (batch,).
-                `episode_index`: (batch,) int64, if demonstrations are used.
+                `episode_index`, if demonstrations are used: (batch,) int64.
             reduction: "mean", or "none" for the loss of each sample.
 
         Returns:
-            The loss, () or (batch,), and what is logged.
+            The loss, () or (batch,), and the scalars to log.
         """
         tasks = list(batch["task"])
         device = batch[ACTION].device
@@ -204,7 +200,7 @@ class DeltacoPolicy(PreTrainedPolicy):
     def _imitation_loss(
         self, batch: dict[str, Any], images: Tensor, film: Tensor, concat: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """L_pi of each sample, (batch,), and its parts."""
+        """The policy loss L_pi (equation 2) of each sample, (batch,), and its parts to log."""
         predicted, gripper = self.model(images, film, self._concatenated(batch, concat))
         action = batch[ACTION].float()
         motion, target = self._split_action(action)
@@ -221,10 +217,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         return likelihood + self.config.gripper_weight * error, logged
 
     def set_train_demonstrations(self, demonstrations: DemonstrationSet) -> None:
-        """Gives demonstrations for training, instead of those that the first batch would read from the disk.
+        """Sets the demonstrations for training, which are otherwise read from the disk with the first batch.
 
         Args:
-            demonstrations: Among them is every episode that is trained on.
+            demonstrations: Demonstrations, which include every episode of the training.
         """
         self.train_demonstrations = demonstrations
         self._train_demonstrations_are_complete = True
@@ -232,28 +228,34 @@ class DeltacoPolicy(PreTrainedPolicy):
     def _train_demo_embeddings(
         self, episodes: Tensor, tasks: Sequence[str], column: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """Embeddings of demonstrations for samples, (batch, embedding); `column` numbers their tasks."""
+        """Embeddings of the samples' demonstrations, (batch, embedding); `column` numbers their tasks."""
         demonstrations = self._training_demonstrations(episodes.device)
         if not self.training:
+            # The episodes of a validation loss may be held back from the demonstrations.
             rows = demonstrations.sample_other_episodes(episodes, generator, tasks=tasks)
             return self._encode_demo(demonstrations, rows, generator)
-        check = not self._train_demonstrations_are_complete
-        if not self.config.demos_per_task:
-            rows = demonstrations.sample_other_episodes(episodes, generator, check)
-            return self._encode_demo(demonstrations, rows, generator)
-        rows, which = demonstrations.sample_shared_episodes(
-            episodes, column, len(set(tasks)), self.config.demos_per_task, generator, check
+        rows, which = choose_training_demonstrations(
+            demonstrations,
+            episodes,
+            column,
+            len(set(tasks)),
+            self.config.demos_per_task,
+            generator,
+            check=not self._train_demonstrations_are_complete,
         )
-        return self._encode_demo(demonstrations, rows, generator)[which]
+        embeddings = self._encode_demo(demonstrations, rows, generator)
+        return embeddings if which is None else embeddings[which]
 
     def _training_demonstrations(self, device: torch.device) -> DemonstrationSet:
         if self.train_demonstrations is None:
             if self._meta is None:
-                raise ValueError("Only a policy that was made with a dataset's metadata can be trained.")
+                raise ValueError(
+                    "A policy is trained with the metadata of its dataset. Pass them as `dataset_meta`."
+                )
             if self.config.tasks_per_batch:
                 logger.warning(
-                    "`tasks_per_batch` has no effect here: this loop draws samples of any tasks. Train with "
-                    "`deltaco-train`, which takes the same arguments."
+                    "`tasks_per_batch` has no effect: this training loop draws samples of any tasks. Train "
+                    "with `deltaco-train`, which takes the same arguments."
                 )
             chosen = self.config.demo_episodes or training_episodes(self._meta)
             loaded = self._load_demonstrations(self._meta.repo_id, self._meta.root, chosen)
@@ -261,9 +263,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         return self.train_demonstrations
 
     def _generator(self) -> torch.Generator:
-        rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
         step = int(self.step) if self.training else 0
-        seed = torch.tensor([self.config.seed, step, rank], dtype=torch.int64)
+        seed = torch.tensor([self.config.seed, step, _process_rank()], dtype=torch.int64)
         # A hash, so that neighboring seeds and steps have nothing in common.
         mixed = 0
         for value in seed.tolist():
@@ -273,22 +274,23 @@ class DeltacoPolicy(PreTrainedPolicy):
     # Evaluation
 
     def reset(self) -> None:
-        """Begins an episode (of this thread, if several evaluate tasks at the same time)."""
-        self._conditioning.pop(threading.get_ident(), None)
+        """Starts an episode, of this thread if several threads evaluate tasks at the same time."""
+        self._episode_tasks.begin_episode()
 
     def begin_evaluation(self) -> None:
-        """Forgets how many episodes each task has had: its demonstrations begin with the first again."""
-        self._n_episodes.clear()
+        """Starts an evaluation: the demonstrations of each task begin with the first again."""
+        self._episode_tasks.begin_evaluation()
 
     @contextmanager
     def demonstrated_as(self, tasks: Mapping[str, str]) -> Iterator[None]:
-        """Demonstrates instructions by other tasks' demonstrations while the context is open.
+        """Uses other tasks' demonstrations with some instructions, while the context is open.
 
-        For a sentence of one's own: `with policy.demonstrated_as({"fetch the jar": task.instruction}): ...`
+        For example, to perform a task from a demonstration and a sentence of one's own:
+        `with policy.demonstrated_as({"fetch the jar": task.instruction}): ...`
 
         Args:
-            tasks: Maps an instruction to the task string whose demonstrations are used with it. It is read at
-                the start of each episode; instructions that are not in it have their own demonstrations.
+            tasks: For an instruction, the task string whose demonstrations are used. It is read when an
+                episode starts; instructions that it lacks keep their own demonstrations.
         """
         previous, self._demonstrated_as = self._demonstrated_as, tasks
         try:
@@ -298,13 +300,13 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """The mean action, of the likeliest mode if there are several.
+        """The mean action; with several motion modes, that of the likeliest one.
 
         Args:
-            batch: As in `forward`, without actions and indices.
+            batch: As in `forward`, without `action` and `episode_index`.
 
         Returns:
-            (batch, action), as the preprocessor would have normalized it.
+            Actions, (batch, action), normalized as in `forward`.
 
         Raises:
             ValueError: A task has no demonstration.
@@ -312,12 +314,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         tasks = tuple(batch["task"])
         images = self._images(batch)
         with self._autocast(images.device):
-            conditioning = self._conditioning.get(threading.get_ident())
-            if conditioning is None or conditioning.tasks != tasks:
-                conditioning = self.encode_task(tasks, images.device)
-                self._conditioning[threading.get_ident()] = conditioning
-            concatenated = self._concatenated(batch, conditioning.concat)
-            motion, gripper = conditioning.model(images, conditioning.film, concatenated)
+            task = self._episode_tasks.conditioning(
+                tasks, lambda tasks: self.encode_task(tasks, images.device)
+            )
+            motion, gripper = task.model(images, task.film, self._concatenated(batch, task.concat))
         if gripper is not None:
             gripper = torch.sigmoid(gripper.float())
         return self._join_action(motion.mean.float(), gripper)
@@ -327,74 +327,48 @@ class DeltacoPolicy(PreTrainedPolicy):
         return self.select_action(batch, **kwargs).unsqueeze(1)
 
     def encode_task(self, tasks: tuple[str, ...], device: torch.device) -> TaskConditioning:
-        """Encodes the demonstrations and instructions of tasks, once an episode."""
-        trials = self._count_trials(tasks)
+        """Encodes the demonstrations and instructions of the tasks of a batch, at the start of an episode.
+
+        Args:
+            tasks: Instruction of each sample.
+            device: Device of the result.
+
+        Raises:
+            ValueError: A task has no demonstration.
+        """
+        trials = self._episode_tasks.count_trials(tasks)
         demo = language = None
         if self.config.uses_demo:
-            demonstrations, rows = self._eval_demonstrations_of(tasks, trials)
+            demonstrations, rows = self._choose_eval_demonstrations(tasks, trials)
             generator = torch.Generator().manual_seed(self.config.seed)
             demo = self._encode_demo(demonstrations, rows, generator)
         if self.config.uses_language:
             language = self.instructions(tasks, device)
         if self.config.method == "mcil":
-            # The trials of a task use the language and the demonstration in turn.
+            # The trials of a task use the instruction and the demonstration in turn.
             by_language = torch.tensor(trials, device=device) % 2 == 0
             film = torch.where(by_language[:, None], self.project_language(language), demo)
             return TaskConditioning(tasks, film, None, self._acting_model())
         return TaskConditioning(tasks, *self.conditioning_inputs(tasks, demo, language), self._acting_model())
 
+    def _choose_eval_demonstrations(
+        self, tasks: Sequence[str], trials: Sequence[int]
+    ) -> tuple[DemonstrationSet, Tensor]:
+        if self.config.demo_episode is not None and self.eval_demonstrations is not None:
+            return choose_episode(self.eval_demonstrations, self.config.demo_episode, len(tasks))
+        candidates = (self.eval_demonstrations, self.train_demonstrations)
+        return choose_eval_demonstrations(candidates, tasks, trials, self._demonstrated_as)
+
     def _acting_model(self) -> nn.Module:
-        """The network that acts: a copy that is quicker for small batches, unless in training mode."""
+        """The network that acts: in evaluation mode, a copy that is faster for small batches."""
         return self.model if self.training else self._folded.network()
 
-    def _count_trials(self, tasks: tuple[str, ...]) -> list[int]:
-        """The number of each sample's episode among those of its task, from 0, whichever thread runs them."""
-        trials = []
-        for task in tasks:
-            trials.append(self._n_episodes.get(task, 0))
-            self._n_episodes[task] = trials[-1] + 1
-        return trials
-
-    def _eval_demonstrations_of(
-        self, tasks: tuple[str, ...], trials: Sequence[int]
-    ) -> tuple[DemonstrationSet, Tensor]:
-        """The demonstrations for evaluation, and the row of each task's; those of a task take turns."""
-        candidates = [
-            demonstrations
-            for demonstrations in (self.eval_demonstrations, self.train_demonstrations)
-            if demonstrations is not None
-        ]
-        if self.config.demo_episode is not None and self.eval_demonstrations is not None:
-            found = (self.eval_demonstrations.episodes == self.config.demo_episode).nonzero().flatten()
-            if not len(found):
-                raise ValueError(
-                    f"`demo_episode` is {self.config.demo_episode}, but the demonstrations are the episodes "
-                    f"{self.eval_demonstrations.episodes.tolist()[:10]} ..."
-                )
-            return self.eval_demonstrations, found[:1].expand(len(tasks))
-        tasks = tuple(self._demonstrated_as.get(task, task) for task in tasks)
-        for demonstrations in candidates:
-            if all(task in demonstrations.rows for task in tasks):
-                rows = [
-                    demonstrations.rows[task][trial % len(demonstrations.rows[task])]
-                    for task, trial in zip(tasks, trials, strict=True)
-                ]
-                return demonstrations, torch.tensor(rows, device=demonstrations.frames.device)
-        there = sorted({task for demonstrations in candidates for task in demonstrations.rows})
-        missing = next(task for task in tasks if task not in there) if there else tasks[0]
-        raise ValueError(
-            f"There is no demonstration of the task {missing!r}. There are {len(there)} tasks"
-            f"{f', such as {there[0]!r}' if there else ''}. Name a dataset that has it with "
-            "--policy.demo_repo_id and --policy.demo_root, and, if its words are other ones, the episode "
-            "with --policy.demo_episode."
-        )
-
-    def _autocast(self, device: torch.device) -> Any:
+    def _autocast(self, device: torch.device) -> AbstractContextManager:
         if self.config.dtype == "float32":
             return nullcontext()
         return torch.autocast(device.type, torch.bfloat16)
 
-    # Both
+    # Training and evaluation
 
     def _images(self, batch: dict[str, Any]) -> Tensor:
         """Images of all cameras, (batch, cameras, 3, size, size)."""
@@ -416,7 +390,13 @@ class DeltacoPolicy(PreTrainedPolicy):
     def conditioning_inputs(
         self, tasks: Sequence[str], demo: Tensor | None, language: Tensor | None
     ) -> tuple[Tensor | None, Tensor | None]:
-        """What goes through FiLM and what is concatenated."""
+        """The embeddings that go through FiLM, and those that are concatenated to the feature points.
+
+        Args:
+            tasks: Instruction of each sample.
+            demo: Embeddings of demonstrations, (batch, embedding); None if they are not used.
+            language: Embeddings of instructions, (batch, embedding); None if they are not used.
+        """
 
         def source(name: str) -> Tensor | None:
             if name == "none":
@@ -433,8 +413,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         unknown = next((task for task in tasks if task not in self.config.one_hot_tasks), None)
         if unknown is not None:
             raise ValueError(
-                f"The task {unknown!r} is not among the {len(self.config.one_hot_tasks)} that this one-hot "
-                "policy knows: those of its training and demonstration datasets."
+                f"This one-hot policy does not know the task {unknown!r}. It knows the "
+                f"{len(self.config.one_hot_tasks)} tasks of its training and demonstration datasets."
             )
         places = {task: n for n, task in enumerate(self.config.one_hot_tasks)}
         indices = torch.tensor([places[task] for task in tasks], device=self.step.device)
@@ -450,7 +430,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         return self.demo_encoder(frames)
 
     def _split_action(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
-        """An action's motion, and its gripper in 0..1."""
+        """The motion of an action, and its gripper in 0..1 if it has one."""
         index = self.config.gripper_index
         if index is None:
             return action, None
@@ -474,9 +454,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         return load_demonstrations(repo_id, root, episodes, camera, size, n_frames)
 
     def _one_hot_vocabulary(self) -> list[str]:
-        """Tasks of the training and demonstration datasets."""
+        """Task strings of the training and demonstration datasets."""
         if self._meta is None:
-            raise ValueError("A one-hot policy is made with a dataset, whose tasks it will know.")
+            raise ValueError(
+                "A one-hot policy knows the tasks of its dataset. Pass the metadata as `dataset_meta`."
+            )
         return list(
             dict.fromkeys(
                 [
@@ -486,42 +468,40 @@ class DeltacoPolicy(PreTrainedPolicy):
             )
         )
 
-    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        # What was read from the datasets is saved; the next user may name others.
+    def _save_pretrained(self, save_directory: Path, *args: Any, **kwargs: Any) -> None:
+        # LeRobot 0.6.1 may pass a `state_dict`, later versions do not; it is handed on as it comes.
+        # What was read from these files is saved with the policy, whose next user has other files.
         sources = ("demo_repo_id", "demo_root", "instruction_embeddings")
         given = {name: getattr(self.config, name) for name in sources}
         try:
             for name in sources:
                 setattr(self.config, name, None)
-            super()._save_pretrained(save_directory, state_dict)
+            super()._save_pretrained(save_directory, *args, **kwargs)
         finally:
             for name, value in given.items():
                 setattr(self.config, name, value)
-        tensors, known = self.instructions.state()
-        if self.eval_demonstrations is not None and self.config.uses_demo:
-            tensors |= {
-                "frames": self.eval_demonstrations.frames.cpu(),
-                "episodes": self.eval_demonstrations.episodes.cpu(),
-            }
-            known["tasks"] = json.dumps(self.eval_demonstrations.tasks)
-        save_file(tensors, save_directory / TASKS_FILE, metadata=known)
+        if not _is_main_process():
+            return  # versions after 0.6.1 call this on every process
+        demonstrations = self.eval_demonstrations if self.config.uses_demo else None
+        write_task_file(save_directory / TASK_FILE, self.instructions, demonstrations)
 
     @classmethod
-    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> DeltacoPolicy:
-        """Loads a policy with what it knows of tasks. See `PreTrainedPolicy.from_pretrained`."""
-        folder = Path(pretrained_name_or_path)
-        if folder.is_dir():
-            path = folder / TASKS_FILE
-        else:
-            names = ("revision", "cache_dir", "token", "local_files_only", "force_download")
-            options = {name: kwargs[name] for name in names if name in kwargs}
-            path = Path(hf_hub_download(str(pretrained_name_or_path), TASKS_FILE, **options))
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:
+        """Loads a policy with the instructions and demonstrations that were saved with it.
+
+        See `PreTrainedPolicy.from_pretrained` for the arguments.
+        """
+        path = find_task_file(pretrained_name_or_path, **kwargs)
         config = kwargs.get("config")
         if config is not None:
-            # Before its weights turn out not to fit.
+            # Another language encoder is an error of its own, before the weights turn out not to fit.
             InstructionTable(config.language_encoder).read(path)
         policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
-        policy._read_tasks(path)
+        policy.instructions.read(path)
+        # Demonstrations that the configuration names take precedence over those of the checkpoint.
+        demonstrations = read_demonstrations(path)
+        if policy.eval_demonstrations is None and demonstrations is not None:
+            policy.eval_demonstrations = demonstrations.to(policy.config.device)
         return policy
 
     def load_state_dict(
@@ -549,20 +529,18 @@ class DeltacoPolicy(PreTrainedPolicy):
         cfg: TrainPipelineConfig | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> ModelCard:
-        """The card that goes to the Hub with the policy. LeRobot's arguments."""
+        """The card of the policy on the Hugging Face Hub. The arguments are those of LeRobot."""
         demonstrations = list(self.eval_demonstrations.rows) if self.eval_demonstrations is not None else []
         n_known = len(self.instructions.rows)
         return policy_card(
             self.config, demonstrations, n_known, dataset_repo_id, license, tags, cfg, dataset_meta
         )
 
-    def _read_tasks(self, path: Path) -> None:
-        self.instructions.read(path)
-        with safe_open(path, framework="pt") as file:
-            known = file.metadata()
-            names = set(file.keys())
-            # Demonstrations named on the command line come before those of the checkpoint.
-            if self.eval_demonstrations is None and "frames" in names:
-                self.eval_demonstrations = DemonstrationSet(
-                    file.get_tensor("frames"), json.loads(known["tasks"]), file.get_tensor("episodes")
-                ).to(self.config.device)
+
+def _process_rank() -> int:
+    """Number of this process among those that train together."""
+    return torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
+
+
+def _is_main_process() -> bool:
+    return _process_rank() == 0

@@ -7,8 +7,10 @@ from typing import Any
 import torch
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline, make_default_pre_post_processors
 
-import lerobot_deltaco.lerobot_internals.thread_safe_steps  # noqa: F401
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.lerobot_internals import make_processor_steps_thread_safe
+
+make_processor_steps_thread_safe()
 
 
 def make_deltaco_pre_post_processors(

@@ -27,9 +27,9 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from PIL import Image
 
-from gym_deltaco import EPISODE_STEPS
+from gym_deltaco import EPISODE_STEPS, EXPERT_NOISE
 from gym_deltaco.env import PickPlaceEnv
-from gym_deltaco.expert import NOISE, expert_episode
+from gym_deltaco.expert import expert_episode
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASKS
 from lerobot_deltaco.commands.collect import main
@@ -993,7 +993,7 @@ def test_a_plan_checks_its_arguments(change):
 
 def test_the_default_noise_is_that_of_the_expert(tmp_path, in_process):
     main(["--root", str(tmp_path / "x"), "--tasks", "4", "--episodes-per-task", "1"])
-    assert history(tmp_path / "x")[0]["plan"]["noise"] == NOISE == CollectionPlan("4", 1).noise
+    assert history(tmp_path / "x")[0]["plan"]["noise"] == EXPERT_NOISE == CollectionPlan("4", 1).noise
 
 
 def test_the_summary_has_what_was_done(tmp_path, capsys, in_process):

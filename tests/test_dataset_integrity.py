@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from gym_deltaco.atomic_files import write_json
 from lerobot_deltaco.cards.templates import markdown_code, markdown_text
 from lerobot_deltaco.commands.collect import main
 from lerobot_deltaco.data import dataset_files as files
@@ -58,9 +59,9 @@ def finished(tmp_path_factory):
     episodes_file = root / files.numbered(files.EPISODES_FILE, 0)
     files.write_episodes_file(episodes_file, 0, 0, 0, tasks, [EPISODE_LENGTH] * 2, statistics)
     files.write_tasks(root / files.TASKS_FILE, tasks)
-    files.write_json(root / files.STATS_FILE, files.statistics_to_json(statistics[0]))
+    write_json(root / files.STATS_FILE, files.statistics_to_json(statistics[0]))
     info = files.dataset_info(PLAN.features, FPS, "widowx_250", 2, 2 * EPISODE_LENGTH, 2)
-    files.write_json(root / files.INFO_FILE, info)
+    write_json(root / files.INFO_FILE, info)
     entry = {
         "plan": {"tasks": "90,4", "episodes_per_task": 1},
         "benchmark": "gym_deltaco/PickPlace-v0",
@@ -68,7 +69,7 @@ def finished(tmp_path_factory):
         "versions": {"numpy": "2"},
         "attempts": {"90": 1, "4": 2},
     }
-    files.write_json(root / HISTORY_FILE, [entry])
+    write_json(root / HISTORY_FILE, [entry])
     names = [path.relative_to(root) for path in root.rglob("*") if path.is_file()]
     write_digests(root, {str(name): file_digest(root / name) for name in names})
     return root

@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 from gym_deltaco import gallery
+from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.gallery import Episode, object_views
 from gym_deltaco.objects import object_model
-from gym_deltaco.sheets import caption, down, write_whole
+from gym_deltaco.sheets import caption, down
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import OBJECTS, get_task
 from lerobot_deltaco.commands.gallery import main
@@ -160,14 +161,16 @@ def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path, capsys):
 
 
 def test_an_interrupted_write_leaves_the_file_as_it_was(tmp_path):
-    def interrupted(file):
-        file.write_text("half")
-        raise KeyboardInterrupt
-
     path = tmp_path / "file"
     path.write_text("whole")
+
+    def interrupted():
+        with atomic_write(path) as temporary:
+            temporary.write_text("half")
+            raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        write_whole(path, interrupted)
+        interrupted()
     assert path.read_text() == "whole"
     assert list(tmp_path.iterdir()) == [path]
 

@@ -9,7 +9,8 @@ import pytest
 
 from gym_deltaco.layout import AMBIGUITIES, sample_layout, twin_word
 from gym_deltaco.object_sets import OBJECT_SETS
-from gym_deltaco.tasks import OBJECTS, TASKS
+from gym_deltaco.tasks import CONTAINER_COLORS, CONTAINER_WORDS, OBJECTS, TASKS
+from gym_deltaco.workspace import QUADRANTS, container_matches
 
 SEEDS_PER_TASK = 3
 SIDES = ["front", "back", "left", "right"]
@@ -356,3 +357,11 @@ def test_a_layout_is_a_function_of_the_generator(ambiguity):
         draw(task_id + 1, ambiguity, 1)
         assert numbers(draw(task_id, ambiguity, 0)) == first
         assert numbers(draw(task_id, ambiguity, 1)) != first
+
+
+@pytest.mark.parametrize("quadrant", QUADRANTS, ids=str)
+def test_a_container_matches_its_color_and_the_words_for_its_place(quadrant):
+    place = {("right", "left")[quadrant.i], ("back", "front")[quadrant.j]}
+    for color in CONTAINER_COLORS:
+        matching = {word for word in CONTAINER_WORDS if container_matches(word, color, quadrant)}
+        assert matching == {color} | place

@@ -326,7 +326,7 @@ def test_a_novel_task_is_served_by_its_demonstration(make, dataset, shown):
 def test_a_task_without_a_demonstration_is_named(make, dataset, shown):
     policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(shown.root))
     policy.eval()
-    with pytest.raises(ValueError, match="no demonstration of the task 'sing'.*4 tasks.*demo_episode"):
+    with pytest.raises(ValueError, match="no demonstration of the task 'sing'.*of 4 tasks.*demo_episode"):
         policy.select_action(before(observation(dataset, ["sing"])))
 
 
@@ -369,7 +369,7 @@ def test_what_acts_is_what_was_trained_last(make, dataset, options):
         policy.begin_evaluation()
         policy.reset()
         acted.append(policy.select_action(seen))
-        conditioning = policy._conditioning[threading.get_ident()]
+        conditioning = policy._episode_tasks._conditioning[threading.get_ident()]
         concatenated = policy._concatenated(seen, conditioning.concat)
         motion, gripper = policy.model(policy._images(seen), conditioning.film, concatenated)
         expected = policy._join_action(motion.mean, gripper.sigmoid())
@@ -477,5 +477,5 @@ def test_a_one_hot_policy_remembers_its_vocabulary(make, dataset, tmp_path):
     policy.save_pretrained(tmp_path)
     loaded = DeltacoPolicy.from_pretrained(tmp_path)
     assert loaded.config.one_hot_tasks == sorted(TASKS, key=TASKS.index)
-    with pytest.raises(ValueError, match="'juggle' is not among the 3"):
+    with pytest.raises(ValueError, match="does not know the task 'juggle'. It knows the 3 tasks"):
         loaded.select_action(before(observation(dataset, ["juggle"])))

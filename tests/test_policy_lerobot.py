@@ -131,6 +131,16 @@ def test_a_policy_and_its_configuration_survive_saving(make, tmp_path, options):
     assert PreTrainedConfig.from_pretrained(tmp_path) == policy.config
 
 
+@pytest.mark.parametrize(
+    "with_state_dict", [True, False], ids=["as LeRobot 0.6.1 does", "as later versions do"]
+)
+def test_a_policy_is_saved_by_either_signature(make, tmp_path, with_state_dict):
+    policy, _, _ = make(method="language_only")
+    arguments = {"state_dict": None} if with_state_dict else {}
+    policy._save_pretrained(tmp_path, **arguments)
+    assert_equal_weights(policy, DeltacoPolicy.from_pretrained(tmp_path))
+
+
 def test_weights_with_names_of_an_earlier_version_say_what_to_do(make, tmp_path):
     policy, _, _ = make(method="language_only")
     policy.save_pretrained(tmp_path)

@@ -14,7 +14,6 @@ from PIL import Image
 
 from gym_deltaco import ENV_ID
 from gym_deltaco.tasks import CONTAINER_WORDS, TASKS
-from gym_deltaco.workspace import QUADRANTS
 from lerobot_deltaco.commands import report as report_command
 from lerobot_deltaco.evaluation.record import (
     EpisodeResult,
@@ -31,7 +30,6 @@ from lerobot_deltaco.reporting.statistics import (
     breakdown,
     followed,
     paper_rate,
-    position_satisfies,
     unknown_sentences,
     wilson_interval,
 )
@@ -195,12 +193,6 @@ def test_the_breakdown_counts_each_kind_and_word():
     assert found["name", "color_word"]["right_object"].count == 2
     assert found["color", "color_word"]["success"].rate is None
     assert found["color", "color_word"]["success"].interval is None
-
-
-def test_position_words_mean_what_they_mean_in_the_scene():
-    for quadrant in QUADRANTS:
-        for word in CONTAINER_WORDS:
-            assert position_satisfies(quadrant, word) == quadrant.satisfies(word)
 
 
 # What behavior followed. Green stands in front on the right, red at the back on the left.

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from gym_deltaco import CONTROL_FPS, MIN_IMAGE_SIZE
 from gym_deltaco import kinematics as kin
 from gym_deltaco.instructions import check_tasks
 from gym_deltaco.layout import ADVERSARIAL_PROBABILITY, AMBIGUITIES, Ambiguity, sample_layout
@@ -19,8 +20,6 @@ from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import Task, get_task
 
 ACTION_SCALE = 0.1  # m of the end effector's motion for an action of 1
-CONTROL_FPS = 24  # nominal: 10 physics steps of 1/240 s
-MIN_IMAGE_SIZE = 8  # px
 
 # Of `agent_pos`: joints are given within half a turn of the rest position; 0.001 is for rounding.
 _STATE_LOW = np.array([*(kin.REST_JOINTS - np.pi), *(kin.SHOULDER - kin.REACH), 0.0]) - 1e-3

@@ -1,4 +1,4 @@
-"""The scripted expert: picks the target object and places it in the target container (paper, algorithm 2)."""
+"""The scripted expert: picks the target object and places it in the target container (paper, algorithm 3)."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco import EPISODE_STEPS
+from gym_deltaco import EPISODE_STEPS, EXPERT_NOISE
 from gym_deltaco.arm import FINGERTIP_OFFSET
 from gym_deltaco.env import ACTION_SCALE, Observation, PickPlaceEnv
 from gym_deltaco.workspace import CONTAINER_FLOOR, CONTAINER_HALF_EXTENTS, TRAY_FLOOR
 
-NOISE = 0.1  # standard deviation of the noise on each of an action's three motions
 OPEN, CLOSED = 1.0, -1.0
 
 # Heights and errors in m. The gripper's height is that of the end effector; the fingertips are 0.05 m below.
@@ -58,7 +57,7 @@ class Step(NamedTuple):
     stage: Stage
 
 
-def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = NOISE) -> Iterator[Step]:
+def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EXPERT_NOISE) -> Iterator[Step]:
     """Runs an episode of the expert, step by step.
 
     Args:
@@ -98,7 +97,7 @@ class Expert:
         self,
         env: PickPlaceEnv,
         rng: np.random.Generator,
-        noise: float = NOISE,
+        noise: float = EXPERT_NOISE,
         target_object: int | None = None,
         target_container: int | None = None,
     ) -> None:

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from gym_deltaco import EPISODE_STEPS
-from gym_deltaco.env import CONTROL_FPS, PickPlaceEnv
+from gym_deltaco import CONTROL_FPS, EPISODE_STEPS
+from gym_deltaco.atomic_files import write_text
+from gym_deltaco.camera import Camera
+from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.fixtures import TABLE_BOXES, TRAY_BOXES, table_mesh, tray_mesh
 from gym_deltaco.layout import Ambiguity, Layout, twin_word
@@ -35,9 +37,8 @@ from gym_deltaco.sheets import (
     save_gif,
     save_png,
     to_image,
-    write_whole,
 )
-from gym_deltaco.simulation import Camera, Simulation
+from gym_deltaco.simulation import Simulation, camera_matrices
 from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, Task, get_task
 from gym_deltaco.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 
@@ -123,7 +124,7 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int]) -> None:
             *draw_episodes(out, seed, filmed, progress.update),
             draw_ambiguity(out, seed, progress.update),
         ]
-    write_whole(out / "index.md", lambda file: file.write_text(page(figures)))
+    write_text(out / "index.md", page(figures))
 
 
 def page(figures: Iterable[Figure]) -> str:
@@ -209,7 +210,7 @@ def _shelves(groups: Iterable[tuple[int, Image.Image]]) -> list[list[Image.Image
 
 def _pixel_of(point: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Where the benchmark's camera sees a point of the world, (3,), m: (x, y) in an image of `size` px."""
-    view, projection = (np.reshape(matrix, (4, 4)).T for matrix in CAMERA.matrices)
+    view, projection = (np.reshape(matrix, (4, 4)).T for matrix in camera_matrices(CAMERA))
     x, y, _, w = projection @ view @ [*point, 1.0]
     return np.array([1 + x / w, 1 - y / w]) * size / 2
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, ContainerColor, ContainerWord, ObjectLabel, Task
-from gym_deltaco.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant
+from gym_deltaco.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
 
 Ambiguity = Literal["container", "object"]
 AMBIGUITIES: tuple[str, ...] = get_args(Ambiguity)
@@ -45,7 +45,7 @@ class PlacedContainer(NamedTuple):
 
     def satisfies(self, word: ContainerWord) -> bool:
         """Whether a word of an instruction describes it."""
-        return word == self.color or self.quadrant.satisfies(word)
+        return container_matches(word, self.color, self.quadrant)
 
 
 class Layout(NamedTuple):

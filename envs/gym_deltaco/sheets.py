@@ -1,9 +1,8 @@
-"""Contact sheets: images with captions, put together into larger ones, and written to files in one go."""
+"""Contact sheets: images with captions, put together into larger ones."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -11,6 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+
+from gym_deltaco.atomic_files import atomic_write
 
 GAP = 8  # px, between the things of a sheet
 PAPER, INK, ACCENT = (250, 250, 248), (30, 30, 34), (196, 84, 0)
@@ -105,7 +106,8 @@ def circled(image: Image.Image, center: NDArray[np.float64], radius: float) -> I
 
 def save_png(image: Image.Image, path: Path) -> None:
     """Writes an image with all of its colors: by a palette, small objects would change theirs."""
-    write_whole(path, lambda file: image.save(file, format="PNG", optimize=True))
+    with atomic_write(path) as temporary:
+        image.save(temporary, format="PNG", optimize=True)
 
 
 def save_gif(frames: Sequence[Image.Image], durations: Sequence[int], path: Path) -> None:
@@ -119,22 +121,10 @@ def save_gif(frames: Sequence[Image.Image], durations: Sequence[int], path: Path
     # One palette for all frames, so that only what moves is stored again.
     palette = down(frames, gap=0).quantize(_PALETTE_SIZE, Image.Quantize.MEDIANCUT)
     first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    write_whole(
-        path,
-        lambda file: first.save(
-            file, format="GIF", save_all=True, append_images=others, duration=list(durations), loop=0
-        ),
-    )
-
-
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Writes a file under another name and renames it, so that `path` is either as it was or complete."""
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_write(path) as temporary:
+        first.save(
+            temporary, format="GIF", save_all=True, append_images=others, duration=list(durations), loop=0
+        )
 
 
 @cache

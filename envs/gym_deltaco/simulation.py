@@ -1,4 +1,4 @@
-"""A PyBullet client behind a small interface: the only module that imports pybullet.
+"""A PyBullet client behind a small interface: the only module that uses PyBullet.
 
 Bodies are made from arrays, never from asset files: images from triangle meshes with a color for each face,
 contacts from boxes and convex hulls. A scene is built anew for every episode, because a rebuilt world repeats
@@ -19,10 +19,11 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 import numpy as np
-import pybullet
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from gym_deltaco.camera import Camera
+from gym_deltaco.quiet_pybullet import pybullet
 from gym_deltaco.solids import Mesh
 
 TIME_STEP = 1 / 240  # s
@@ -64,40 +65,6 @@ class Pose(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A pinhole camera that looks at a point; the image is square.
-
-    Attributes:
-        target: The point in the middle of the image, m.
-        distance: From the target, m.
-        yaw: About the vertical, degrees; 0 looks along +y.
-        pitch: Degrees; negative looks down.
-        fov: Vertical field of view, degrees.
-        near: Distance of the near plane, m.
-        far: Distance of the far plane, m.
-    """
-
-    target: tuple[float, float, float]
-    distance: float
-    yaw: float
-    pitch: float
-    fov: float = 60.0
-    near: float = 0.1
-    far: float = 2.0
-
-    @functools.cached_property
-    def matrices(self) -> tuple[Sequence[float], Sequence[float]]:
-        """View and projection, 16 numbers each, as PyBullet takes them."""
-        view = pybullet.computeViewMatrixFromYawPitchRoll(
-            self.target, self.distance, self.yaw, self.pitch, roll=0, upAxisIndex=2
-        )
-        projection = pybullet.computeProjectionMatrixFOV(
-            self.fov, aspect=1, nearVal=self.near, farVal=self.far
-        )
-        return view, projection
-
-
-@dataclass(frozen=True)
 class Link:
     """A link of an articulated body, moved by one joint at its origin.
 
@@ -126,6 +93,18 @@ class Link:
     is_rolled: bool = False
     boxes: tuple[Box, ...] = ()
     limits: tuple[float, float] | None = None
+
+
+@functools.cache
+def camera_matrices(camera: Camera) -> tuple[Sequence[float], Sequence[float]]:
+    """View and projection matrices of a camera, 16 numbers each, in the form that PyBullet takes."""
+    view = pybullet.computeViewMatrixFromYawPitchRoll(
+        camera.target, camera.distance, camera.yaw, camera.pitch, roll=0, upAxisIndex=2
+    )
+    projection = pybullet.computeProjectionMatrixFOV(
+        camera.fov, aspect=1, nearVal=camera.near, farVal=camera.far
+    )
+    return view, projection
 
 
 class Simulation:
@@ -399,7 +378,7 @@ class Simulation:
 
     def render(self, camera: Camera, size: int) -> NDArray[np.uint8]:
         """An image, (size, size, 3), by PyBullet's software renderer (the same on every machine)."""
-        view, projection = camera.matrices
+        view, projection = camera_matrices(camera)
         pixels = pybullet.getCameraImage(
             size,
             size,

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.simulation import Camera
-from gym_deltaco.tasks import ContainerWord
+from gym_deltaco.camera import Camera
+from gym_deltaco.tasks import ContainerColor, ContainerWord
 
 TABLE_TOP = -0.375  # m
 TRAY_FLOOR = -0.37  # m
@@ -66,6 +66,11 @@ class Quadrant(NamedTuple):
     def satisfies(self, word: ContainerWord) -> bool:
         """Whether it lies where a position word says; False for a color."""
         return word in (("right", "left")[self.i], ("back", "front")[self.j])
+
+
+def container_matches(word: ContainerWord, color: ContainerColor, quadrant: Quadrant) -> bool:
+    """Whether a word of an instruction, a color or a position, describes a container."""
+    return word == color or quadrant.satisfies(word)
 
 
 QUADRANTS = tuple(Quadrant(i, j) for i in (0, 1) for j in (0, 1))

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gym_deltaco import EPISODE_STEPS
+from gym_deltaco.atomic_files import write_text
 from gym_deltaco.env import ACTION_SCALE, PickPlaceEnv
 from gym_deltaco.sheets import (
     caption,
@@ -30,7 +31,6 @@ from gym_deltaco.sheets import (
     save_gif,
     save_png,
     to_image,
-    write_whole,
 )
 from gym_deltaco.tasks import SCENARIOS, TASKS, Task
 from lerobot_deltaco.cards.templates import env_options, render
@@ -108,7 +108,7 @@ def write_card(root: Path, folder: Path | None = None, repo_id: str | None = Non
         save_png(_tasks_image(episodes, env), folder / TASKS_IMAGE)
         _save_episode(episodes[0], env, folder / EPISODE_IMAGE)
     text = card_text(root, repo_id)
-    write_whole(folder / CARD_FILE, lambda file: file.write_text(text, encoding="utf-8"))
+    write_text(folder / CARD_FILE, text)
 
 
 def has_current_card(root: Path) -> bool:

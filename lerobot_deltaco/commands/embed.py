@@ -6,12 +6,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from safetensors.torch import save_file
-
+from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.policy.language import InstructionTable, LanguageEncoderError
 from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.task_file import write_task_file
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -28,11 +28,8 @@ def main(arguments: list[str] | None = None) -> None:
     table = InstructionTable(options.language_encoder)
     try:
         table.add(instructions)
-        tensors, known = table.state()
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = options.out.with_name(f"{options.out.name}.unfinished")
-        save_file(tensors, unfinished, metadata=known)
-        unfinished.replace(options.out)
+        with atomic_write(options.out) as temporary:
+            write_task_file(temporary, table)
     except (LanguageEncoderError, OSError) as error:
         parser.exit(1, f"{parser.prog}: {error}\n")
     sys.stdout.write(

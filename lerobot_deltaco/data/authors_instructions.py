@@ -5,11 +5,11 @@ Their license is not stated, so they are not shipped: each user downloads them.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import httpx
 
+from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.instructions import InstructionsError, check_authors, parse_instructions
 
 AUTHORS_URL = "https://deltaco-robot.github.io/files/all_human_data.csv"
@@ -37,10 +37,8 @@ def fetch_instructions(path: Path, url: str = AUTHORS_URL) -> int:
     except UnicodeDecodeError as error:
         raise InstructionsError(f"{url} is no text in UTF-8: {error}.") from error
     check_authors(rows, url)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.unfinished")
-    unfinished.write_bytes(content)
-    os.replace(unfinished, path)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
     return len(rows)
 
 

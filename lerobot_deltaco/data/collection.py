@@ -35,6 +35,7 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from gym_deltaco import ENV_ID
+from gym_deltaco.atomic_files import json_text, write_json
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.tasks import TASKS
 from lerobot_deltaco.data import dataset_files as files
@@ -332,7 +333,7 @@ def _identity(plan: CollectionPlan, append: bool) -> dict[str, Any]:
 
 def _mark_unfinished(root: Path, plan: CollectionPlan) -> None:
     info = files.dataset_info(plan.features, FPS, ROBOT_TYPE, 0, 0, 0)
-    files.write_json(root / files.INFO_FILE, {**info, "codebase_version": UNFINISHED})
+    write_json(root / files.INFO_FILE, {**info, "codebase_version": UNFINISHED})
 
 
 @contextmanager
@@ -600,19 +601,19 @@ def _commit(root: Path) -> None:
     remedy = f"Put it back from a copy, or delete {root}, and collect again."
     contents = read_checked_json(staging / "commit.json", remedy)
     info, digests = contents["info"], contents["sha256"]
-    files.write_json(root / files.INFO_FILE, {**info, "codebase_version": UNFINISHED})
+    write_json(root / files.INFO_FILE, {**info, "codebase_version": UNFINISHED})
     for path in sorted((staging / JOINED).rglob("*.parquet")):
         target = root / path.relative_to(staging / JOINED)
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(path, target)
     files.write_tasks(root / files.TASKS_FILE, contents["tasks"])
-    files.write_json(root / files.STATS_FILE, contents["stats"])
-    files.write_json(root / HISTORY_FILE, contents["history"])
+    write_json(root / files.STATS_FILE, contents["stats"])
+    write_json(root / HISTORY_FILE, contents["history"])
     metadata = (files.TASKS_FILE, files.STATS_FILE, HISTORY_FILE)
     digests |= {str(file): file_digest(root / file) for file in metadata}
-    digests[str(files.INFO_FILE)] = hashlib.sha256(files.json_text(info).encode()).hexdigest()
+    digests[str(files.INFO_FILE)] = hashlib.sha256(json_text(info).encode()).hexdigest()
     write_digests(root, digests)
-    files.write_json(root / files.INFO_FILE, info)
+    write_json(root / files.INFO_FILE, info)
     os.replace(staging, root / FINISHED_STAGING)
     shutil.rmtree(root / FINISHED_STAGING)
 

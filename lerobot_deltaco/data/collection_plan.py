@@ -6,19 +6,20 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco import ENV_ID, EPISODE_STEPS
-from gym_deltaco.env import CONTROL_FPS, MIN_IMAGE_SIZE, PickPlaceEnv
-from gym_deltaco.expert import NOISE, expert_episode
+from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS, EXPERT_NOISE, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
 from gym_deltaco.seeding import Split, episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, select_tasks
 from lerobot_deltaco.data.dataset_files import DEFAULT_FEATURES
 from lerobot_deltaco.data.feature_names import ACTION_NAMES, PRIVILEGED, STATE_NAMES
+
+if TYPE_CHECKING:
+    from gym_deltaco.env import PickPlaceEnv
 
 FPS = CONTROL_FPS
 ROBOT_TYPE = "widowx_250"
@@ -70,7 +71,7 @@ class CollectionPlan:
     seed: int = 0
     split: Split | None = None
     ambiguity: Ambiguity = "container"
-    noise: float = NOISE
+    noise: float = EXPERT_NOISE
     image_size: int = 48
 
     def __post_init__(self) -> None:
@@ -163,6 +164,9 @@ def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, numbe
     Raises:
         CollectionError: It never succeeded.
     """
+    # Only here: a plan needs no simulator.
+    from gym_deltaco.expert import expert_episode
+
     for attempt in range(MAX_ATTEMPTS):
         seed = episode_seed(plan.seed, plan.split, task_id, number, attempt)
         steps = list(expert_episode(env, task_id, seed, plan.noise))

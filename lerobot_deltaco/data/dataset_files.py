@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from PIL import Image
 
+from gym_deltaco.atomic_files import atomic_write
 from lerobot_deltaco.data.dataset_statistics import STATISTICS, Statistics, feature_statistics
 
 CODEBASE_VERSION = "v3.0"
@@ -124,7 +124,7 @@ def episode_statistics(columns: Mapping[str, NDArray]) -> dict[str, Statistics]:
 
 def write_data_file(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
     """Writes episodes, one row group each, so that a reader may fetch a single one."""
-    with new_file(path) as temporary, pq.ParquetWriter(temporary, schema, compression="snappy") as writer:
+    with atomic_write(path) as temporary, pq.ParquetWriter(temporary, schema, compression="snappy") as writer:
         for table in tables:
             writer.write_table(table)
 
@@ -169,14 +169,14 @@ def write_episodes_file(
             columns[f"stats/{feature}/{name}"] = [item[feature][name].tolist() for item in statistics]
     columns["meta/episodes/chunk_index"] = np.full(n_episodes, chunk_index)
     columns["meta/episodes/file_index"] = np.full(n_episodes, file_index)
-    with new_file(path) as temporary:
+    with atomic_write(path) as temporary:
         pq.write_table(pa.table(columns), temporary, compression="snappy")
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     """Writes the table of tasks; their order is their index."""
     frame = pd.DataFrame({"task_index": np.arange(len(tasks))}, index=pd.Index(tasks, name="task"))
-    with new_file(path) as temporary:
+    with atomic_write(path) as temporary:
         frame.to_parquet(temporary)
 
 
@@ -218,36 +218,3 @@ def statistics_from_json(contents: Mapping[str, Mapping[str, Any]]) -> dict[str,
     return {
         feature: {name: np.array(value) for name, value in of.items()} for feature, of in contents.items()
     }
-
-
-def write_json(path: Path, contents: Any) -> None:
-    """Writes a JSON file."""
-    with new_file(path) as temporary:
-        temporary.write_text(json_text(contents))
-
-
-def json_text(contents: Any) -> str:
-    """The text of a JSON file, as `write_json` writes it."""
-    return json.dumps(contents, indent=4) + "\n"
-
-
-class new_file:  # noqa: N801  (used like a function)
-    """A temporary name, which becomes the file's when the block ends well: no file is ever half-written.
-
-    The name is always the same, so that what a killed process leaves is overwritten when the file is written
-    again.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._temporary = path.with_name(f".{path.name}.part")
-
-    def __enter__(self) -> Path:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        return self._temporary
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None:
-            os.replace(self._temporary, self._path)
-        else:
-            self._temporary.unlink(missing_ok=True)

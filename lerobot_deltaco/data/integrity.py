@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_deltaco.data.dataset_files import new_file
+from gym_deltaco.atomic_files import atomic_write
 
 DIGESTS_FILE = Path("meta/SHA256SUMS")
 _DIGEST_BYTES = hashlib.sha256().digest_size
@@ -45,7 +45,7 @@ def file_digest(path: Path) -> str:
 
 def write_checked(path: Path, contents: bytes) -> None:
     """Writes contents, followed by their SHA-256."""
-    with new_file(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(contents)
         file.write(hashlib.sha256(contents).digest())
 
@@ -73,7 +73,7 @@ def read_checked(path: Path, remedy: str) -> bytes:
 def write_checked_json(path: Path, contents: Any) -> None:
     """Writes a JSON file that carries the SHA-256 of its contents."""
     text = json.dumps(contents)
-    with new_file(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({"sha256": _text_digest(text), "contents": text}) + "\n")
 
 
@@ -112,7 +112,7 @@ def write_digests(root: Path, digests: Mapping[str, str]) -> None:
         root: The dataset's folder.
         digests: For each file, its path in the folder and its SHA-256 in hexadecimal digits.
     """
-    with new_file(root / DIGESTS_FILE) as temporary:
+    with atomic_write(root / DIGESTS_FILE) as temporary:
         temporary.write_text("".join(f"{digests[name]}  {name}\n" for name in sorted(digests)))
 
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gym_deltaco.atomic_files import write_json
 from lerobot_deltaco.demo import recipe
 from lerobot_deltaco.demo.machine import fast_dtype, seconds_per_step
 
@@ -70,10 +71,7 @@ class Demo:
         self._write_settings()
 
     def _write_settings(self) -> None:
-        file = self.folder / "settings.json"
-        unfinished = file.with_suffix(".unfinished")
-        unfinished.write_text(json.dumps(self.settings, indent=2) + "\n")
-        unfinished.replace(file)
+        write_json(self.folder / "settings.json", self.settings)
 
     @property
     def run(self) -> Path:
@@ -215,10 +213,7 @@ class Demo:
     def _note(self, name: str, seconds: float) -> None:
         everything = self.seconds()
         everything[name] = everything.get(name, 0.0) + seconds
-        file = self.folder / _DONE
-        unfinished = file.with_suffix(".unfinished")
-        unfinished.write_text(json.dumps(everything, indent=2) + "\n")
-        unfinished.replace(file)
+        write_json(self.folder / _DONE, everything)
 
     @staticmethod
     def _deltaco(command: str, *arguments: Any) -> list[Any]:

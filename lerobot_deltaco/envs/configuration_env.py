@@ -11,8 +11,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-from gym_deltaco import ENV_ID, EPISODE_STEPS
-from gym_deltaco.env import CONTROL_FPS, MIN_IMAGE_SIZE
+from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.tasks import TASKS, select_tasks
 from lerobot_deltaco.envs.vector_env import make_task_vector_envs

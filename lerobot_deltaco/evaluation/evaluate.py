@@ -17,7 +17,7 @@ from gym_deltaco import ENV_ID
 from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, Task, get_task, select_tasks
-from gym_deltaco.workspace import Quadrant
+from gym_deltaco.workspace import Quadrant, container_matches
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.envs.vector_env import make_task_vector_envs
 from lerobot_deltaco.evaluation.record import BENCHMARK, COUNTERFACTUALS, Counterfactual, EpisodeResult
@@ -181,7 +181,7 @@ def counterfactual_task(others: Sequence[Task], info: dict[str, Any], rng: rando
         containers = [
             n
             for n, color in enumerate(CONTAINER_COLORS)
-            if task.container == color or Quadrant(*info["container_quadrants"][n]).satisfies(task.container)
+            if container_matches(task.container, color, Quadrant(*info["container_quadrants"][n]))
         ]
         is_other_container = containers == [1 - info["target_container"]]
         is_other_object = len(objects) == 1 and objects != [info["target_object"]]

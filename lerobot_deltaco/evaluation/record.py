@@ -7,13 +7,13 @@ file in the folder `evaluations` of the training run.
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from gym_deltaco.atomic_files import write_json
 from gym_deltaco.tasks import N_TASKS, OBJECTS
 
 RECORD_FORMAT = 1
@@ -118,11 +118,7 @@ def record_path(run_folder: Path, step: int, counterfactual: Counterfactual = "n
 
 def write_record(record: EvaluationRecord, path: Path) -> None:
     """Writes a record, wholly or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".unfinished")
-    text = json.dumps({"format": RECORD_FORMAT, **asdict(record)}, indent=1, ensure_ascii=False)
-    unfinished.write_text(text + "\n", encoding="utf-8")
-    os.replace(unfinished, path)
+    write_json(path, {"format": RECORD_FORMAT, **asdict(record)}, indent=1)
 
 
 def read_record(path: Path) -> EvaluationRecord:

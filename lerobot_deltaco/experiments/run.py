@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from gym_deltaco.atomic_files import write_json
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
 from lerobot_deltaco.experiments.config import ExperimentConfig
 
@@ -80,11 +81,7 @@ class ExperimentRun:
         }
 
     def _keep_settings(self) -> None:
-        file = self._settings_file()
-        file.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = file.with_suffix(".unfinished")
-        unfinished.write_text(json.dumps(self._settings(), indent=2) + "\n")
-        unfinished.replace(file)
+        write_json(self._settings_file(), self._settings())
 
     def _train(self, commands: CommandRunner) -> None:
         """Trains, from the last checkpoint if there is one."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from gym_deltaco.atomic_files import atomic_write
 from lerobot_deltaco.reporting.curves import Curve, draw_curves
 from lerobot_deltaco.reporting.paper_results import CHANCE, NOTE, PAPER_RESULTS, TITLES, label_of
 from lerobot_deltaco.reporting.series import Report, Series, counted, find_records, make_report
@@ -381,15 +382,8 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def _write_files(out: Path, contents: Mapping[str, bytes]) -> None:
     """Puts all files in place once all of them are written; removes those of an earlier report."""
-    out.mkdir(parents=True, exist_ok=True)
-    unfinished = {name: out / f".{name}.unfinished" for name in contents}
-    try:
+    with ExitStack() as stack:
         for name, content in contents.items():
-            unfinished[name].write_bytes(content)
-        for name, path in unfinished.items():
-            os.replace(path, out / name)
-    finally:
-        for path in unfinished.values():
-            path.unlink(missing_ok=True)
+            stack.enter_context(atomic_write(out / name)).write_bytes(content)
     for name in set(FILES) - set(contents):
         (out / name).unlink(missing_ok=True)

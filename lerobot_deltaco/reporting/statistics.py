@@ -15,7 +15,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, ContainerWord, Task, get_task
+from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, Task, get_task
+from gym_deltaco.workspace import Quadrant, container_matches
 from lerobot_deltaco.evaluation.record import Counterfactual, EpisodeResult
 
 N_BEST_SETS = 10  # the paper's
@@ -253,8 +254,7 @@ def _asked_for(
             numbers = [
                 number
                 for number, color in enumerate(CONTAINER_COLORS)
-                if task.container == color
-                or position_satisfies(episode.container_quadrants[number], task.container)
+                if container_matches(task.container, color, Quadrant(*episode.container_quadrants[number]))
             ]
         elif task.index == episode.task_id and cue != "instruction":
             # In ambiguity scheme (ii), the instruction describes the target's twin as well.
@@ -264,15 +264,6 @@ def _asked_for(
         n_options = len(episode.objects) if aspect == "object" else len(episode.container_quadrants)
         asked[cue] = frozenset(numbers) if len(numbers) < n_options else frozenset()
     return asked
-
-
-def position_satisfies(quadrant: Sequence[int], word: ContainerWord) -> bool:
-    """Whether a quadrant (i, j) lies where a position word says.
-
-    The same as `gym_deltaco.workspace.Quadrant.satisfies`, which cannot be had without the simulator.
-    """
-    i, j = quadrant
-    return word in (("right", "left")[i], ("back", "front")[j])
 
 
 def _chosen_object(episode: EpisodeResult) -> int | None:

@@ -1,9 +1,8 @@
 """LeRobot's own training loop, over frames in memory.
 
-LeRobot has no hook for the dataset, the sampler and the evaluation. So while a training runs, some names in
-the module of its loop stand for others: the function that makes the datasets, the sampler, the iterator over
-batches, the function that makes the policy, and, on the benchmark, the evaluation. All else, from the
-arguments to the checkpoints, is LeRobot's.
+While a training runs, some functions that LeRobot's loop calls are replaced: those that make the datasets,
+the sampler, the batches and the policy, and, on the benchmark, the evaluation. All else, from the arguments
+to the checkpoints, is LeRobot's.
 """
 
 from __future__ import annotations
@@ -16,20 +15,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
+from lerobot.datasets import LeRobotDataset
 from lerobot.policies import PreTrainedPolicy
-from lerobot.scripts import lerobot_train
 from torch import Tensor
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
 from lerobot_deltaco.evaluation.sets import run_set
+from lerobot_deltaco.lerobot_internals import (
+    replaced_in_training_loop,
+    run_training_loop,
+    step_of_videos,
+    training_loop,
+)
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.training.frames import FramesInMemory
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
@@ -59,24 +62,26 @@ class InMemoryTraining:
     def __init__(self) -> None:
         self._config: TrainPipelineConfig | None = None
         self._frames: FramesInMemory | None = None
-        self._make_datasets = lerobot_train.make_train_eval_datasets
-        self._make_policy = lerobot_train.make_policy
-        self._cycle = lerobot_train.cycle
-        self._make_envs = lerobot_train._make_eval_envs
-        self._evaluate = lerobot_train.eval_policy_all
+        loop = training_loop()
+        self._make_datasets = loop.make_train_eval_datasets
+        self._make_policy = loop.make_policy
+        self._make_sampler = loop.EpisodeAwareSampler
+        self._cycle = loop.cycle
+        self._make_envs = loop._make_eval_envs
+        self._evaluate = loop.eval_policy_all
 
     @contextmanager
     def active(self) -> Iterator[None]:
         """Lets LeRobot's loop run over frames in memory."""
-        with patch.multiple(
-            lerobot_train,
-            make_train_eval_datasets=self.make_datasets,
-            make_policy=self.make_policy,
-            EpisodeAwareSampler=self.make_sampler,
-            cycle=self.batches,
-            _make_eval_envs=self.make_envs,
-            eval_policy_all=self.evaluate,
-        ):
+        functions = {
+            "make_train_eval_datasets": self.make_datasets,
+            "make_policy": self.make_policy,
+            "EpisodeAwareSampler": self.make_sampler,
+            "cycle": self.batches,
+            "_make_eval_envs": self.make_envs,
+            "eval_policy_all": self.evaluate,
+        }
+        with replaced_in_training_loop(functions):
             yield
 
     def make_datasets(self, config: TrainPipelineConfig) -> tuple[FrameIndexDataset, LeRobotDataset | None]:
@@ -119,7 +124,7 @@ class InMemoryTraining:
 
     def make_sampler(self, from_indices: Any, to_indices: Any, **options: Any) -> Any:
         """Batches of tasks if they are wanted, else LeRobot's sampler."""
-        stock = EpisodeAwareSampler(from_indices, to_indices, **options)
+        stock = self._make_sampler(from_indices, to_indices, **options)
         assert self._config is not None
         assert self._frames is not None
         config: DeltacoConfig = self._config.policy
@@ -169,8 +174,7 @@ class InMemoryTraining:
         assert config is not None
         if not self._records(config):
             return self._evaluate(**arguments)
-        # Only the folder for videos tells the step.
-        step = int(arguments["videos_dir"].name.rsplit("_", 1)[1])
+        step = step_of_videos(arguments["videos_dir"])
         policy: DeltacoPolicy = arguments["policy"]
         policy.eval()
         record = run_set(
@@ -207,4 +211,4 @@ class InMemoryTraining:
 def train() -> None:
     """Trains as the command line says: `lerobot-train`, over frames in memory."""
     with InMemoryTraining().active():
-        lerobot_train.main()
+        run_training_loop()

@@ -1,0 +1,40 @@
+"""PyBullet, imported without the line that it prints ("pybullet build time: ...").
+
+The environment needs it; tasks, layouts, datasets and policies do not. It is the extra `sim`, because many
+systems have to compile it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from gym_deltaco.errors import SimulatorMissingError
+
+
+@contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """Discards what compiled code prints to the standard error."""
+    sys.stderr.flush()
+    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)
+
+
+try:
+    with _silent_stderr():
+        import pybullet
+except ImportError as error:
+    raise SimulatorMissingError(
+        "The environment needs PyBullet, which is not installed. Install it with "
+        '`pip install "lerobot_policy_deltaco[sim]"`; it needs a C++ compiler where there is no wheel.'
+    ) from error
+
+__all__ = ["pybullet"]

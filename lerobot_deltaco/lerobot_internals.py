@@ -1,0 +1,153 @@
+"""Everything that relies on LeRobot's internals, which another version of LeRobot may have changed.
+
+- LeRobot's training loop has no hook for datasets, samplers and evaluation. `deltaco-train` therefore
+  replaces some of the functions that the loop calls, while it runs.
+- Neither the policy nor its card is told which episodes of a dataset are trained on; that is read from the
+  command line or the configuration file, as LeRobot reads it.
+- A processor step keeps the transition that it processes in an attribute, which several threads overwrite.
+
+What is replaced is checked first: with an unsupported version of LeRobot, an error names those that are
+supported.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+if TYPE_CHECKING:
+    from lerobot.processor import ProcessorStep
+
+SUPPORTED_LEROBOT = ">=0.6.1,<0.6.2"
+
+# Functions and classes that the training loop of a supported LeRobot looks up by these names.
+LOOP_FUNCTIONS = (
+    "make_train_eval_datasets",
+    "make_policy",
+    "EpisodeAwareSampler",
+    "cycle",
+    "_make_eval_envs",
+    "eval_policy_all",
+)
+
+
+class UnsupportedLeRobotError(RuntimeError):
+    """This version of LeRobot lacks something that is relied on; the message says which versions have it."""
+
+
+# The training loop
+
+
+def training_loop() -> ModuleType:
+    """The module of LeRobot's training loop.
+
+    Raises:
+        UnsupportedLeRobotError: The loop does not call the functions that are to be replaced.
+    """
+    from lerobot.scripts import lerobot_train
+
+    called = _names_in(inspect.unwrap(lerobot_train.train).__code__)
+    missing = [name for name in LOOP_FUNCTIONS if name not in called or not hasattr(lerobot_train, name)]
+    if missing:
+        raise UnsupportedLeRobotError(
+            f"`deltaco-train` supports lerobot{SUPPORTED_LEROBOT}. The training loop of the installed "
+            f"version {version('lerobot')} does not call {', '.join(missing)}. Install a supported version, "
+            "or train with `lerobot-train`, which takes the same arguments."
+        )
+    return lerobot_train
+
+
+@contextmanager
+def replaced_in_training_loop(functions: Mapping[str, Callable[..., Any]]) -> Iterator[None]:
+    """Lets LeRobot's training loop call other functions while the context is open.
+
+    Args:
+        functions: Replacements, by their names in `LOOP_FUNCTIONS`.
+
+    Raises:
+        UnsupportedLeRobotError: The loop does not call the functions that are to be replaced.
+    """
+    with patch.multiple(training_loop(), **functions):
+        yield
+
+
+def run_training_loop() -> None:
+    """Trains with the arguments of the command line."""
+    training_loop().main()
+
+
+def step_of_videos(videos_dir: Path) -> int:
+    """The training step of an evaluation in the loop, which only the name of the folder for its videos has.
+
+    Raises:
+        UnsupportedLeRobotError: The folder is named otherwise.
+    """
+    step = videos_dir.name.rpartition("_")[2]
+    if not step.isdecimal():
+        raise UnsupportedLeRobotError(
+            f"`deltaco-train` supports lerobot{SUPPORTED_LEROBOT}, which evaluates into folders named "
+            f"videos_step_STEP. Got {videos_dir.name!r} from version {version('lerobot')}."
+        )
+    return int(step)
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """Global names that a function uses, those of the functions inside it included."""
+    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*map(_names_in, inner))
+
+
+# Arguments of `lerobot-train`
+
+
+def dataset_option(name: str) -> Any:
+    """The value of `--dataset.<name>` for the running `lerobot-train`; None if it is not given.
+
+    It is taken from the command line, or else from the file of `--config_path`.
+    """
+    from lerobot.configs import parser
+
+    text = parser.parse_arg(f"dataset.{name}")
+    if text is not None:
+        return json.loads(text)
+    config_path = parser.parse_arg("config_path")
+    if config_path is None or not Path(config_path).is_file():
+        return None
+    return json.loads(Path(config_path).read_text()).get("dataset", {}).get(name)
+
+
+# Processor steps
+
+_TRANSITION = "_current_transition"
+
+
+class _PerThread:
+    """An attribute with a value for each thread, None at first. It is copied with its instance."""
+
+    def __get__(self, step: ProcessorStep | None, owner: type[ProcessorStep]) -> Any:
+        if step is None:
+            return self
+        return step.__dict__.get(_TRANSITION, {}).get(threading.get_ident())
+
+    def __set__(self, step: ProcessorStep, value: Any) -> None:
+        step.__dict__.setdefault(_TRANSITION, {})[threading.get_ident()] = value
+
+
+def make_processor_steps_thread_safe() -> None:
+    """Gives each thread its own copy of the transition that a processor step works on.
+
+    LeRobot 0.6 shares the steps between the threads of `--env.max_parallel_tasks`, so that a policy could get
+    another task's observation and instruction. A version without the attribute needs no workaround.
+    """
+    from lerobot.processor import ProcessorStep
+
+    if getattr(ProcessorStep, _TRANSITION, ...) is None:
+        setattr(ProcessorStep, _TRANSITION, _PerThread())

@@ -1,1 +1,0 @@
-"""Workarounds that rely on LeRobot's internals."""

@@ -1,0 +1,60 @@
+"""The tasks of the running episodes: what conditions the policy's network while an episode lasts."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from torch import Tensor, nn
+
+
+class TaskConditioning(NamedTuple):
+    """What the policy's network receives about the tasks of a batch, computed once per episode."""
+
+    tasks: tuple[str, ...]
+    film: Tensor | None  # (batch, film_dim)
+    concat: Tensor | None  # (batch, concatenated embeddings)
+    model: nn.Module  # the network that acts
+
+
+class EpisodeTasks:
+    """The conditioning of the running episodes, and the number of episodes that each task has had.
+
+    With `--env.max_parallel_tasks` above 1, several threads run episodes of different tasks with one policy:
+    each thread has a conditioning of its own.
+    """
+
+    def __init__(self) -> None:
+        self._conditioning: dict[int, TaskConditioning] = {}  # by thread
+        self._n_episodes: dict[str, int] = {}  # by task
+
+    def begin_episode(self) -> None:
+        """Forgets the conditioning of this thread's last episode."""
+        self._conditioning.pop(threading.get_ident(), None)
+
+    def begin_evaluation(self) -> None:
+        """Counts the episodes of each task from 0 again."""
+        self._n_episodes.clear()
+
+    def conditioning(
+        self, tasks: tuple[str, ...], encode: Callable[[tuple[str, ...]], TaskConditioning]
+    ) -> TaskConditioning:
+        """The conditioning of this thread's episode.
+
+        Args:
+            tasks: Instruction of each sample of the batch.
+            encode: Computes the conditioning of tasks; called at the episode's first step.
+        """
+        current = self._conditioning.get(threading.get_ident())
+        if current is None or current.tasks != tasks:
+            current = self._conditioning[threading.get_ident()] = encode(tasks)
+        return current
+
+    def count_trials(self, tasks: Sequence[str]) -> list[int]:
+        """Number of each sample's episode among those of its task, from 0, whichever thread runs them."""
+        trials = []
+        for task in tasks:
+            trials.append(self._n_episodes.get(task, 0))
+            self._n_episodes[task] = trials[-1] + 1
+        return trials

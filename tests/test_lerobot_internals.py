@@ -1,0 +1,63 @@
+"""What relies on LeRobot's internals finds them here, and says so where another version lacks them."""
+
+import inspect
+from pathlib import Path
+
+import pytest
+from lerobot.scripts import lerobot_train
+
+from lerobot_deltaco import lerobot_internals
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.lerobot_internals import (
+    LOOP_FUNCTIONS,
+    UnsupportedLeRobotError,
+    replaced_in_training_loop,
+    step_of_videos,
+    training_loop,
+)
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+
+
+def test_the_installed_training_loop_is_supported():
+    assert training_loop() is lerobot_train
+
+
+def test_functions_are_replaced_while_the_context_is_open():
+    before = {name: getattr(lerobot_train, name) for name in LOOP_FUNCTIONS}
+    with replaced_in_training_loop({"cycle": list}):
+        assert lerobot_train.cycle is list
+        assert lerobot_train.make_policy is before["make_policy"]
+    assert {name: getattr(lerobot_train, name) for name in LOOP_FUNCTIONS} == before
+
+
+def test_a_loop_that_calls_other_functions_is_refused(monkeypatch):
+    """As in LeRobot after 0.6.1, where another function makes the sampler and the batches."""
+
+    def train(config):
+        lerobot_train.make_train_eval_datasets(config), lerobot_train.make_policy(config)
+        with lerobot_train._make_eval_envs(config) as envs:
+            lerobot_train.eval_policy_all(envs)
+
+    monkeypatch.setattr(lerobot_train, "train", train)
+    message = r"supports lerobot>=0.6.1,<0.6.2.*not call EpisodeAwareSampler, cycle.*`lerobot-train`"
+    with pytest.raises(UnsupportedLeRobotError, match=message):
+        training_loop()
+    with pytest.raises(UnsupportedLeRobotError, match=message), replaced_in_training_loop({"cycle": list}):
+        pytest.fail("The loop was not checked.")
+
+
+def test_the_supported_versions_are_those_that_are_required():
+    pyproject = (Path(__file__).parents[1] / "pyproject.toml").read_text()
+    assert f"lerobot[training,evaluation]{lerobot_internals.SUPPORTED_LEROBOT}" in pyproject
+
+
+def test_the_step_of_an_evaluation_is_read_from_its_folder():
+    assert step_of_videos(Path("run/eval/videos_step_002000")) == 2000
+    with pytest.raises(UnsupportedLeRobotError, match="videos_step_STEP. Got 'final'"):
+        step_of_videos(Path("run/eval/final"))
+
+
+def test_the_annotation_of_the_configuration_is_a_class():
+    """LeRobot's own tests of policies ask `issubclass` of it."""
+    annotation = inspect.signature(DeltacoPolicy.__init__).parameters["config"].annotation
+    assert annotation is DeltacoConfig
