@@ -38,6 +38,7 @@ from lerobot_deltaco.policy.losses import (
 from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
 from lerobot_deltaco.policy.scalars import LoggedScalars
+from lerobot_deltaco.policy.step_generator import step_generator
 from lerobot_deltaco.policy.task_conditioning import EpisodeTasks, TaskConditioning
 from lerobot_deltaco.policy.task_file import TASK_FILE, find_task_file, read_demonstrations, write_task_file
 from lerobot_deltaco.policy.training_episodes import training_episodes
@@ -160,7 +161,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         device = batch[ACTION].device
         if self.training and device.type == "cpu":
             keep_freed_memory()
-        generator = self._generator()
+        step = int(self.step) if self.training else 0
+        generator = step_generator(self.config.seed, step, _process_rank())
         images = self._images(batch)
         if self.training and self.config.crop_padding:
             images = random_crop(images, self.config.crop_padding, generator)
@@ -261,15 +263,6 @@ class DeltacoPolicy(PreTrainedPolicy):
             loaded = self._load_demonstrations(self._meta.repo_id, self._meta.root, chosen)
             self.train_demonstrations = loaded.to(device)
         return self.train_demonstrations
-
-    def _generator(self) -> torch.Generator:
-        step = int(self.step) if self.training else 0
-        seed = torch.tensor([self.config.seed, step, _process_rank()], dtype=torch.int64)
-        # A hash, so that neighboring seeds and steps have nothing in common.
-        mixed = 0
-        for value in seed.tolist():
-            mixed = (mixed * 6364136223846793005 + value + 1442695040888963407) % 2**63
-        return torch.Generator().manual_seed(mixed)
 
     # Evaluation
 

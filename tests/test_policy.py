@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import itertools
 import sys
 import threading
 
@@ -25,6 +26,7 @@ from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.language import LanguageEncoderError
+from lerobot_deltaco.policy.step_generator import step_generator
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
 
@@ -113,6 +115,15 @@ def test_a_gripper_that_is_not_there_is_refused(make):
 
 
 # Training
+
+
+def test_the_draws_of_a_step_are_a_function_of_seed_step_and_rank():
+    numbers = list(itertools.product(range(3), repeat=3))
+    first, again = (
+        [tuple(torch.rand(4, generator=step_generator(*each)).tolist()) for each in numbers] for _ in range(2)
+    )
+    assert first == again
+    assert len(set(first)) == len(numbers)
 
 
 @pytest.mark.parametrize(
