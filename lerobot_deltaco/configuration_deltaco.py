@@ -35,6 +35,15 @@ METHODS = MappingProxyType(
         "mcil": Conditioning("language_or_demo", "none", "none"),
     }
 )
+# With `demo_encoder=correspondence`: what says what is to be grasped, and where it is to be released.
+GOAL_SOURCES = MappingProxyType(
+    {
+        "deltaco": ("demo", "condition"),
+        "demo_only": ("demo", "demo"),
+        "language_only": ("condition", "condition"),
+        "one_hot": ("condition", "condition"),
+    }
+)
 INPUTS = ("none", "demo", "language", "demo+language")
 ENCODER_LOSSES = ("contrastive", "cosine", "none")
 
@@ -53,7 +62,8 @@ BACKBONES = MappingProxyType(
         "strided": Backbone((16, 32, 64, 64), stem_stride=2, demo_stride=2),
     }
 )
-DEMO_ENCODERS = ("cnn", "attention")
+CORRESPONDENCE = "correspondence"
+DEMO_ENCODERS = ("cnn", "attention", CORRESPONDENCE)
 GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
 SCHEDULERS = ("constant", "cosine")
 DTYPES = ("float32", "bfloat16")
@@ -80,8 +90,11 @@ class DeltacoConfig(PreTrainedConfig):
         instruction_embeddings: A file with embeddings of instructions, which are then not computed: a
             checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
             language model.
-        demo_encoder: cnn (the paper's), or attention (ours), which compares the frames at each place, and
-            attends to a few places.
+        demo_encoder: Encoder of demonstrations. cnn: the paper's. attention (ours): compares the frames at
+            each place, and attends to a few places. correspondence (ours): no embedding; what the
+            demonstration moved is looked for in the scene, the instruction says where it goes, and the policy
+            is given both places as goals. It needs a camera that does not move, a robot state, and a gripper;
+            without demonstrations (language_only, one_hot), the method's other input says what to look for.
         demo_rows: m, rows of the array of a demonstration's frames.
         demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
             (For the attention, which has no array, they are m n frames.)
@@ -98,6 +111,19 @@ class DeltacoConfig(PreTrainedConfig):
         crop_padding: Pixels by which observations are shifted at random in training, 0 for none.
         demo_crop_padding: The same for demonstrations. Without it, the encoder soon knows those of a small
             dataset by heart, and misreads new ones.
+        demo_camera: Name of the camera for demonstrations and goals, such as "observation.images.front". By
+            default, the first.
+        n_demonstrations: Number of demonstrations of each task that are combined in evaluation, with
+            `demo_encoder=correspondence`.
+        goal_noise: Standard deviation of the noise on goals in training, where an image's edges are at -1 and
+            1; 0.04 is a pixel of 48.
+        locator_share: Share of each batch's samples on which goals are learned to be found.
+        recolor_share: Share of training samples in which one random change of hue, saturation and brightness
+            is applied to the observation and the demonstration alike, with `demo_encoder=correspondence`.
+        color_blind_tasks: Regular expression that is found in the instructions of tasks in which color does
+            not count: their demonstrations are recolored apart from the scene.
+        frames_after_release: With `deltaco-train`, the number of frames that are trained on after the gripper
+            has last opened in an episode, instead of leaving out the last `drop_n_last_frames`; None for all.
         demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at
             least 2, so that none is shown its own episode; 0 for one drawn anew for every sample. Sharing
             saves most of the demonstration encoder's time.
@@ -142,6 +168,13 @@ class DeltacoConfig(PreTrainedConfig):
     temperature: float = 0.1
     crop_padding: int = 4
     demo_crop_padding: int = 4
+    demo_camera: str | None = None
+    n_demonstrations: int = 1
+    goal_noise: float = 0.04
+    locator_share: float = 0.25
+    recolor_share: float = 0.0
+    color_blind_tasks: str | None = None
+    frames_after_release: int | None = None
     demos_per_task: int = 0
     demo_repo_id: str | None = None
     demo_root: str | None = None
@@ -197,6 +230,9 @@ class DeltacoConfig(PreTrainedConfig):
             ("encoder_loss_weight", 0),
             ("crop_padding", 0),
             ("demo_crop_padding", 0),
+            ("n_demonstrations", 1),
+            ("goal_noise", 0),
+            ("recolor_share", 0),
             ("demos_per_task", 0),
             ("drop_n_last_frames", 0),
             ("tasks_per_batch", 0),
@@ -210,6 +246,14 @@ class DeltacoConfig(PreTrainedConfig):
         for name in ("temperature", "optimizer_lr"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"`{name}` must be greater than 0. Got {getattr(self, name)}.")
+        if not self.recolor_share <= 1:
+            raise ValueError(f"`recolor_share` must be at most 1. Got {self.recolor_share}.")
+        if not 0 < self.locator_share <= 1:
+            raise ValueError(
+                f"`locator_share` must be greater than 0 and at most 1. Got {self.locator_share}."
+            )
+        if self.frames_after_release is not None and not self.frames_after_release >= 0:
+            raise ValueError(f"`frames_after_release` must be at least 0. Got {self.frames_after_release}.")
         if self.demos_per_task == 1:
             raise ValueError(
                 "`demos_per_task` cannot be 1: the sample from the one episode would be shown itself. Choose "
@@ -224,14 +268,15 @@ class DeltacoConfig(PreTrainedConfig):
         self._check_conditioning()
 
     def _check_upsampling(self) -> None:
+        for name in ("upsampled_tasks", "color_blind_tasks"):
+            try:
+                re.compile(getattr(self, name) or "")
+            except re.error as error:
+                raise ValueError(
+                    f"`{name}` must be a regular expression. Got {getattr(self, name)!r}: {error}."
+                ) from None
         if self.upsampled_tasks is None:
             return
-        try:
-            re.compile(self.upsampled_tasks)
-        except re.error as error:
-            raise ValueError(
-                f"`upsampled_tasks` must be a regular expression. Got {self.upsampled_tasks!r}: {error}."
-            ) from None
         if not 0 < self.upsampled_share < 1:
             raise ValueError(f"`upsampled_share` must be between 0 and 1. Got {self.upsampled_share}.")
         if self.tasks_per_batch < 2:
@@ -250,6 +295,9 @@ class DeltacoConfig(PreTrainedConfig):
         if overridden and self.method in ("one_hot", "mcil"):
             raise ValueError(f"`{overridden[0]}` cannot be changed in the method {self.method!r}.")
         film, concat, encoder_loss = self.conditioning
+        if self.locates_goals:
+            self._check_correspondence(film, concat, encoder_loss)
+            return
         if film == concat == "none":
             raise ValueError("`film` and `concat` are both 'none': the policy would not know its task.")
         if encoder_loss != "none" and not self.uses_demo:
@@ -258,24 +306,61 @@ class DeltacoConfig(PreTrainedConfig):
                 "one in `film` or `concat`."
             )
 
+    def _check_correspondence(self, film: str, concat: str, encoder_loss: str) -> None:
+        if self.method not in GOAL_SOURCES:
+            raise ValueError(
+                f"`demo_encoder` cannot be {CORRESPONDENCE!r} in the method {self.method!r}. It can in "
+                f"{', '.join(GOAL_SOURCES)}."
+            )
+        if "demo" in film or "demo" in concat or encoder_loss != "none":
+            raise ValueError(
+                f"With `demo_encoder={CORRESPONDENCE}`, demonstrations have no embedding: `film` and "
+                f"`concat` can be 'none' or 'language', and `encoder_loss` 'none'. Got {film!r}, "
+                f"{concat!r} and {encoder_loss!r}."
+            )
+
+    @property
+    def locates_goals(self) -> bool:
+        """Whether the policy is given places in the image as goals, which a locator finds."""
+        return self.demo_encoder == CORRESPONDENCE
+
+    @property
+    def n_goals(self) -> int:
+        """Number of goals that the policy is given: a grasp and a release, or none."""
+        return 2 if self.locates_goals else 0
+
     @property
     def conditioning(self) -> Conditioning:
         """The method's, with what an ablation changes."""
         changed = {
             name: getattr(self, name) for name in Conditioning._fields if getattr(self, name) is not None
         }
+        if self.locates_goals:
+            return Conditioning("none", "none", "none")._replace(**changed)
         return METHODS[self.method]._replace(**changed)
 
     @property
     def uses_demo(self) -> bool:
         """Whether demonstrations are needed."""
+        if self.locates_goals:
+            return "demo" in GOAL_SOURCES[self.method]
         return any("demo" in source for source in self.conditioning[:2])
 
     @property
     def uses_language(self) -> bool:
         """Whether instructions are embedded: as an input, or for the encoder's loss."""
         film, concat, encoder_loss = self.conditioning
+        if self.locates_goals and "language" in METHODS[self.method]:
+            return True
         return "language" in film or "language" in concat or encoder_loss != "none"
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, that of the demonstrations first."""
+        names = list(self.image_features)
+        if self.demo_camera is not None:
+            names.sort(key=lambda name: name != self.demo_camera)
+        return tuple(names)
 
     @property
     def n_demo_frames(self) -> int:
@@ -333,6 +418,17 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 f"`gripper` is {self.gripper_index}, but the action has only the dimensions 0 to "
                 f"{action_dim - 1}. Name one of these, or 'none'."
+            )
+        if self.demo_camera is not None and self.demo_camera not in self.image_features:
+            raise ValueError(
+                f"`demo_camera` must be one of the dataset's cameras, {', '.join(self.image_features)}. Got "
+                f"{self.demo_camera!r}."
+            )
+        if self.locates_goals and (self.gripper_index is None or self.robot_state_feature is None):
+            raise ValueError(
+                f"`demo_encoder={CORRESPONDENCE}` learns where things are from when the gripper closes "
+                "and opens: it needs the feature 'observation.state' and a gripper among the action's "
+                "dimensions, which `gripper` names. Without them, choose another `demo_encoder`."
             )
         if action_dim == 1 and self.gripper_index is not None:
             raise ValueError(

@@ -3,6 +3,7 @@
 # No `from __future__ import annotations`: LeRobot's tests expect the annotation of `config` to be a class.
 
 import logging
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -14,18 +15,26 @@ from huggingface_hub import ModelCard
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
+from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_transition
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_deltaco.cards.policy_card import policy_card
-from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
+from lerobot_deltaco.configuration_deltaco import BACKBONES, GOAL_SOURCES, DeltacoConfig
+from lerobot_deltaco.policy.correspondence import GoalLocator, goal_loss
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
 from lerobot_deltaco.policy.demonstration_choice import (
     choose_episode,
     choose_eval_demonstrations,
     choose_training_demonstrations,
 )
-from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
+from lerobot_deltaco.policy.demonstrations import (
+    DemonstrationSet,
+    RobotData,
+    load_demonstrations,
+    load_robot_data,
+)
+from lerobot_deltaco.policy.goal_conditioning import FoundGoals, GoalConditioning
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.language import InstructionTable
 from lerobot_deltaco.policy.losses import (
@@ -36,12 +45,14 @@ from lerobot_deltaco.policy.losses import (
     mixture_negative_log_likelihood,
 )
 from lerobot_deltaco.policy.memory import keep_freed_memory
-from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
+from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop, random_shifts, shift_images
+from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
 from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.step_generator import step_generator
 from lerobot_deltaco.policy.task_conditioning import EpisodeTasks, TaskConditioning
 from lerobot_deltaco.policy.task_file import TASK_FILE, find_task_file, read_demonstrations, write_task_file
 from lerobot_deltaco.policy.training_episodes import training_episodes
+from lerobot_deltaco.policy.training_goals import TrainingGoals, find_training_goals
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +69,8 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     Args:
         config: Configuration of the policy. LeRobot fills in its input and output features beforehand.
-        dataset_stats: Unused: the processors normalize.
+        dataset_stats: Statistics of the training dataset, by which the processors normalize; None in
+            evaluation.
         dataset_meta: Metadata of the training dataset; None in evaluation.
 
     Attributes:
@@ -79,13 +91,14 @@ class DeltacoPolicy(PreTrainedPolicy):
     ) -> None:
         super().__init__(config)
         self.config: DeltacoConfig = config
-        self._meta = dataset_meta
+        self._meta, self._stats = dataset_meta, dataset_stats
         config.resolve(dataset_meta.features if dataset_meta else None)
         self.instructions = InstructionTable(config.language_encoder)
         if config.instruction_embeddings is not None:
             self.instructions.read(Path(config.instruction_embeddings))
         self.eval_demonstrations: DemonstrationSet | None = None
         self.train_demonstrations: DemonstrationSet | None = None
+        self.train_goals: TrainingGoals | None = None
         self._train_demonstrations_are_complete = False  # whether they surely include every training episode
         self._demonstrated_as: Mapping[str, str] = {}
         self._episode_tasks = EpisodeTasks()
@@ -104,19 +117,24 @@ class DeltacoPolicy(PreTrainedPolicy):
             "one_hot": len(config.one_hot_tasks),
         }
         backbone = BACKBONES[config.backbone]
-        state = config.robot_state_feature
+        state_dim = config.robot_state_feature.shape[0] if config.robot_state_feature else 0
         action_dim = config.action_feature.shape[0]
         self.model = ConditionedPolicy(
             n_cameras=len(config.image_features),
             film_dim=dims[film],
-            concat_dim=dims[concat] + (state.shape[0] if state else 0),
+            # With goals: how far the state is from each of them.
+            concat_dim=dims[concat] + state_dim * (1 + config.n_goals),
             motion_dim=action_dim - (config.gripper_index is not None),
             has_gripper=config.gripper_index is not None,
             channels=backbone.channels,
             stem_stride=backbone.stem_stride,
             motion_modes=config.motion_modes,
+            n_goals=config.n_goals,
         )
-        self.demo_encoder = self._make_demo_encoder() if config.uses_demo else None
+        self.demo_encoder = (
+            self._make_demo_encoder() if config.uses_demo and not config.locates_goals else None
+        )
+        self.goals = self._make_goal_conditioning(state_dim) if config.locates_goals else None
         # MCIL brings both modalities into one space.
         self.project_language = (
             nn.Linear(config.embedding_dim, config.embedding_dim) if config.method == "mcil" else None
@@ -135,6 +153,13 @@ class DeltacoPolicy(PreTrainedPolicy):
             return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
         size, stride = config.image_size, BACKBONES[config.backbone].demo_stride
         return ArrayEncoder(size, size, config.demo_rows, config.demo_columns, config.embedding_dim, stride)
+
+    def _make_goal_conditioning(self, state_dim: int) -> GoalConditioning:
+        config = self.config
+        condition_dim = len(config.one_hot_tasks) if config.method == "one_hot" else 0
+        if config.uses_language:
+            condition_dim = config.embedding_dim
+        return GoalConditioning(GoalLocator(*GOAL_SOURCES[config.method], condition_dim), state_dim)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """All weights. The language encoder is frozen, and not among them."""
@@ -163,6 +188,8 @@ class DeltacoPolicy(PreTrainedPolicy):
             keep_freed_memory()
         step = int(self.step) if self.training else 0
         generator = step_generator(self.config.seed, step, _process_rank())
+        if self.goals is not None:
+            return self._goal_forward(batch, tasks, generator, reduction)
         images = self._images(batch)
         if self.training and self.config.crop_padding:
             images = random_crop(images, self.config.crop_padding, generator)
@@ -199,11 +226,132 @@ class DeltacoPolicy(PreTrainedPolicy):
             self.step += 1
         return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
 
+    def _goal_forward(
+        self, batch: dict[str, Any], tasks: Sequence[str], generator: torch.Generator, reduction: str
+    ) -> tuple[Tensor, LoggedScalars]:
+        """As `forward`, with goals: the policy loss, and that of finding the goals on a share of the samples.
+
+        The policy's network gets the goals of each sample's own episode, with noise; the locator learns, from
+        other episodes' demonstrations, to find them. So neither waits for the other.
+        """
+        images = self._images(batch)
+        n_samples, device = len(images), images.device
+        language = self.instructions(tasks, device) if self.config.uses_language else None
+        demonstrations = self._training_demonstrations(device)
+        assert self.train_goals is not None
+        rows = demonstrations.episode_rows(batch["episode_index"])
+        known = (rows >= 0) & self.train_goals.found[rows]
+        places = self.train_goals.places[rows]  # (batch, 2, 2)
+        logged = {}
+        if self.training:
+            if not self._train_demonstrations_are_complete:
+                demonstrations.check_episodes(batch["episode_index"], rows)
+            recolorings = random_recolorings(n_samples, self.config.recolor_share, generator)
+            n_located = max(1, round(self.config.locator_share * n_samples))
+            some = torch.arange(n_located) * n_samples // n_located
+            locator_loss = self._locator_loss(batch, tasks, rows, some, recolorings, generator)
+            places = places + self.config.goal_noise * torch.randn(places.shape, generator=generator).to(
+                device
+            )
+            if self.config.crop_padding:
+                shifts = random_shifts(n_samples, self.config.crop_padding, generator)
+                images = shift_images(images, shifts, self.config.crop_padding)
+                places = places + (shifts * 2 / self.config.image_size).to(device)[:, None]
+            images = recolor(images, recolorings)
+        elif not known.all():
+            # Of episodes that are held back for a validation loss, no goals are known: those that are found
+            # in the present image stand in for them.
+            found = self._find_goals(images[:, 0], tasks, [0] * n_samples)
+            places = torch.where(known[:, None, None], places, found.places)
+        film, concat = self.conditioning_inputs(tasks, None, language)
+        loss, parts = self._imitation_loss(batch, images, film, concat, places)
+        logged |= parts
+        if self.training:
+            share = n_samples / n_located
+            loss = loss.index_add(0, some.to(device), share * locator_loss.sum(dim=1))
+            logged |= {"grasp_loss": locator_loss[:, 0].mean(), "release_loss": locator_loss[:, 1].mean()}
+            self.step += 1
+        return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
+
+    def _locator_loss(
+        self,
+        batch: dict[str, Any],
+        tasks: Sequence[str],
+        rows: Tensor,
+        some: Tensor,
+        recolorings: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """How well the goals of some samples are found in the first images of their episodes, (some, 2).
+
+        Args:
+            batch: As in `forward`.
+            tasks: Instruction of each sample.
+            rows: Rows of the samples' episodes among the demonstrations, (batch,).
+            some: Which samples, on the CPU.
+            recolorings: Changes of the samples' colors, (batch, 3, 3), on the CPU.
+            generator: Source of the draws, on the CPU.
+        """
+        config, demonstrations = self.config, self.train_demonstrations
+        assert demonstrations is not None
+        assert self.train_goals is not None
+        assert self.goals is not None
+        device, padding = rows.device, config.demo_crop_padding
+        own, recolorings = rows[some.to(device)], recolorings[some]
+        some_tasks = [tasks[sample] for sample in some.tolist()]
+        plain = demonstrations.frames[own, 0].float() / 255  # (some, 3, H, W)
+        shifts = random_shifts(len(some), padding, generator)
+        plain = shift_images(plain, shifts, padding)
+        places = self.train_goals.places[own] + (shifts * 2 / config.image_size).to(device)[:, None]
+        scenes = recolor(plain, recolorings)
+        description = None
+        if config.uses_demo:
+            episodes = batch["episode_index"][some.to(device)]
+            others = demonstrations.sample_other_episodes(episodes, generator, check=False)
+            frames = demonstrations.frames[others][:, [0, -1]].float() / 255  # (some, 2, 3, H, W)
+            frames = random_crop(frames, padding, generator)
+            if config.color_blind_tasks is not None:
+                apart = random_recolorings(len(some), 1.0, generator)
+                blind = [re.search(config.color_blind_tasks, task) is not None for task in some_tasks]
+                recolorings = torch.where(torch.tensor(blind)[:, None, None], apart, recolorings)
+            frames = recolor(frames, recolorings)
+        with self._autocast(device):
+            if config.uses_demo:
+                description = self.goals.locator.describe(frames)
+            logits = self.goals.locator(scenes, plain, description, self._goal_condition(some_tasks))
+        loss = goal_loss(logits, places)
+        return torch.where(self.train_goals.found[own][:, None], loss, 0.0)
+
+    def _goal_condition(self, tasks: Sequence[str]) -> Tensor | None:
+        """The locator's condition for tasks, (tasks, condition)."""
+        if self.config.method == "one_hot":
+            return self._one_hot(tasks)
+        return self.instructions(tasks, self.step.device) if self.config.uses_language else None
+
+    def _find_goals(self, scenes: Tensor, tasks: Sequence[str], trials: Sequence[int]) -> FoundGoals:
+        """Finds the goals of tasks in scenes (batch, 3, H, W), by the demonstrations of these trials."""
+        assert self.goals is not None
+        frames = None
+        if self.config.uses_demo:
+            n_each = self.config.n_demonstrations
+            each = []
+            for number in range(n_each):
+                turns = [trial * n_each + number for trial in trials]
+                demonstrations, rows = self._choose_eval_demonstrations(tasks, turns)
+                each.append(demonstrations.frames[rows][:, [0, -1]].float() / 255)
+            frames = torch.stack(each, dim=1).to(scenes.device)  # (batch, demonstrations, 2, 3, H, W)
+        return self.goals.find(scenes, frames, self._goal_condition(tasks))
+
     def _imitation_loss(
-        self, batch: dict[str, Any], images: Tensor, film: Tensor, concat: Tensor | None
+        self,
+        batch: dict[str, Any],
+        images: Tensor,
+        film: Tensor | None,
+        concat: Tensor | None,
+        goals: Tensor | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The policy loss L_pi (equation 2) of each sample, (batch,), and its parts to log."""
-        predicted, gripper = self.model(images, film, self._concatenated(batch, concat))
+        predicted, gripper = self.model(images, film, self._concatenated(batch, concat, goals), goals)
         action = batch[ACTION].float()
         motion, target = self._split_action(action)
         likelihood = mixture_negative_log_likelihood(
@@ -218,14 +366,42 @@ class DeltacoPolicy(PreTrainedPolicy):
         logged["gripper_accuracy"] = ((gripper > 0) == (target > 0.5)).float().mean()
         return likelihood + self.config.gripper_weight * error, logged
 
-    def set_train_demonstrations(self, demonstrations: DemonstrationSet) -> None:
+    def set_train_demonstrations(
+        self, demonstrations: DemonstrationSet, robot_data: RobotData | None = None
+    ) -> None:
         """Sets the demonstrations for training, which are otherwise read from the disk with the first batch.
 
         Args:
             demonstrations: Demonstrations, which include every episode of the training.
+            robot_data: What the robot did in them, for `demo_encoder=correspondence`.
         """
         self.train_demonstrations = demonstrations
         self._train_demonstrations_are_complete = True
+        if self.goals is not None:
+            assert robot_data is not None
+            self._fit_goals(robot_data)
+
+    def _fit_goals(self, robot_data: RobotData) -> None:
+        """Finds the goals of the training episodes, and the robot's states there."""
+        demonstrations, index = self.train_demonstrations, self.config.gripper_index
+        assert demonstrations is not None
+        assert self.goals is not None
+        assert index is not None
+        frames, device = demonstrations.frames, demonstrations.frames.device
+        goals = find_training_goals(
+            frames[:, 0],
+            frames[:, -1],
+            robot_data.states.to(device),
+            robot_data.actions[:, index].to(device),
+            robot_data.spans,
+        )
+        self.train_goals = goals
+        normalize = NormalizerProcessorStep(
+            {OBS_STATE: self.config.robot_state_feature}, self.config.normalization_mapping, self._stats
+        )
+        normalized = normalize(create_transition(observation={OBS_STATE: goals.states.cpu()}))
+        states = normalized[TransitionKey.OBSERVATION][OBS_STATE].to(device)
+        self.goals.fit(goals, states)
 
     def _train_demo_embeddings(
         self, episodes: Tensor, tasks: Sequence[str], column: Tensor, generator: torch.Generator
@@ -262,6 +438,8 @@ class DeltacoPolicy(PreTrainedPolicy):
             chosen = self.config.demo_episodes or training_episodes(self._meta)
             loaded = self._load_demonstrations(self._meta.repo_id, self._meta.root, chosen)
             self.train_demonstrations = loaded.to(device)
+            if self.goals is not None:
+                self._fit_goals(load_robot_data(self._meta.repo_id, self._meta.root, chosen))
         return self.train_demonstrations
 
     # Evaluation
@@ -307,10 +485,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         tasks = tuple(batch["task"])
         images = self._images(batch)
         with self._autocast(images.device):
-            task = self._episode_tasks.conditioning(
-                tasks, lambda tasks: self.encode_task(tasks, images.device)
-            )
-            motion, gripper = task.model(images, task.film, self._concatenated(batch, task.concat))
+            task = self._episode_tasks.conditioning(tasks, lambda tasks: self.encode_task(tasks, images))
+            places = None if task.goals is None else task.goals.places
+            concatenated = self._concatenated(batch, task.concat, places)
+            motion, gripper = task.model(images, task.film, concatenated, places)
         if gripper is not None:
             gripper = torch.sigmoid(gripper.float())
         return self._join_action(motion.mean.float(), gripper)
@@ -319,30 +497,33 @@ class DeltacoPolicy(PreTrainedPolicy):
         """The action as a chunk of one, (batch, 1, action)."""
         return self.select_action(batch, **kwargs).unsqueeze(1)
 
-    def encode_task(self, tasks: tuple[str, ...], device: torch.device) -> TaskConditioning:
+    def encode_task(self, tasks: tuple[str, ...], images: Tensor) -> TaskConditioning:
         """Encodes the demonstrations and instructions of the tasks of a batch, at the start of an episode.
 
         Args:
             tasks: Instruction of each sample.
-            device: Device of the result.
+            images: Images of the scenes, (batch, cameras, 3, size, size) in 0..1, in which goals are found.
 
         Raises:
             ValueError: A task has no demonstration.
         """
         trials = self._episode_tasks.count_trials(tasks)
-        demo = language = None
-        if self.config.uses_demo:
+        demo = language = goals = None
+        if self.goals is not None:
+            goals = self._find_goals(images[:, 0], tasks, trials)
+        elif self.config.uses_demo:
             demonstrations, rows = self._choose_eval_demonstrations(tasks, trials)
             generator = torch.Generator().manual_seed(self.config.seed)
             demo = self._encode_demo(demonstrations, rows, generator)
         if self.config.uses_language:
-            language = self.instructions(tasks, device)
+            language = self.instructions(tasks, images.device)
         if self.config.method == "mcil":
             # The trials of a task use the instruction and the demonstration in turn.
-            by_language = torch.tensor(trials, device=device) % 2 == 0
+            by_language = torch.tensor(trials, device=images.device) % 2 == 0
             film = torch.where(by_language[:, None], self.project_language(language), demo)
             return TaskConditioning(tasks, film, None, self._acting_model())
-        return TaskConditioning(tasks, *self.conditioning_inputs(tasks, demo, language), self._acting_model())
+        film, concat = self.conditioning_inputs(tasks, demo, language)
+        return TaskConditioning(tasks, film, concat, self._acting_model(), goals)
 
     def _choose_eval_demonstrations(
         self, tasks: Sequence[str], trials: Sequence[int]
@@ -364,20 +545,26 @@ class DeltacoPolicy(PreTrainedPolicy):
     # Training and evaluation
 
     def _images(self, batch: dict[str, Any]) -> Tensor:
-        """Images of all cameras, (batch, cameras, 3, size, size)."""
+        """Images of all cameras, that of the demonstrations first, (batch, cameras, 3, size, size)."""
         size = self.config.image_size
         images = []
-        for name in self.config.image_features:
+        for name in self.config.cameras:
             image = batch[name]  # (batch, 3, H, W)
             if image.shape[-2:] != (size, size):
                 image = F.interpolate(image, (size, size), mode="bilinear", antialias=True)
             images.append(image)
         return torch.stack(images, dim=1)
 
-    def _concatenated(self, batch: dict[str, Any], embedding: Tensor | None) -> Tensor | None:
+    def _concatenated(
+        self, batch: dict[str, Any], embedding: Tensor | None, goals: Tensor | None = None
+    ) -> Tensor | None:
+        """What is concatenated to the images' features: an embedding, the state, its way to the goals."""
         parts = [embedding] if embedding is not None else []
         if self.config.robot_state_feature:
             parts.append(batch[OBS_STATE])
+        if goals is not None:
+            assert self.goals is not None
+            parts.append(self.goals.offsets(goals, batch[OBS_STATE].float()))
         return torch.cat(parts, dim=-1) if parts else None
 
     def conditioning_inputs(
@@ -442,7 +629,7 @@ class DeltacoPolicy(PreTrainedPolicy):
     def _load_demonstrations(
         self, repo_id: str, root: str | Path | None, episodes: Sequence[int] | None
     ) -> DemonstrationSet:
-        camera = next(iter(self.config.image_features))
+        camera = self.config.cameras[0]
         size, n_frames = self.config.image_size, self.config.n_demo_frames
         return load_demonstrations(repo_id, root, episodes, camera, size, n_frames)
 

@@ -6,10 +6,13 @@ import logging
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from tqdm import tqdm
 
@@ -87,12 +90,12 @@ class DemonstrationSet(torch.nn.Module):
             ValueError: An episode is not in the set, or no episode of its task.
         """
         draws = torch.rand(len(episodes), generator=generator).to(self.frames.device)
-        rows = self._rows(episodes)
+        rows = self.episode_rows(episodes)
         held_back = rows < 0
         if tasks is not None and held_back.any():
             rows = torch.where(held_back, self._any_rows(tasks, held_back), rows)
         elif check:
-            self._check(episodes, rows)
+            self.check_episodes(episodes, rows)
         own, count = self._place[rows].unbind(dim=1)
         place = (draws * (count - 1)).long()  # one of the count - 1 others
         place = torch.where(count > 1, place + (place >= own), own)
@@ -130,9 +133,9 @@ class DemonstrationSet(torch.nn.Module):
         longest = max(map(len, self.rows.values()))
         priorities = torch.rand(n_tasks, longest, generator=generator).to(device)
         start = torch.randint(n_each, (n_samples,), generator=generator).to(device)
-        rows = self._rows(episodes)
+        rows = self.episode_rows(episodes)
         if check:
-            self._check(episodes, rows)
+            self.check_episodes(episodes, rows)
         first = torch.full((n_tasks,), n_samples, device=device).scatter_reduce(
             0, column, torch.arange(n_samples, device=device), "amin"
         )
@@ -148,12 +151,17 @@ class DemonstrationSet(torch.nn.Module):
         which = column * n_each + torch.where(own, (start + 1) % n_distinct, start)
         return drawn.flatten(), which
 
-    def _rows(self, episodes: Tensor) -> Tensor:
+    def episode_rows(self, episodes: Tensor) -> Tensor:
         """Rows of episodes, (batch,); -1 of those that are not in the set."""
         known = episodes < len(self._row_of_episode)
         return torch.where(known, self._row_of_episode[episodes.clamp(max=len(self._row_of_episode) - 1)], -1)
 
-    def _check(self, episodes: Tensor, rows: Tensor) -> None:
+    def check_episodes(self, episodes: Tensor, rows: Tensor) -> None:
+        """Checks that episodes (batch,) were found in these rows (batch,).
+
+        Raises:
+            ValueError: One was not.
+        """
         if (rows < 0).any():
             raise ValueError(
                 f"Episode {int(episodes[rows < 0][0])} is trained on, but is not among those that "
@@ -231,6 +239,37 @@ def load_demonstrations(
         frames.append(resize_images(images, image_size))
         tasks.append(row["tasks"][0])
     return DemonstrationSet(torch.stack(frames), tasks, episodes)
+
+
+class RobotData(NamedTuple):
+    """What the robot did in episodes.
+
+    Attributes:
+        states: Robot states of frames, (frames, state).
+        actions: Actions in these frames, (frames, action).
+        spans: First and last frame of each episode.
+    """
+
+    states: Tensor
+    actions: Tensor
+    spans: list[tuple[int, int]]
+
+
+def load_robot_data(repo_id: str, root: str | Path | None, episodes: Sequence[int]) -> RobotData:
+    """Reads the states and actions of episodes from a LeRobotDataset.
+
+    Args:
+        repo_id: Id of the dataset.
+        root: Folder of the dataset, None for LeRobot's cache.
+        episodes: Which of its episodes.
+    """
+    dataset = LeRobotDataset(repo_id, root=root)
+    columns = dataset.hf_dataset.select_columns([OBS_STATE, ACTION]).with_format("numpy")[:]
+    states, actions = (
+        torch.from_numpy(np.stack(columns[name]).astype(np.float32)) for name in (OBS_STATE, ACTION)
+    )
+    starts, ends = (dataset.meta.episodes[f"dataset_{side}_index"][:] for side in ("from", "to"))
+    return RobotData(states, actions, [(starts[episode], ends[episode] - 1) for episode in episodes])
 
 
 def kept_frame_indices(first: int, last: int, n_demo_frames: int) -> Tensor:

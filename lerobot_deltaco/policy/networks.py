@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 FILM_INITIAL_STD = 1e-3
 MIN_LOG_STD, MAX_LOG_STD = -6.0, 0.0
+GOAL_STD = 1 / 12  # of the map of a goal, where the image's edges are at -1 and 1
 INITIAL_LOG_STD = -1.0  # ours: of the order of the first errors, so that the first gradients are moderate
 
 
@@ -65,6 +66,7 @@ class ConditionedPolicy(nn.Module):
         gripper_hidden_dim: Of the gripper's hidden layer.
         spatial_softmax_temperature: Divides the activations.
         motion_modes: Gaussians of the motion's distribution.
+        n_goals: Number of places in the first camera's image that the policy is given as goals.
     """
 
     def __init__(
@@ -80,11 +82,14 @@ class ConditionedPolicy(nn.Module):
         gripper_hidden_dim: int = 32,
         spatial_softmax_temperature: float = 1.0,
         motion_modes: int = 1,
+        n_goals: int = 0,
     ) -> None:
         super().__init__()
-        self.backbone = FilmResNet(film_dim, channels, stem_stride)
+        self.n_goals = n_goals
+        self.backbone = FilmResNet(film_dim, channels, stem_stride, in_channels=3 + n_goals)
         self.spatial_softmax = SpatialSoftmax(spatial_softmax_temperature)
-        feature_dim = n_cameras * 2 * channels[-1] + concat_dim
+        # Of each goal: its place, and what the maps are there.
+        feature_dim = n_cameras * 2 * channels[-1] + concat_dim + n_goals * (2 + channels[-1])
         self.motion_dim, self.motion_modes = motion_dim, motion_modes
         n_outputs = motion_modes * motion_dim + (motion_modes if motion_modes > 1 else 0)
         self.motion = multilayer_perceptron([feature_dim, *hidden_dims, n_outputs])
@@ -101,7 +106,7 @@ class ConditionedPolicy(nn.Module):
         return MIN_LOG_STD + (MAX_LOG_STD - MIN_LOG_STD) * torch.sigmoid(self.raw_log_std)
 
     def forward(
-        self, images: Tensor, film: Tensor | None, concat: Tensor | None
+        self, images: Tensor, film: Tensor | None, concat: Tensor | None, goals: Tensor | None = None
     ) -> tuple[Motion, Tensor | None]:
         """Predicts an action.
 
@@ -109,6 +114,8 @@ class ConditionedPolicy(nn.Module):
             images: (batch, cameras, 3, H, W) in 0..1.
             film: (batch, film_dim), None if it is 0.
             concat: (batch, concat_dim), None if it is 0.
+            goals: Places in the first camera's image, x and y in -1..1, (batch, n_goals, 2); None if there
+                are none.
 
         Returns:
             The motion, and the gripper's logit, (batch,), or None. (Its sigmoid is the gripper in 0..1.)
@@ -116,11 +123,17 @@ class ConditionedPolicy(nn.Module):
         n_cameras = images.shape[1]
         if film is not None:
             film = film.repeat_interleave(n_cameras, dim=0)  # (batch * cameras, film_dim)
+        if goals is not None:
+            images = self._with_goals(images, goals)  # (batch, cameras, 3 + goals, H, W)
         maps = self.backbone(
             rearrange(images, "b n c h w -> (b n) c h w"), film
         )  # (batch * cameras, c, h, w)
-        points = rearrange(self.spatial_softmax(maps), "(b n) p -> b (n p)", n=n_cameras)
-        features = points if concat is None else torch.cat([points, concat], dim=-1)  # (batch, feature_dim)
+        parts = [rearrange(self.spatial_softmax(maps), "(b n) p -> b (n p)", n=n_cameras)]
+        if goals is not None:
+            parts += [features_at(maps[::n_cameras], goals).flatten(1), goals.flatten(1)]
+        if concat is not None:
+            parts.append(concat)
+        features = torch.cat(parts, dim=-1)  # (batch, feature_dim)
         gripper = None if self.gripper is None else self.gripper(features).squeeze(-1)
         outputs = self.motion(features)
         means = rearrange(
@@ -128,6 +141,13 @@ class ConditionedPolicy(nn.Module):
         )
         logits = outputs[:, self.motion_modes * self.motion_dim :]
         return Motion(means, logits if self.motion_modes > 1 else torch.zeros_like(means[..., 0])), gripper
+
+    def _with_goals(self, images: Tensor, goals: Tensor) -> Tensor:
+        """Images with a map of each goal as a further channel; zeros in the images of other cameras."""
+        height, width = images.shape[-2:]
+        maps = gaussian_maps(goals, height, width, GOAL_STD).to(images.dtype)  # (batch, goals, H, W)
+        others = maps.new_zeros(len(maps), images.shape[1] - 1, *maps.shape[1:])
+        return torch.cat([images, torch.cat([maps[:, None], others], dim=1)], dim=2)
 
 
 class FilmResNet(nn.Module):
@@ -137,12 +157,15 @@ class FilmResNet(nn.Module):
         film_dim: Size of the embedding, 0 for no FiLM.
         channels: Of the blocks.
         stem_stride: Of the first convolution. With the paper's 1, the maps have half the image's size.
+        in_channels: Number of channels of the image.
     """
 
-    def __init__(self, film_dim: int, channels: Sequence[int], stem_stride: int = 1) -> None:
+    def __init__(
+        self, film_dim: int, channels: Sequence[int], stem_stride: int = 1, in_channels: int = 3
+    ) -> None:
         super().__init__()
         self.stem = nn.Sequential(
-            nn.Conv2d(3, channels[0], kernel_size=7, stride=stem_stride, padding=3, bias=False),
+            nn.Conv2d(in_channels, channels[0], kernel_size=7, stride=stem_stride, padding=3, bias=False),
             nn.BatchNorm2d(channels[0]),
             nn.ReLU(inplace=True),
             nn.MaxPool2d(kernel_size=3, stride=2, padding=1),
@@ -228,6 +251,36 @@ def mean_position(weights: Tensor) -> tuple[Tensor, Tensor]:
     return (weights.sum(dim=2) * x).sum(-1), (weights.sum(dim=3) * y).sum(-1)
 
 
+def cell_centers(n_cells: int, device: torch.device) -> Tensor:
+    """Places of the cells of a row or column of a map whose edges are at -1 and 1, (n_cells,)."""
+    return (torch.arange(n_cells, device=device) + 0.5) * 2 / n_cells - 1
+
+
+def gaussian_maps(places: Tensor, height: int, width: int, std: float | Tensor) -> Tensor:
+    """Maps that are 1 at a place and fall off around it.
+
+    Args:
+        places: x and y in -1..1 between the edges, (batch, places, 2).
+        height: Number of rows.
+        width: Number of columns.
+        std: Standard deviation, in the same unit; one number, or those of x and y, (2,).
+
+    Returns:
+        (batch, places, height, width).
+    """
+    std = torch.as_tensor(std, device=places.device).expand(2)
+    across = torch.exp(-0.5 * ((cell_centers(width, places.device) - places[..., :1]) / std[0]) ** 2)
+    down = torch.exp(-0.5 * ((cell_centers(height, places.device) - places[..., 1:]) / std[1]) ** 2)
+    return down[..., :, None] * across[..., None, :]
+
+
+def features_at(maps: Tensor, places: Tensor) -> Tensor:
+    """What maps (batch, channels, h, w) are around places (batch, places, 2): (batch, places, channels)."""
+    weights = gaussian_maps(places, *maps.shape[-2:], GOAL_STD)
+    weights = weights / weights.sum(dim=(2, 3), keepdim=True).clamp_min(1e-3)
+    return torch.einsum("bphw,bchw->bpc", weights.to(maps.dtype), maps)
+
+
 class FullPrecisionLinear(nn.Linear):
     """A linear layer that computes in its weights' precision, also under mixed precision.
 
@@ -257,17 +310,27 @@ def random_crop(images: Tensor, padding: int, generator: torch.Generator | None 
 
     Args:
         images: (batch, ..., H, W). All images of a sample are shifted alike.
-        padding: px.
+        padding: Largest shift in x and in y, px.
         generator: Source of the shifts, on the CPU.
 
     Returns:
         The same shape.
     """
+    return shift_images(images, random_shifts(len(images), padding, generator), padding)
+
+
+def random_shifts(n_samples: int, padding: int, generator: torch.Generator | None = None) -> Tensor:
+    """Draws shifts to the right and down, -padding..padding px, (n_samples, 2), on the CPU."""
+    return padding - torch.randint(0, 2 * padding + 1, (2, n_samples), generator=generator).flip(0).T
+
+
+def shift_images(images: Tensor, shifts: Tensor, padding: int) -> Tensor:
+    """Shifts images (batch, ..., H, W) by shifts (batch, 2) of up to `padding` pixels; see `random_crop`."""
     batch_size, (height, width) = len(images), images.shape[-2:]
-    shifts = torch.randint(0, 2 * padding + 1, (2, batch_size), generator=generator).to(images.device)
+    left, top = (padding - shifts).to(images.device).unbind(dim=1)
     padded = F.pad(images, [padding] * 4)
-    rows = shifts[0, :, None] + torch.arange(height, device=images.device)  # (batch, H)
-    columns = shifts[1, :, None] + torch.arange(width, device=images.device)  # (batch, W)
+    rows = top[:, None] + torch.arange(height, device=images.device)  # (batch, H)
+    columns = left[:, None] + torch.arange(width, device=images.device)  # (batch, W)
     sample = torch.arange(batch_size, device=images.device)
     flat = padded.flatten(1, -3) if padded.ndim > 4 else padded  # (batch, channels, H + 2p, W + 2p)
     # Advanced indices on both sides of a slice put the batch, rows and columns first.

@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 from torch import Tensor, nn
 
+from lerobot_deltaco.policy.goal_conditioning import FoundGoals
+
 
 class TaskConditioning(NamedTuple):
     """What the policy's network receives about the tasks of a batch, computed once per episode."""
@@ -16,6 +18,7 @@ class TaskConditioning(NamedTuple):
     film: Tensor | None  # (batch, film_dim)
     concat: Tensor | None  # (batch, concatenated embeddings)
     model: nn.Module  # the network that acts
+    goals: FoundGoals | None = None  # with demo_encoder=correspondence
 
 
 class EpisodeTasks:

@@ -13,6 +13,7 @@ import psutil
 import pyarrow as pa
 import torch
 from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import ACTION, OBS_STATE
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
@@ -21,10 +22,12 @@ from tqdm import tqdm
 
 from lerobot_deltaco.policy.demonstrations import (
     DemonstrationSet,
+    RobotData,
     kept_frame_indices,
     resize_images,
     to_uint8,
 )
+from lerobot_deltaco.policy.keyframes import release_frames
 
 # Rows that are decoded at a time, and those of them that a thread takes at a time.
 CHUNK, PART = 1024, 32
@@ -119,6 +122,36 @@ class FramesInMemory:
         images = self.columns[camera][rows.to(self.held_on)]  # (episodes, kept, 3, h, w)
         tasks = [self.task_names[self._task_of[self.spans[episode][0]]] for episode in episodes]
         return DemonstrationSet(resize_images(images, image_size), tasks, episodes).to(self.device)
+
+    def robot_data(self) -> RobotData:
+        """The robot's states and actions in all frames."""
+        spans = [self.spans[episode] for episode in self.spans]
+        return RobotData(self.columns[OBS_STATE], self.columns[ACTION], spans)
+
+    def until_release(self, gripper_index: int | None, n_after: int) -> NDArray[np.bool_]:
+        """Which frames come before the gripper's last opening in their episode, or soon after it.
+
+        Args:
+            gripper_index: The gripper's dimension of the action.
+            n_after: Number of frames after the opening that count as well.
+
+        Returns:
+            (frames,) bool. All frames of an episode without an opening count.
+
+        Raises:
+            ValueError: There is no gripper.
+        """
+        if gripper_index is None:
+            raise ValueError(
+                "`frames_after_release` needs a gripper among the action's dimensions, which `gripper` names."
+            )
+        data = self.robot_data()
+        releases = release_frames(data.actions[:, gripper_index], data.spans)
+        use = np.ones(len(self), dtype=bool)
+        for release, (_, last) in zip(releases, data.spans, strict=True):
+            if release is not None:
+                use[release + 1 + n_after : last + 1] = False
+        return use
 
     def _choose_device(self, dataset: LeRobotDataset, image_size: int | None) -> torch.device:
         needed = needed_bytes(dataset, image_size)

@@ -115,10 +115,10 @@ class InMemoryTraining:
         config, frames = policy.config, self._frames
         assert isinstance(policy, DeltacoPolicy)
         assert frames is not None
-        if config.uses_demo and config.demo_episodes is None:
-            camera = next(iter(config.image_features))
+        if (config.uses_demo or config.locates_goals) and config.demo_episodes is None:
             policy.set_train_demonstrations(
-                frames.demonstrations(camera, config.image_size, config.n_demo_frames)
+                frames.demonstrations(config.cameras[0], config.image_size, config.n_demo_frames),
+                frames.robot_data() if config.locates_goals else None,
             )
         return policy
 
@@ -129,10 +129,17 @@ class InMemoryTraining:
         assert self._frames is not None
         config: DeltacoConfig = self._config.policy
         if not config.tasks_per_batch:
+            if config.frames_after_release is not None:
+                raise ValueError(
+                    "`frames_after_release` chooses frames for batches of tasks. Set `tasks_per_batch`, or "
+                    "choose frames by `drop_n_last_frames`."
+                )
             return stock
         tasks = self._frames.tasks
         use = np.zeros(len(tasks), dtype=bool)
         use[stock.indices] = True
+        if config.frames_after_release is not None:
+            use &= self._frames.until_release(config.gripper_index, config.frames_after_release)
         upsampled = []
         if config.upsampled_tasks is not None:
             names = self._frames.task_names

@@ -1,0 +1,72 @@
+"""Keyframes of an episode: where the gripper closes around an object, and where it opens again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Keyframes(NamedTuple):
+    """The robot's states at the keyframes of episodes.
+
+    Attributes:
+        states: States in which the gripper has closed and is about to open, (episodes, 2, state), as in the
+            dataset. Zeros where there are none.
+        found: Whether an episode has them, (episodes,) bool.
+    """
+
+    states: Tensor
+    found: Tensor
+
+
+def find_keyframes(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Keyframes:
+    """Finds the keyframes of episodes: the last closing that is followed by an opening, and that opening.
+
+    A gripper counts as closed where its command is below the middle of the commands' range, LeRobot's
+    convention for grippers. If an object slips and is grasped again, the last grasp counts.
+
+    Args:
+        states: Robot states of all frames, (frames, state).
+        gripper: Commands of the gripper in all frames, (frames,).
+        spans: First and last frame of each episode.
+
+    Returns:
+        The keyframes of each episode.
+    """
+    closed = _is_closed(gripper)
+    found, frames = [], []
+    for span in spans:
+        opening = closing = _last_opening(closed, span)
+        if opening is None or closing is None:
+            found.append(False)
+            frames.append((span[0], span[0]))
+            continue
+        while closing > span[0] and closed[closing - 1]:
+            closing -= 1
+        found.append(True)
+        # One step later, the command to close has been carried out.
+        frames.append((min(closing + 1, opening), opening))
+    is_found = torch.tensor(found, device=states.device)
+    at = states[torch.tensor(frames, device=states.device)].float()  # (episodes, 2, state)
+    return Keyframes(torch.where(is_found[:, None, None], at, 0.0), is_found)
+
+
+def release_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[int | None]:
+    """The frame of each episode in which the gripper opens for the last time; None without any."""
+    closed = _is_closed(gripper)
+    return [_last_opening(closed, span) for span in spans]
+
+
+def _is_closed(gripper: Tensor) -> list[bool]:
+    return (gripper < (gripper.min() + gripper.max()) / 2).tolist()
+
+
+def _last_opening(closed: Sequence[bool], span: tuple[int, int]) -> int | None:
+    first, last = span
+    for frame in range(last, first, -1):
+        if closed[frame - 1] and not closed[frame]:
+            return frame
+    return None

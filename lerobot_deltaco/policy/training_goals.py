@@ -1,0 +1,61 @@
+"""The goals of training episodes: where in the image each of them grasped and released something."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lerobot_deltaco.policy.calibration import StateToImage
+from lerobot_deltaco.policy.keyframes import find_keyframes
+
+logger = logging.getLogger(__name__)
+
+
+class TrainingGoals(NamedTuple):
+    """Goals of episodes, in the order of their demonstrations.
+
+    Attributes:
+        places: Grasp and release in the first camera's image, x and y in -1..1, (episodes, 2, 2).
+        states: The robot's states there, (episodes, 2, state), as in the dataset.
+        found: Whether the gripper closed and opened in an episode, (episodes,) bool; else the rest is 0.
+    """
+
+    places: Tensor
+    states: Tensor
+    found: Tensor
+
+    def to(self, device: torch.device | str) -> TrainingGoals:
+        """The same on a device."""
+        return TrainingGoals(*(tensor.to(device) for tensor in self))
+
+
+def find_training_goals(
+    first: Tensor, last: Tensor, states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]
+) -> TrainingGoals:
+    """Finds the goals of episodes without a calibrated camera.
+
+    Args:
+        first: First images of the episodes, (episodes, 3, H, W) uint8.
+        last: Their last images.
+        states: Robot states of all frames, (frames, state).
+        gripper: The gripper's commands in all frames, (frames,).
+        spans: First and last frame of each episode.
+
+    Raises:
+        ValueError: There are too few episodes in which the gripper closes and opens.
+    """
+    keyframes = find_keyframes(states, gripper, spans)
+    found = keyframes.found
+    if not found.all():
+        logger.warning(
+            "The gripper does not close and open again in %d of %d episodes; their goals are not learned.",
+            int((~found).sum()),
+            len(found),
+        )
+    to_image = StateToImage(first[found], last[found], keyframes.states[found, 0])
+    places = to_image(keyframes.states).clamp(-1, 1)
+    return TrainingGoals(torch.where(found[:, None, None], places, 0.0), keyframes.states, found)

@@ -1,0 +1,330 @@
+"""Conditioning by correspondence: keyframes, calibration, recoloring, the locator, and the policy."""
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from small_policies import batch_of, small_policy, use_fake_encoder
+
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.calibration import MIN_EPISODES, StateToImage
+from lerobot_deltaco.policy.correspondence import GoalLocator, goal_loss, peak_places
+from lerobot_deltaco.policy.keyframes import find_keyframes, release_frames
+from lerobot_deltaco.policy.networks import ConditionedPolicy, gaussian_maps
+from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
+from lerobot_deltaco.training.frames import FramesInMemory
+
+SIZE, LENGTH = 24, 7
+COLORS = {"move the red thing left": (230, 40, 30), "move the blue thing right": (30, 60, 220)}
+CORRESPONDENCE = {"demo_encoder": "correspondence", "image_size": SIZE, "motion_modes": 2}
+
+
+@pytest.fixture(autouse=True)
+def _language(monkeypatch):
+    use_fake_encoder(monkeypatch)
+
+
+def image_with(*things):
+    """A gray image with squares of 4 x 4 px, each a color and its middle (x, y) in -1..1."""
+    image = np.full((SIZE, SIZE, 3), 120, np.uint8)
+    for color, (x, y) in things:
+        column, row = (round((c + 1) * SIZE / 2) for c in (x, y))
+        image[max(0, row - 2) : row + 2, max(0, column - 2) : column + 2] = color
+    return image
+
+
+def state_of(place):
+    """The robot's state at a place in the image, in other units, with a number that never changes."""
+    x, y = place
+    return np.array([3 + 0.4 * x + 0.1 * y, -1 - 0.1 * x + 0.5 * y, 7.0], np.float32)
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    """Of each episode: the task, where its thing was and went, and where the other thing stood."""
+    rng = np.random.default_rng(0)
+    found = []
+    while len(found) < 60:
+        start, other = rng.uniform(-0.7, 0.7, (2, 2))
+        if np.abs(start - other).max() > 0.5:
+            task = list(COLORS)[len(found) % 2]
+            found.append((task, start, other, np.array([-0.8 if "left" in task else 0.8, start[1]])))
+    return found
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory, episodes):
+    """Two things on a table, of which one is moved: grasped in frame 2, released in frame 5."""
+    features = {
+        "observation.image": {
+            "dtype": "image",
+            "shape": (SIZE, SIZE, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "c"]},
+        "action": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "gripper"]},
+    }
+    root = tmp_path_factory.mktemp("data") / "table"
+    dataset = LeRobotDataset.create("test/table", 10, features, root=root, use_videos=False)
+    home = np.zeros(2)
+    for task, start, other, end in episodes:
+        other_color = next(color for name, color in COLORS.items() if name != task)
+        for step in range(LENGTH):
+            place = (home, start, start, start, end, end, home)[step]
+            thing = start if step < 4 else end
+            dataset.add_frame(
+                {
+                    "observation.image": image_with((COLORS[task], thing), (other_color, other)),
+                    "observation.state": state_of(place),
+                    "action": np.array([*(place - home), (1, 1, -1, -1, -1, 1, 1)[step]], np.float32),
+                    "task": task,
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDataset("test/table", root=root)
+
+
+@pytest.fixture
+def policy(dataset):
+    policy, _, _ = small_policy(dataset, **CORRESPONDENCE)
+    return policy
+
+
+# Keyframes
+
+
+def test_the_last_grasp_that_is_released_counts():
+    states = torch.arange(14).float()[:, None]
+    gripper = torch.tensor([1, -1, 1, 1, -1, -1, 1, 1, -1, 1.0, 1, 1, -1, -1])
+    keyframes = find_keyframes(states, gripper, [(0, 7), (8, 10), (11, 13)])
+    assert keyframes.found.tolist() == [True, True, False]
+    # One step after the command to close, and the step of the command to open.
+    assert keyframes.states[:2, :, 0].tolist() == [[5, 6], [9, 9]]
+    assert not keyframes.states[2].any()
+    assert release_frames(gripper, [(0, 7), (8, 10), (11, 13)]) == [6, 9, None]
+
+
+# Calibration
+
+
+def test_changes_alone_tell_where_states_are_in_the_image(episodes):
+    first = [image_with((COLORS[task], start), ((0, 200, 0), other)) for task, start, other, _ in episodes]
+    last = [image_with((COLORS[task], end), ((0, 200, 0), other)) for task, _, other, end in episodes]
+    images = [torch.from_numpy(np.stack(side)).permute(0, 3, 1, 2) for side in (first, last)]
+    states = torch.from_numpy(np.stack([state_of(start) for _, start, _, _ in episodes]))
+    to_image = StateToImage(*images, states)
+    places = torch.from_numpy(np.stack([start for _, start, _, _ in episodes])).float()
+    errors = (to_image(states) - places).norm(dim=1) * SIZE / 2
+    assert errors.median() < 1  # px
+    assert errors.max() < 2.5
+
+
+def test_too_few_episodes_for_a_calibration_are_an_error():
+    n = MIN_EPISODES - 1
+    images = torch.zeros(n, 3, SIZE, SIZE, dtype=torch.uint8)
+    with pytest.raises(ValueError, match=f"at least {MIN_EPISODES} episodes .* Got {n}"):
+        StateToImage(images, images, torch.zeros(n, 2))
+
+
+# Recoloring
+
+
+def test_recoloring_changes_its_share_of_the_samples_and_leaves_gray_gray():
+    recolorings = random_recolorings(400, 0.7, torch.Generator().manual_seed(0))
+    same = (recolorings == torch.eye(3)).all(dim=(1, 2))
+    assert 0.2 < same.float().mean() < 0.4
+    gray = recolor(torch.full((400, 3, 2, 2), 0.4), recolorings)
+    torch.testing.assert_close(gray, gray[:, :1].expand_as(gray))
+    images = torch.rand(400, 2, 3, 4, 4)
+    changed = recolor(images, recolorings)
+    assert changed.shape == images.shape
+    assert (changed >= 0).all()
+    assert (changed <= 1).all()
+    torch.testing.assert_close(changed[same], images[same])
+    # Both images of a sample change alike.
+    torch.testing.assert_close(recolor(images[:, :1], recolorings), changed[:, :1])
+
+
+# Maps
+
+
+def test_the_peak_of_a_map_is_its_place():
+    places = torch.rand(5, 2, 2) * 1.6 - 0.8
+    maps = gaussian_maps(places, 24, 32, 0.1)
+    torch.testing.assert_close(peak_places(20 * maps), places, atol=0.03, rtol=0)
+
+
+def test_the_goal_loss_is_least_where_the_goal_is():
+    goals = torch.tensor([[[0.3, -0.4], [-0.5, 0.6]]])
+    right = 5 * gaussian_maps(goals, 12, 12, 0.2)
+    wrong = 5 * gaussian_maps(goals.flip(1), 12, 12, 0.2)
+    assert (goal_loss(right, goals) < goal_loss(torch.zeros_like(right), goals)).all()
+    assert (goal_loss(torch.zeros_like(right), goals) < goal_loss(wrong, goals)).all()
+
+
+def test_what_a_descriptor_was_made_of_is_most_similar_to_it():
+    torch.manual_seed(0)
+    locator = GoalLocator("demo", "demo", condition_dim=0).eval()
+    scene = torch.rand(1, 3, SIZE, SIZE)
+    description = locator.describe(torch.stack([scene, scene], dim=1))
+    features = locator.trunk(scene)
+    row, column = 3, 8
+    logits = locator(scene, scene, description._replace(moved=features[:, :, row, column]), None)
+    assert logits.shape == (1, 2, SIZE // 2, SIZE // 2)
+    assert logits[0, 0].argmax() == row * (SIZE // 2) + column
+
+
+def test_goals_reach_the_action_and_no_other_cameras_image():
+    torch.manual_seed(0)
+    network = ConditionedPolicy(2, 0, 0, 3, True, (8, 8), 2, n_goals=2).eval()
+    images, goals = torch.rand(1, 2, 3, SIZE, SIZE), torch.zeros(1, 2, 2)
+    with_goals = network._with_goals(images, goals)
+    assert with_goals[0, 0, 3:].amax(dim=(1, 2)).min() > 0.7
+    assert not with_goals[0, 1, 3:].any()
+    motion, gripper = network(images, None, None, goals)
+    other_motion, other_gripper = network(images, None, None, goals + 0.5)
+    assert not torch.equal(motion.mean, other_motion.mean)
+    assert not torch.equal(gripper, other_gripper)
+
+
+# The policy
+
+
+def test_goals_of_training_episodes_are_where_things_were_moved(policy, dataset, episodes):
+    policy.forward({**batch_of(dataset, [0, LENGTH])})
+    true = torch.from_numpy(np.stack([np.stack([start, end]) for _, start, _, end in episodes])).float()
+    true = true[policy.train_demonstrations.episodes].clamp(-1, 1)
+    errors = (policy.train_goals.places - true).norm(dim=2) * SIZE / 2
+    assert policy.train_goals.found.all()
+    assert errors.median() < 1.5  # px
+
+
+def test_frames_in_memory_give_the_same_goals(policy, dataset):
+    policy.forward(batch_of(dataset, [0, LENGTH]))
+    frames = FramesInMemory(dataset)
+    in_memory, _, _ = small_policy(dataset, **CORRESPONDENCE)
+    in_memory.set_train_demonstrations(
+        frames.demonstrations("observation.image", SIZE, 2), frames.robot_data()
+    )
+    assert in_memory.train_demonstrations.episodes.tolist() == list(range(60))
+    rows = in_memory.train_demonstrations.episode_rows(policy.train_demonstrations.episodes)
+    torch.testing.assert_close(in_memory.train_goals.states[rows], policy.train_goals.states)
+    torch.testing.assert_close(
+        in_memory.train_goals.places[rows], policy.train_goals.places, atol=0.05, rtol=0
+    )
+
+
+def test_frames_until_the_release_are_those_that_are_trained_on(dataset):
+    use = FramesInMemory(dataset).until_release(2, 0).reshape(-1, LENGTH)
+    assert (use == [True] * 6 + [False]).all()
+
+
+def test_it_learns_to_find_what_a_demonstration_moved(dataset, episodes):
+    torch.manual_seed(0)
+    policy, before, _ = small_policy(
+        dataset, **CORRESPONDENCE, locator_share=1.0, demo_crop_padding=1, crop_padding=0, recolor_share=0.5
+    )
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
+    rng = np.random.default_rng(0)
+    first_frames = np.arange(40) * LENGTH  # of 40 of the 60 episodes
+    for _ in range(60):
+        loss, _ = policy.forward(before(batch_of(dataset, rng.choice(first_frames, 16).tolist())))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    policy.eval()
+    policy.eval_demonstrations = policy.train_demonstrations
+    held_out = range(40, 60)
+    batch = batch_of(dataset, [episode * LENGTH for episode in held_out])
+    conditioning = policy.encode_task(tuple(batch["task"]), batch["observation.image"][:, None])
+    true = torch.from_numpy(np.stack([np.stack(episodes[n][1::2]) for n in held_out])).float()
+    errors = (conditioning.goals.places - true).norm(dim=2) * SIZE / 2
+    assert (errors[:, 0] < 3).float().mean() > 0.85  # the right one of two things, within 3 px
+
+
+@pytest.mark.parametrize("method", ["deltaco", "demo_only", "language_only", "one_hot"])
+def test_every_method_trains_acts_and_is_the_same_when_it_is_loaded(dataset, tmp_path, method):
+    policy, before, _ = small_policy(
+        dataset,
+        **CORRESPONDENCE,
+        method=method,
+        demo_repo_id="test/table",
+        demo_root=str(dataset.root),
+        color_blind_tasks="blue",
+        crop_padding=2,
+    )
+    batch = before(batch_of(dataset, [0, 2, LENGTH, LENGTH + 3]))
+    loss, logged = policy.forward(batch)
+    loss.backward()
+    assert loss.isfinite()
+    assert logged["grasp_loss"] > 0
+    assert all(parameter.grad is not None for parameter in policy.parameters())
+    policy.eval()
+    each, _ = policy.forward(batch, reduction="none")
+    assert each.shape == (4,)
+    observation = {name: batch[name] for name in ("observation.image", "observation.state", "task")}
+    policy.reset()
+    action = policy.select_action(observation)
+    assert action.shape == (4, 3)
+    policy.save_pretrained(tmp_path / "saved")
+    loaded = DeltacoPolicy.from_pretrained(tmp_path / "saved").eval()
+    loaded.reset()
+    torch.testing.assert_close(loaded.select_action(observation), action)
+
+
+def test_goals_are_found_in_the_first_image_of_an_episode(policy, dataset):
+    policy.forward(batch_of(dataset, [0, LENGTH]))
+    policy.eval()
+    batch = batch_of(dataset, [0, LENGTH])
+    observation = {name: batch[name] for name in ("observation.image", "observation.state", "task")}
+    calls = []
+    find = policy.goals.find
+    policy.goals.find = lambda *arguments: calls.append(1) or find(*arguments)
+    for _ in range(3):
+        policy.select_action(observation)
+    assert len(calls) == 1
+    policy.reset()
+    policy.select_action(observation)
+    assert len(calls) == 2
+
+
+def test_several_demonstrations_are_combined(dataset):
+    demos = {"demo_repo_id": "test/table", "demo_root": str(dataset.root)}
+    torch.manual_seed(0)
+    one, _, _ = small_policy(dataset, **CORRESPONDENCE, **demos)
+    three, _, _ = small_policy(dataset, **CORRESPONDENCE, **demos, n_demonstrations=3)
+    three.load_state_dict(one.state_dict())
+    images = batch_of(dataset, [0])["observation.image"][:, None]
+    found = [policy.eval().encode_task((list(COLORS)[0],), images).goals for policy in (one, three)]
+    assert not torch.equal(found[0].logits[:, 0], found[1].logits[:, 0])
+    torch.testing.assert_close(found[0].logits[:, 1], found[1].logits[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "mcil"}, "cannot be 'correspondence' in the method 'mcil'"),
+        ({"film": "demo"}, "can be 'none' or 'language'"),
+        ({"encoder_loss": "contrastive"}, "`encoder_loss` 'none'"),
+        ({"recolor_share": 1.5}, "`recolor_share` must be at most 1"),
+        ({"locator_share": 0.0}, "`locator_share` must be greater than 0"),
+        ({"n_demonstrations": 0}, "`n_demonstrations` must be at least 1"),
+        ({"color_blind_tasks": "("}, "`color_blind_tasks` must be a regular expression"),
+        ({"frames_after_release": -1}, "`frames_after_release` must be at least 0"),
+    ],
+)
+def test_what_cannot_be_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        DeltacoConfig(device="cpu", **{"demo_encoder": "correspondence", **options})
+
+
+def test_it_needs_a_gripper(dataset):
+    with pytest.raises(ValueError, match=r"needs the feature 'observation.state' and a gripper"):
+        small_policy(dataset, **CORRESPONDENCE, gripper="none")
+
+
+def test_a_demonstration_camera_must_exist(dataset):
+    with pytest.raises(ValueError, match=r"`demo_camera` must be one of .*observation.image"):
+        small_policy(dataset, demo_camera="observation.images.wrist")
