@@ -276,6 +276,15 @@ def test_internal_links_resolve(path):
             assert anchor in slugs(linked), f"{page_name(path)} links to {target}"
 
 
+FOLDERS = "benchmarks|datasets_cards|docs|envs|experiments|lerobot_deltaco|results|scripts|tests"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=page_name)
+def test_paths_in_the_repository_exist(path):
+    for name in re.findall(rf"`((?:{FOLDERS})/[\w./-]*)`", path.read_text()):
+        assert "_build" in name or (ROOT / name).exists(), f"{page_name(path)} names {name}"
+
+
 def test_every_page_is_in_the_table_of_contents():
     contents = "\n".join(block for block in fences(DOCS / "index.md", r"\{toctree\}"))
     listed = {line for line in contents.splitlines() if line and not line.startswith(":")}
