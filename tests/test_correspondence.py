@@ -272,6 +272,8 @@ def test_every_method_trains_acts_and_is_the_same_when_it_is_loaded(dataset, tmp
     loaded = DeltacoPolicy.from_pretrained(tmp_path / "saved").eval()
     loaded.reset()
     torch.testing.assert_close(loaded.select_action(observation), action)
+    card = loaded.generate_model_card("test/table", "deltaco", None, None)
+    assert "| goal: where to grasp |" in card.text
 
 
 def test_goals_are_found_in_the_first_image_of_an_episode(policy, dataset):

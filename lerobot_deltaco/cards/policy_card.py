@@ -54,9 +54,18 @@ _INPUT_TEXTS = {
     "language_or_demo": "the embedding of the instruction (projected) or of the demonstration",
 }
 
+# With goals: what determines where to grasp, and where to release.
+_GOAL_TEXTS = {
+    "deltaco": ("the object that the demonstration moved, found in the scene", "the instruction"),
+    "demo_only": ("the object that the demonstration moved, found in the scene", "the demonstration"),
+    "language_only": ("the instruction", "the instruction"),
+    "one_hot": ("the number of the task", "the number of the task"),
+}
+
 _DEMO_ENCODER_TEXTS = {
     "cnn": "the paper's convolutional network, on the array of frames",
     "attention": "a convolutional network with attention, on the frames laid upon each other (ours)",
+    "correspondence": "none: what the demonstration moved is looked for in the scene (ours)",
 }
 
 
@@ -117,7 +126,10 @@ def policy_card(
         concat=_concat_text(config),
         encoder_loss=_encoder_loss_text(config),
         uses_language=config.uses_language,
-        uses_language_input="language" in film or "language" in concat,
+        uses_language_input="language" in film
+        or "language" in concat
+        or (config.locates_goals and config.uses_language),
+        goals=_GOAL_TEXTS[config.method] if config.locates_goals else None,
         uses_demo=config.uses_demo,
         config=config,
         language_repo_id=LANGUAGE_ENCODERS[config.language_encoder].repo_id,
