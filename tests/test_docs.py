@@ -287,7 +287,13 @@ def test_paths_in_the_repository_exist(path):
 
 def test_every_page_is_in_the_table_of_contents():
     contents = "\n".join(block for block in fences(DOCS / "index.md", r"\{toctree\}"))
-    listed = {line for line in contents.splitlines() if line and not line.startswith(":")}
+    entries = [line for line in contents.splitlines() if line and not line.startswith(":")]
+    listed = {
+        path.relative_to(DOCS).with_suffix("").as_posix()
+        for entry in entries
+        for path in DOCS.glob(f"{entry}.md")
+    }
+    assert all("*" in entry or entry in listed for entry in entries)
     pages = {path.relative_to(DOCS).with_suffix("").as_posix() for path in PAGES if DOCS in path.parents}
     assert listed == pages - {"index"}
 
