@@ -1,17 +1,17 @@
 """`--policy.type=deltaco`: every method, baseline and ablation of the paper as a configuration."""
 
-from __future__ import annotations
+# No `from __future__ import annotations`: see `modeling_deltaco.py`.
 
 import re
-from collections.abc import Collection
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import NamedTuple
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
+from lerobot_deltaco.common.checks import check_choices, check_minimums
 from lerobot_deltaco.data.feature_names import ACTION_NAMES
-from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.language_encoders import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
 from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAdamWConfig
 
 
@@ -153,7 +153,7 @@ class DeltacoConfig(PreTrainedConfig):
     film: str | None = None
     concat: str | None = None
     encoder_loss: str | None = None
-    language_encoder: str = "paraphrase-MiniLM-L3-v2"
+    language_encoder: str = DEFAULT_LANGUAGE_ENCODER
     instruction_embeddings: str | None = None
     demo_encoder: str = "cnn"
     demo_rows: int = 1
@@ -205,44 +205,45 @@ class DeltacoConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_choice("method", METHODS)
-        for name in ("film", "concat"):
-            if getattr(self, name) is not None:
-                self._check_choice(name, INPUTS)
-        if self.encoder_loss is not None:
-            self._check_choice("encoder_loss", ENCODER_LOSSES)
-        self._check_choice("language_encoder", LANGUAGE_ENCODERS)
-        self._check_choice("demo_encoder", DEMO_ENCODERS)
-        self._check_choice("backbone", BACKBONES)
-        self._check_choice("gripper_loss", GRIPPER_LOSSES)
-        self._check_choice("scheduler_name", SCHEDULERS)
-        self._check_choice("dtype", DTYPES)
+        check_choices(
+            self,
+            method=METHODS,
+            language_encoder=LANGUAGE_ENCODERS,
+            demo_encoder=DEMO_ENCODERS,
+            backbone=BACKBONES,
+            gripper_loss=GRIPPER_LOSSES,
+            scheduler_name=SCHEDULERS,
+            dtype=DTYPES,
+        )
+        ablations = {"film": INPUTS, "concat": INPUTS, "encoder_loss": ENCODER_LOSSES}
+        check_choices(
+            self, **{name: ablations[name] for name in ablations if getattr(self, name) is not None}
+        )
         if self.gripper_weight is None:
             self.gripper_weight = GRIPPER_LOSSES[self.gripper_loss]
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
             raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
-        for name, minimum in (
-            ("demo_rows", 1),
-            ("demo_columns", 1),
-            ("image_size", 16),
-            ("motion_modes", 1),
-            ("gripper_weight", 0),
-            ("encoder_loss_weight", 0),
-            ("crop_padding", 0),
-            ("demo_crop_padding", 0),
-            ("n_demonstrations", 1),
-            ("goal_noise", 0),
-            ("recolor_share", 0),
-            ("demos_per_task", 0),
-            ("drop_n_last_frames", 0),
-            ("tasks_per_batch", 0),
-            ("seed", 0),
-            ("optimizer_weight_decay", 0),
-            ("scheduler_warmup_steps", 0),
-            ("grad_clip_norm", 0),
-        ):
-            if not getattr(self, name) >= minimum:
-                raise ValueError(f"`{name}` must be at least {minimum}. Got {getattr(self, name)}.")
+        check_minimums(
+            self,
+            demo_rows=1,
+            demo_columns=1,
+            image_size=16,
+            motion_modes=1,
+            gripper_weight=0,
+            encoder_loss_weight=0,
+            crop_padding=0,
+            demo_crop_padding=0,
+            n_demonstrations=1,
+            goal_noise=0,
+            recolor_share=0,
+            demos_per_task=0,
+            drop_n_last_frames=0,
+            tasks_per_batch=0,
+            seed=0,
+            optimizer_weight_decay=0,
+            scheduler_warmup_steps=0,
+            grad_clip_norm=0,
+        )
         for name in ("temperature", "optimizer_lr"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"`{name}` must be greater than 0. Got {getattr(self, name)}.")
@@ -284,11 +285,6 @@ class DeltacoConfig(PreTrainedConfig):
                 "`upsampled_tasks` get a share of the tasks of a batch: `tasks_per_batch` must be at least "
                 f"2. Got {self.tasks_per_batch}."
             )
-
-    def _check_choice(self, name: str, valid: Collection[str]) -> None:
-        value = getattr(self, name)
-        if value not in valid:
-            raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {value!r}.")
 
     def _check_conditioning(self) -> None:
         overridden = [name for name in ("film", "concat", "encoder_loss") if getattr(self, name) is not None]

@@ -543,7 +543,7 @@ def test_an_interrupt_ends_with_a_message_and_the_next_run_goes_on(finished, tmp
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes of the command
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130, error
-    assert "Interrupted. The same command goes on from here." in error
+    assert "Interrupted. Run the same command again to continue." in error
     assert "Traceback" not in error
     with pytest.raises(ValueError, match="unfinished; run its `deltaco-collect` command again to go on"):
         LeRobotDataset("user/deltaco", root=tmp_path)

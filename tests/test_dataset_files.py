@@ -20,7 +20,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from PIL import Image
 
 from gym_deltaco.tasks import TASKS
-from lerobot_deltaco.data import collection
+from lerobot_deltaco.data import collection, feature_names
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import collect
 from lerobot_deltaco.data.collection_plan import FPS, ROBOT_TYPE, CollectionPlan
@@ -138,7 +138,7 @@ def test_constants_are_those_of_lerobot():
     assert str(files.STATS_FILE) == lerobot_files.STATS_PATH
     assert str(files.TASKS_FILE) == lerobot_files.DEFAULT_TASKS_PATH
     as_lerobot_has_them = json.loads(json.dumps(DEFAULT_FEATURES))
-    assert as_lerobot_has_them == files.DEFAULT_FEATURES
+    assert as_lerobot_has_them == feature_names.DEFAULT_FEATURES
 
 
 def test_the_last_file_of_a_chunk_is_followed_by_the_first_of_the_next():

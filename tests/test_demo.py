@@ -117,7 +117,7 @@ def test_the_whole_demo_at_a_tiny_size(tmp_path):
         "counterfactual_trials": 1,
     }
     demo = Demo(tmp_path / "demo", settings)
-    for step in (demo.collect, demo.train, demo.evaluate, demo.ask_otherwise):
+    for step in (demo.collect, demo.train, demo.evaluate, demo.evaluate_counterfactuals):
         step()
     page = write_page(demo)
     summary = json.loads((demo.folder / "summary.json").read_text())
@@ -136,6 +136,6 @@ def test_the_whole_demo_at_a_tiny_size(tmp_path):
             assert Image.open(demo.folder / name).width > 600
     # Everything is done: nothing runs again.
     before = demo.seconds()
-    for step in (demo.collect, demo.train, demo.evaluate, demo.ask_otherwise):
+    for step in (demo.collect, demo.train, demo.evaluate, demo.evaluate_counterfactuals):
         step()
     assert demo.seconds() == before

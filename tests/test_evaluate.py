@@ -17,9 +17,12 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.commands import collect as collect_command
 from lerobot_deltaco.commands import evaluate as evaluate_command
-from lerobot_deltaco.evaluation.evaluate import EvaluationPlan, counterfactual_task, evaluate
+from lerobot_deltaco.common.run_folder import RunError, checkpoints
+from lerobot_deltaco.evaluation import sets
+from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
+from lerobot_deltaco.evaluation.evaluate import counterfactual_task, evaluate
+from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import read_record, record_path
-from lerobot_deltaco.evaluation.runs import RunError, checkpoints, load_policy
 from lerobot_deltaco.training.loop import InMemoryTraining
 
 TASKS = (4, 14, 55)
@@ -152,16 +155,16 @@ def test_the_command_writes_a_record_of_each_checkpoint_once(run, capsys, monkey
     def must_not_run(*arguments):
         raise AssertionError("evaluated again")
 
-    monkeypatch.setattr(evaluate_command, "run_set", must_not_run)
+    monkeypatch.setattr(sets, "run_set", must_not_run)
     evaluate_command.main(arguments)
-    assert capsys.readouterr().out.count("was there already") == 2
+    assert capsys.readouterr().out.count("already evaluated") == 2
 
 
 def test_records_of_other_evaluations_are_not_taken_for_this_one(run, capsys):
     evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "1", "--steps", "last"])
     with pytest.raises(SystemExit):
         evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "2", "--steps", "last"])
-    assert "is of another evaluation" in capsys.readouterr().err
+    assert "belongs to another evaluation" in capsys.readouterr().err
 
 
 def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder(run, tmp_path, capsys):
@@ -178,15 +181,15 @@ def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder
     assert episode.demonstration == episode.instruction == get_task(7).instruction
     with pytest.raises(SystemExit):
         evaluate_command.main([*arguments, "--experiment", "another", "--out", str(tmp_path / "out")])
-    assert "is of another run: of 'small/deltaco' with the seed 7" in capsys.readouterr().err
+    assert "belongs to another run: 'small/deltaco' with seed 7" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--policy.demo_root", "data", "--out", "out"], "Name both"),
+        (["--policy.demo_root", "data", "--out", "out"], "Give both"),
         (["--policy.demo_repo_id", "USER/NAME"], "folder for its records with --out"),
-        (["another_run", "--out", "out"], "for the records of one run. Got 2 runs"),
+        (["another_run", "--out", "out"], "the records of a single run. Got 2 runs"),
         (["--tasks", "301"], "301"),
         (["--trials", "0"], "`trials` must be at least 1"),
         (["--steps", "5"], "no checkpoint of step 5. There are 1, 2"),

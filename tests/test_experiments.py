@@ -17,7 +17,7 @@ from small_policies import TASKS, batch_of, small_policy, use_fake_encoder, writ
 
 from lerobot_deltaco.commands import experiment as experiment_command
 from lerobot_deltaco.data.collection_plan import CollectionPlan
-from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
+from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.experiments import command_runner, side_by_side
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
 from lerobot_deltaco.experiments.config import ExperimentConfigError, experiment_names, read_experiment

@@ -30,6 +30,7 @@ from lerobot_deltaco.cards.dataset_card import (
 )
 from lerobot_deltaco.commands import collect as collect_command
 from lerobot_deltaco.commands import push as push_command
+from lerobot_deltaco.data import collection
 from lerobot_deltaco.data.collection import CollectionError, collect
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.dataset_files import INFO_FILE
@@ -164,7 +165,7 @@ def test_the_commands_in_the_card_are_those_that_made_it(dataset, monkeypatch):
         made.append((plan, append))
         raise CollectionError
 
-    monkeypatch.setattr(collect_command, "collect", instead)
+    monkeypatch.setattr(collection, "collect", instead)
     for line in block.splitlines():
         with pytest.raises(SystemExit):
             collect_command.main(line.split()[1:])

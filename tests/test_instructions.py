@@ -175,7 +175,7 @@ def test_the_authors_file_is_fetched_and_checked(serve, tmp_path, capsys):
     ]
     with pytest.raises(SystemExit):
         main(["--url", "http://127.0.0.1:1", "--out", str(file)])
-    assert "is there already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     main(["--check", str(file)])
     assert "all: 1500 of 300 tasks" in capsys.readouterr().out
 

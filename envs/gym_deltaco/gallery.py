@@ -42,9 +42,6 @@ from gym_deltaco.simulation import Simulation, camera_matrices
 from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, Task, get_task
 from gym_deltaco.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 
-# Every kind of task, each with various containers: six names, three colors, three shapes.
-DEFAULT_TASKS = "4,64,123,179,231,258,33,234,187,90,144,296"
-MAX_SCENES = 12
 N_EPISODES = 3
 POLICY_SIZE = 48  # px, of what a policy sees
 PEOPLE_SIZE = 256  # px, of what people see
@@ -94,13 +91,14 @@ class Figure(NamedTuple):
     text: str
 
 
-def draw_gallery(out: Path, seed: int, task_ids: Sequence[int]) -> None:
+def draw_gallery(out: Path, seed: int, task_ids: Sequence[int], max_scenes: int) -> None:
     """Draws all images, and the page `index.md`, which links to them, last.
 
     Args:
         out: Folder to write to.
         seed: Of the scenes.
         task_ids: Tasks whose scenes are shown; of some, an episode of the expert too.
+        max_scenes: Greatest number of tasks; so many are drawn at random from more.
 
     Raises:
         OSError: The folder cannot be made or written to.
@@ -108,7 +106,7 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=out):
         pass  # so that a folder that cannot be written to is an error before anything is drawn
-    shown = _drawn(task_ids, MAX_SCENES, seed)
+    shown = _drawn(task_ids, max_scenes, seed)
     filmed = shown[:: max(1, len(shown) // N_EPISODES)][:N_EPISODES]
     n_images = len(OBJECTS) + len(shown) + len(filmed) + 2
     progress = tqdm(total=n_images, desc="gallery", unit="image")

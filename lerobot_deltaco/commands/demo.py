@@ -1,4 +1,4 @@
-"""`deltaco-demo`: collects, trains and evaluates on a small set of tasks, and shows what came of it."""
+"""`deltaco-demo`: collects, trains and evaluates on a small set of tasks, and shows the result on a page."""
 
 from __future__ import annotations
 
@@ -6,30 +6,34 @@ import argparse
 import sys
 from pathlib import Path
 
-from lerobot_deltaco.demo.page import write_page
-from lerobot_deltaco.demo.steps import Demo, DemoError
+from lerobot_deltaco.commands.command_errors import exit_on_error
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Does what is not done yet."""
+    """Runs the steps that are not finished yet."""
     parser = argparse.ArgumentParser(
         prog="deltaco-demo",
-        description="In a quarter of an hour on two cores: collects episodes, trains a policy on them with "
-        "lerobot-train, and evaluates it with lerobot-eval. Interrupted, the same command goes on.",
+        description="Collects episodes, trains a policy on them with lerobot-train and evaluates it with "
+        "lerobot-eval, in a quarter of an hour on two cores. After an interruption, the same command "
+        "continues.",
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("outputs/demo"), metavar="DIR", help="where to (%(default)s)"
+        "--out",
+        type=Path,
+        default=Path("outputs/demo"),
+        metavar="DIR",
+        help="folder for all outputs (default: %(default)s)",
     )
     options = parser.parse_args(arguments)
-    try:
+    with exit_on_error(parser):
+        # Only here, since they take seconds to import.
+        from lerobot_deltaco.demo.page import write_page
+        from lerobot_deltaco.demo.steps import Demo, DemoError
+    with exit_on_error(parser, DemoError, OSError):
         demo = Demo(options.out)
-        for step in (demo.collect, demo.train, demo.evaluate, demo.ask_otherwise):
+        for step in (demo.collect, demo.train, demo.evaluate, demo.evaluate_counterfactuals):
             step()
         page = write_page(demo)
-    except (DemoError, OSError) as error:
-        parser.exit(1, f"{parser.prog}: {error}\n")
-    except KeyboardInterrupt:
-        parser.exit(130, f"\n{parser.prog}: Interrupted. The same command goes on from here.\n")
     sys.stdout.write(f"\n{(options.out / 'summary.json').read_text()}\nSee {page}.\n")
 
 

@@ -1,4 +1,4 @@
-"""`deltaco-embed`: embeddings of instructions, for machines without the language model."""
+"""`deltaco-embed`: embeds instructions for machines without the language encoder."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from pathlib import Path
 
 from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.tasks import get_task, select_tasks
-from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.policy.language import InstructionTable, LanguageEncoderError
-from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
-from lerobot_deltaco.policy.task_file import write_task_file
+from lerobot_deltaco.commands.command_errors import exit_on_error
+from lerobot_deltaco.policy.language_encoders import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Embeds instructions, and writes them to a file."""
+    """Embeds instructions, and writes the embeddings to a file."""
     parser = _parser()
     options = parser.parse_args(arguments)
     try:
@@ -25,13 +23,15 @@ def main(arguments: list[str] | None = None) -> None:
             instructions += [line.strip() for line in lines if line.strip()]
     except (ValueError, OSError) as error:
         parser.error(str(error))
+    # Only here, since they take seconds to import.
+    from lerobot_deltaco.policy.language import InstructionTable, LanguageEncoderError
+    from lerobot_deltaco.policy.task_file import write_task_file
+
     table = InstructionTable(options.language_encoder)
-    try:
+    with exit_on_error(parser, LanguageEncoderError, OSError):
         table.add(instructions)
         with atomic_write(options.out) as temporary:
             write_task_file(temporary, table)
-    except (LanguageEncoderError, OSError) as error:
-        parser.exit(1, f"{parser.prog}: {error}\n")
     sys.stdout.write(
         f"{options.out}: {len(table.rows)} instructions. Train with "
         f"--policy.instruction_embeddings={options.out} "
@@ -42,26 +42,26 @@ def main(arguments: list[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="deltaco-embed",
-        description="Writes embeddings of instructions to a file, with which a machine without the language "
-        "model and without a network trains and evaluates.",
+        description="Writes embeddings of instructions to a file. With it, a machine without the language "
+        "encoder and without a network can train and evaluate.",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .safetensors file")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=".safetensors file to write")
     parser.add_argument(
         "--tasks",
         default="all",
-        help="of the benchmark: a task set, or indices and ranges, such as 4,50-73 (%(default)s)",
+        help="task set of the benchmark, or indices and ranges, such as 4,50-73 (default: %(default)s)",
     )
     parser.add_argument(
         "--instructions",
         type=Path,
         metavar="FILE",
-        help="a text file with further instructions, one in a line",
+        help="text file with further instructions, one per line",
     )
     parser.add_argument(
         "--language-encoder",
         choices=LANGUAGE_ENCODERS,
-        default=DeltacoConfig.language_encoder,
-        help="(%(default)s)",
+        default=DEFAULT_LANGUAGE_ENCODER,
+        help="sentence encoder (default: %(default)s)",
     )
     return parser
 

@@ -1,4 +1,4 @@
-"""`deltaco-evaluate`: evaluation sets of checkpoints, one record for each."""
+"""`deltaco-evaluate`: evaluates checkpoints of training runs, and writes a record of each evaluation set."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gym_deltaco.layout import AMBIGUITIES
-from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
+from lerobot_deltaco.commands.command_errors import exit_on_error
+from lerobot_deltaco.common.run_folder import Checkpoint, RunError, checkpoints, describe
+from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import (
     COUNTERFACTUALS,
     EvaluationRecord,
@@ -17,12 +19,10 @@ from lerobot_deltaco.evaluation.record import (
     read_record,
     record_path,
 )
-from lerobot_deltaco.evaluation.runs import Checkpoint, RunError, checkpoints, describe, load_policy
-from lerobot_deltaco.evaluation.sets import run_set
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Evaluates what is not evaluated yet, and shows the rates."""
+    """Evaluates the checkpoints that have no record yet, and prints the success rates."""
     parser = _parser()
     options = parser.parse_args(arguments)
     command = shlex.join([parser.prog, *(sys.argv[1:] if arguments is None else arguments)])
@@ -31,28 +31,24 @@ def main(arguments: list[str] | None = None) -> None:
             options.tasks, options.trials, options.seed, options.counterfactual, options.ambiguity
         )
         if options.out is not None and len(options.runs) > 1:
-            parser.error(f"--out is for the records of one run. Got {len(options.runs)} runs.")
+            parser.error(f"--out holds the records of a single run. Got {len(options.runs)} runs.")
         if options.demo_root is not None and options.demo_repo_id is None:
-            parser.error("--policy.demo_root is the folder of --policy.demo_repo_id. Name both.")
+            parser.error("--policy.demo_root is the folder of --policy.demo_repo_id. Give both.")
         if options.demo_repo_id is not None and options.out is None:
             parser.error(
-                "With other demonstrations, an evaluation is not to be taken for the run's own. Name another "
+                "An evaluation with other demonstrations must not be mixed with the run's own. Name another "
                 "folder for its records with --out."
             )
         todo = [(run, checkpoint) for run in options.runs for checkpoint in _chosen(run, options.steps)]
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    try:
+    with exit_on_error(parser, RunError, RecordError, ValueError, OSError):
         for run, checkpoint in todo:
             _evaluate(run, checkpoint, plan, options, command)
-    except (RunError, RecordError, ValueError, OSError) as error:
-        parser.exit(1, f"{parser.prog}: {error}\n")
-    except KeyboardInterrupt:
-        parser.exit(130, f"\n{parser.prog}: Interrupted. The same command goes on from here.\n")
 
 
 def _chosen(run: Path, steps: str) -> list[Checkpoint]:
-    """The checkpoints of a run that are asked for."""
+    """The checkpoints of a run that `--steps` selects."""
     found = checkpoints(run)
     if steps == "all":
         return found
@@ -61,8 +57,8 @@ def _chosen(run: Path, steps: str) -> list[Checkpoint]:
     wanted = {int(step) for step in steps.split(",")}
     missing = sorted(wanted - {checkpoint.step for checkpoint in found})
     if missing:
-        there = ", ".join(str(checkpoint.step) for checkpoint in found)
-        raise RunError(f"{run} has no checkpoint of step {missing[0]}. There are {there}.")
+        available = ", ".join(str(checkpoint.step) for checkpoint in found)
+        raise RunError(f"{run} has no checkpoint of step {missing[0]}. It has those of {available}.")
     return [checkpoint for checkpoint in found if checkpoint.step in wanted]
 
 
@@ -77,19 +73,23 @@ def _evaluate(
         record = read_record(path)
         if options.out is not None and (record.experiment, record.run_seed) != (experiment, description.seed):
             raise RecordError(
-                f"{path} is of another run: of {record.experiment!r} with the seed {record.run_seed}. Asked "
-                f"for is {experiment!r} with the seed {description.seed}. Name another folder with --out."
+                f"{path} belongs to another run: {record.experiment!r} with seed {record.run_seed}. Expected "
+                f"{experiment!r} with seed {description.seed}. Name another folder with --out."
             )
         made_for = EvaluationPlan(
             record.tasks, record.trials, record.evaluation_seed, record.counterfactual, record.ambiguity
         )
         if made_for != plan:
             raise RecordError(
-                f"{path} is of another evaluation: {asdict(made_for)}. Asked for is {asdict(plan)}. Ask for "
-                "the same one, or name another folder for its records with --out."
+                f"{path} belongs to another evaluation: {asdict(made_for)}. Expected {asdict(plan)}. Use the "
+                "same arguments, or name another folder for the records with --out."
             )
-        sys.stdout.write(_text(run, record, "was there already"))
+        sys.stdout.write(_text(run, record, "already evaluated"))
         return
+    # Only here, since they take seconds to import.
+    from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
+    from lerobot_deltaco.evaluation.sets import run_set
+
     given = {name: getattr(options, name) for name in ("device", "demo_repo_id", "demo_root")}
     overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
     policy, preprocessor, postprocessor = load_policy(checkpoint.folder, overrides)
@@ -126,66 +126,75 @@ def _parser() -> argparse.ArgumentParser:
     plan = EvaluationPlan()
     parser = argparse.ArgumentParser(
         prog="deltaco-evaluate",
-        description="Evaluates checkpoints of training runs, and writes a record of each evaluation set "
-        "into the run's folder `evaluations`. What has a record is skipped. `deltaco-report` tabulates them.",
+        description="Evaluates checkpoints of training runs, and writes a record of each evaluation set to "
+        "the folder `evaluations` of the run. Checkpoints that have a record are skipped. `deltaco-report` "
+        "tabulates the records.",
     )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_DIR", help="of a training")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_DIR", help="folder of a training run")
     parser.add_argument(
         "--tasks",
         default=plan.tasks,
-        help="a task set (scenario_a_test, ...) or indices and ranges, such as 4,50-73 (%(default)s)",
+        help="task set (scenario_a_test, ...), or indices and ranges, such as 4,50-73 (default: %(default)s)",
     )
     parser.add_argument(
-        "--trials", type=int, default=plan.trials, metavar="N", help="episodes of each task (%(default)s)"
+        "--trials",
+        type=int,
+        default=plan.trials,
+        metavar="N",
+        help="number of episodes of each task (default: %(default)s)",
     )
     parser.add_argument(
-        "--seed", type=int, default=plan.seed, help="of the scenes, with the step (%(default)s)"
+        "--seed",
+        type=int,
+        default=plan.seed,
+        help="seed of the scenes, which the step also changes (default: %(default)s)",
     )
     parser.add_argument(
         "--counterfactual",
         choices=COUNTERFACTUALS,
         default=plan.counterfactual,
-        help="show another task's demonstration, or tell its instruction (%(default)s)",
+        help="give another task's demonstration or instruction (default: %(default)s)",
     )
     parser.add_argument(
         "--ambiguity",
         choices=AMBIGUITIES,
         default=plan.ambiguity,
-        help="what of a task is ambiguous: the paper's scheme i or ii (%(default)s)",
+        help="ambiguity scheme of the scenes: container (the paper's scheme i) or object (scheme ii) "
+        "(default: %(default)s)",
     )
     parser.add_argument(
         "--steps",
         type=_steps,
         default="all",
         metavar="all|last|STEP,...",
-        help="which checkpoints (%(default)s)",
+        help="checkpoints to evaluate (default: %(default)s)",
     )
     parser.add_argument(
         "--experiment",
         metavar="NAME",
-        help="what was trained; runs of the same name differ in their seeds "
-        "alone (by default, the run's --job_name)",
+        help="name of the experiment; runs with the same name differ only in their seeds (default: the run's "
+        "--job_name)",
     )
     parser.add_argument(
         "--policy.demo_repo_id",
         dest="demo_repo_id",
         metavar="USER/NAME",
-        help="dataset that shows the tasks (by default, the checkpoint's own demonstrations)",
+        help="dataset of demonstrations (default: the demonstrations in the checkpoint)",
     )
     parser.add_argument(
         "--policy.demo_root",
         dest="demo_root",
         metavar="DIR",
-        help="its folder, if it is not in LeRobot's cache",
+        help="folder of that dataset, if it is not in LeRobot's cache",
     )
     parser.add_argument(
         "--out",
         type=Path,
         metavar="DIR",
-        help="where to write the folder `evaluations` of the one RUN_DIR, for a second evaluation of the "
-        "same steps (by default, in RUN_DIR)",
+        help="folder to hold `evaluations`, for a second evaluation of the same steps of a single RUN_DIR "
+        "(default: RUN_DIR)",
     )
-    parser.add_argument("--device", help="such as cpu or cuda (by default, the checkpoint's)")
+    parser.add_argument("--device", help="device, such as cpu or cuda (default: the checkpoint's)")
     return parser
 
 

@@ -1,17 +1,21 @@
-"""`deltaco-experiment`: runs experiments, from collecting the data to the evaluation."""
+"""`deltaco-experiment`: runs experiments, from collecting the data to evaluating every checkpoint."""
 
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 from pathlib import Path
 
-from lerobot_deltaco.evaluation.record import RecordError
+from lerobot_deltaco.commands.command_errors import exit_on_error
 from lerobot_deltaco.experiments.command_runner import ExperimentError
-from lerobot_deltaco.experiments.config import ExperimentConfigError, read_experiment
+from lerobot_deltaco.experiments.config import (
+    ExperimentConfigError,
+    default_folder,
+    experiment_names,
+    read_experiment,
+)
 from lerobot_deltaco.experiments.run import ExperimentRun
-from lerobot_deltaco.experiments.side_by_side import run_side_by_side
-from lerobot_deltaco.reporting.report import write_report
-from lerobot_deltaco.reporting.series import ReportError
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -20,35 +24,55 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.jobs < 1:
         parser.error(f"--jobs must be at least 1. Got {options.jobs}.")
+    if options.list:
+        sys.stdout.write("".join(f"{name}\n" for name in experiment_names(options.experiments)))
+        return
+    if not options.names:
+        parser.error("Name at least one experiment. --list prints their names.")
     try:
-        names = dict.fromkeys(options.names)
-        configs = [read_experiment(options.experiments, name, options.settings) for name in names]
+        configs = [
+            read_experiment(options.experiments, name, options.settings)
+            for name in dict.fromkeys(options.names)
+        ]
     except ExperimentConfigError as error:
         parser.error(str(error))
-    try:
-        experiments = [
-            ExperimentRun(config, seed, options.out)
-            for seed in dict.fromkeys(options.seed)
-            for config in configs
-        ]
-        done: list[Path] = []
+    runs = [
+        ExperimentRun(config, seed, options.out) for seed in dict.fromkeys(options.seed) for config in configs
+    ]
+    if options.dry_run:
+        with exit_on_error(parser, ExperimentError, OSError):
+            _print_commands(runs)
+        return
+    # Only here, since they take a second to import.
+    from lerobot_deltaco.evaluation.record import RecordError
+    from lerobot_deltaco.experiments.side_by_side import run_side_by_side
+    from lerobot_deltaco.reporting.report import write_report
+    from lerobot_deltaco.reporting.series import ReportError
 
-        def report(run: Path) -> None:
-            """After each, so that there is a report however far it comes."""
-            done.append(run)
-            if options.report is not None:
-                write_report(done, options.report)
+    finished: list[Path] = []
 
+    def report(run: Path) -> None:
+        """Writes the report after each run, so that there is one after an interruption, too."""
+        finished.append(run)
+        if options.report is not None:
+            write_report(finished, options.report)
+
+    with exit_on_error(parser, ExperimentError, ReportError, RecordError, OSError):
         if options.jobs > 1:
-            run_side_by_side(experiments, options.jobs, report)
+            run_side_by_side(runs, options.jobs, report)
         else:
-            for experiment in experiments:
-                experiment.run()
-                report(experiment.folder)
-    except (ExperimentError, ReportError, RecordError, OSError) as error:
-        parser.exit(1, f"{parser.prog}: {error}\n")
-    except KeyboardInterrupt:
-        parser.exit(130, f"\n{parser.prog}: Interrupted. The same command goes on from here.\n")
+            for run in runs:
+                run.run()
+                report(run.folder)
+
+
+def _print_commands(runs: list[ExperimentRun]) -> None:
+    """Prints each command that the runs would run, once."""
+    for run in runs:
+        run.check_settings()
+    commands = [command for run in runs for command in run.commands()]
+    lines = dict.fromkeys(shlex.join([f"deltaco-{name}", *arguments]) for name, arguments in commands)
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -57,9 +81,20 @@ def _parser() -> argparse.ArgumentParser:
         description="Collects the data of experiments, trains, and evaluates every checkpoint. After an "
         "interruption, the same command continues.",
     )
-    parser.add_argument("names", nargs="+", metavar="EXPERIMENT", help="such as scenario_a/deltaco")
     parser.add_argument(
-        "--seed", type=int, nargs="+", default=[0], metavar="SEED", help="one or more, of the training (0)"
+        "names", nargs="*", metavar="EXPERIMENT", help="name of an experiment, such as scenario_a/deltaco"
+    )
+    parser.add_argument("--list", action="store_true", help="print the names of all experiments and end")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="print the commands that would be run, and run none"
+    )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        nargs="+",
+        default=[0],
+        metavar="SEED",
+        help="one or more seeds of the training (default: 0)",
     )
     parser.add_argument(
         "--set",
@@ -67,31 +102,32 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="SECTION.NAME=VALUE",
-        help="a setting that overrides the experiments' files, such as training.steps=2000; may be repeated",
+        help="setting that overrides the experiments' files, such as training.steps=2000; may be repeated",
     )
     parser.add_argument(
         "--jobs",
         type=int,
         default=1,
         metavar="N",
-        help="train and evaluate N runs at a time (%(default)s). Each has its share of the processor's cores "
-        "and its own copy of the frames in memory; those on a GPU are all on the same.",
+        help="number of runs at a time (default: %(default)s). Each gets an equal share of the processor's "
+        "cores and holds its own copy of the frames in memory; on a GPU, all share it.",
     )
     parser.add_argument(
-        "--report",
-        type=Path,
-        metavar="DIR",
-        help="also write the report on these experiments, as deltaco-report does",
+        "--report", type=Path, metavar="DIR", help="folder for the report, as deltaco-report writes it"
     )
     parser.add_argument(
         "--experiments",
         type=Path,
-        default=Path("experiments"),
+        default=default_folder(),
         metavar="DIR",
-        help="folder of the experiments' files (%(default)s)",
+        help="folder of the experiments' files (default: those of this project)",
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("outputs/experiments"), metavar="DIR", help="where to (%(default)s)"
+        "--out",
+        type=Path,
+        default=Path("outputs/experiments"),
+        metavar="DIR",
+        help="folder for all outputs (default: %(default)s)",
     )
     return parser
 

@@ -8,31 +8,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from gym_deltaco.gallery import DEFAULT_TASKS, MAX_SCENES, draw_gallery
 from gym_deltaco.tasks import select_tasks
+from lerobot_deltaco.commands.command_errors import exit_on_error
+
+# All kinds of tasks with various containers: six names, three colors, three shapes.
+DEFAULT_TASKS = "4,64,123,179,231,258,33,234,187,90,144,296"
+MAX_SCENES = 12
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command.
-
-    Args:
-        arguments: Of the command line; None takes the process's own.
-    """
-    parser = argparse.ArgumentParser(
-        prog="deltaco-gallery",
-        description="Draws the benchmark's objects, scenes and expert, and writes a page that shows them.",
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder to write to; made if missing"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of the scenes, at least 0; default: %(default)s")
-    parser.add_argument(
-        "--tasks",
-        default=DEFAULT_TASKS,
-        metavar="SELECTION",
-        help="tasks to show: indices and ranges of 0 to 299, such as 4,50-73, or a set, such as "
-        f"scenario_a_test. Of more than {MAX_SCENES}, so many are drawn at random. Default: %(default)s",
-    )
+    """Draws the images and writes the page."""
+    parser = _parser()
     options = parser.parse_args(arguments)
 
     def fail(message: str) -> NoReturn:
@@ -46,11 +32,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
         fail(f"--tasks: {error}")
     if options.out.exists() and not options.out.is_dir():
         fail(f"--out must be a folder. {options.out} is a file.")
-    try:
-        draw_gallery(options.out, options.seed, task_ids)
-    except OSError as error:
-        fail(f"cannot write to {options.out}: {error.strerror or error}.")
+    with exit_on_error(parser, interrupted="Interrupted."):
+        from gym_deltaco.gallery import draw_gallery  # imports the simulator
+
+        try:
+            draw_gallery(options.out, options.seed, task_ids, MAX_SCENES)
+        except OSError as error:
+            fail(f"cannot write to {options.out}: {error.strerror or error}.")
     sys.stdout.write(f"The images are in {options.out}. Start with {options.out / 'index.md'}.\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="deltaco-gallery",
+        description="Draws the benchmark's objects, scenes and expert, and writes a page that shows them.",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder to write to; created if missing"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the scenes, at least 0 (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--tasks",
+        default=DEFAULT_TASKS,
+        metavar="SELECTION",
+        help="tasks to show: task set, such as scenario_a_test, or indices and ranges of 0 to 299, such as "
+        f"4,50-73; {MAX_SCENES} tasks are drawn at random from a larger selection (default: %(default)s)",
+    )
+    return parser
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from gym_deltaco.instructions import (
     read_instructions,
     split_instructions,
 )
+from lerobot_deltaco.commands.command_errors import exit_on_error
 from lerobot_deltaco.data.authors_instructions import AUTHORS_URL, fetch_instructions
 
 
@@ -19,15 +20,13 @@ def main(arguments: list[str] | None = None) -> None:
     """Fetches instructions, or checks some, and says how many there are."""
     parser = _parser()
     options = parser.parse_args(arguments)
-    try:
+    with exit_on_error(parser, InstructionsError, OSError):
         if options.check is None:
             if options.out.exists():
-                parser.error(f"{options.out} is there already. Check it with --check {options.out}.")
+                parser.error(f"{options.out} already exists. Check it with --check {options.out}.")
             fetch_instructions(options.out, options.url)
         path = options.check or options.out
         instructions = read_instructions(path)
-    except (InstructionsError, OSError) as error:
-        parser.exit(1, f"{parser.prog}: {error}\n")
     lines = [f"{path}: distinct instructions of {len(instructions)} tasks"]
     for split in INSTRUCTION_SPLITS:
         chosen = split_instructions(instructions, split)

@@ -1,59 +1,64 @@
-"""`deltaco-report`: the paper's tables and curves from the records of evaluations."""
+"""`deltaco-report`: writes the paper's tables and curves from the records of evaluations."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lerobot_deltaco.evaluation.record import RecordError
-from lerobot_deltaco.reporting.report import REPORT_FILE, last_text, rate_text, write_report
-from lerobot_deltaco.reporting.series import Report, ReportError, counted
-from lerobot_deltaco.reporting.statistics import paper_rate
+from lerobot_deltaco.commands.command_errors import exit_on_error
+
+if TYPE_CHECKING:
+    from lerobot_deltaco.reporting.series import Report
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Writes the report, and shows its rates."""
+    """Writes the report, and prints its success rates."""
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.out.exists() and not options.out.is_dir():
         parser.error(f"--out must be a folder. {options.out} is a file.")
-    try:
+    from lerobot_deltaco.evaluation.record import RecordError
+    from lerobot_deltaco.reporting.report import write_report
+    from lerobot_deltaco.reporting.series import ReportError
+
+    with exit_on_error(parser, ReportError, RecordError, OSError, interrupted="Interrupted."):
         report = write_report(options.runs, options.out, options.authors_levels)
-    except (ReportError, RecordError, OSError) as error:
-        parser.exit(1, f"{parser.prog}: {error}\n")
-    except KeyboardInterrupt:
-        parser.exit(130, f"\n{parser.prog}: Interrupted.\n")
     sys.stdout.write(_text(report, options.out))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="deltaco-report",
-        description="Reports on evaluations of training runs: the paper's success rates, learning curves, "
-        "what happened in the episodes, and what behavior followed when demonstration and instruction "
-        "differed. Runs of one experiment that differ in their seeds are taken together.",
+        description="Reports on the evaluations of training runs: success rates as in the paper, learning "
+        "curves, outcomes of the episodes, and which of demonstration and instruction the policy followed "
+        "where they differed. Runs of one experiment that differ in their seeds are combined.",
     )
     parser.add_argument(
         "runs",
         type=Path,
         nargs="+",
         metavar="RUN_DIR",
-        help="a training run's folder, in which deltaco-evaluate has written evaluations/*.json, or a folder "
-        "with several runs in it",
+        help="folder of a training run with the records evaluations/*.json that deltaco-evaluate writes, or "
+        "folder with several such runs",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="the report's folder; its files are replaced"
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the report; its files are replaced"
     )
     parser.add_argument(
         "--authors-levels",
         action="store_true",
-        help="draw the authors' rates, which are another simulation's, into the curves as dashed lines",
+        help="draw the rates of the paper, measured in another simulation, into the curves as dashed lines",
     )
     return parser
 
 
 def _text(report: Report, out: Path) -> str:
+    from lerobot_deltaco.reporting.report import REPORT_FILE, last_text, rate_text
+    from lerobot_deltaco.reporting.series import counted
+    from lerobot_deltaco.reporting.statistics import paper_rate
+
     lines = [f"{out / REPORT_FILE}: success in %, as the paper reports it (SD); at the last step [95 %]"]
     for series in report.regular:
         lines.append(

@@ -15,8 +15,8 @@ from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS, EXPERT_NOISE, MIN_IM
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
 from gym_deltaco.seeding import Split, episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, select_tasks
-from lerobot_deltaco.data.dataset_files import DEFAULT_FEATURES
-from lerobot_deltaco.data.feature_names import ACTION_NAMES, PRIVILEGED, STATE_NAMES
+from lerobot_deltaco.common.checks import check_choices, check_minimums
+from lerobot_deltaco.data.feature_names import ACTION_NAMES, DEFAULT_FEATURES, PRIVILEGED, STATE_NAMES
 
 if TYPE_CHECKING:
     from gym_deltaco.env import PickPlaceEnv
@@ -76,22 +76,13 @@ class CollectionPlan:
 
     def __post_init__(self) -> None:
         task_ids = self.task_ids
-        for name, minimum in (
-            ("episodes_per_task", 1),
-            ("seed", 0),
-            ("noise", 0),
-            ("image_size", MIN_IMAGE_SIZE),
-        ):
-            if not getattr(self, name) >= minimum:
-                raise ValueError(f"`{name}` must be at least {minimum}. Got {getattr(self, name)}.")
+        check_minimums(self, episodes_per_task=1, seed=0, noise=0, image_size=MIN_IMAGE_SIZE)
         if not math.isfinite(self.noise):
             raise ValueError(f"`noise` must be finite. Got {self.noise}.")
-        if self.ambiguity not in AMBIGUITIES:
-            raise ValueError(f"`ambiguity` must be one of {', '.join(AMBIGUITIES)}. Got {self.ambiguity!r}.")
+        check_choices(self, ambiguity=AMBIGUITIES)
         if self.split is None:
             object.__setattr__(self, "split", _default_split(self.tasks, task_ids))
-        if self.split not in COLLECTED_SPLITS:
-            raise ValueError(f"`split` must be one of {', '.join(COLLECTED_SPLITS)}. Got {self.split!r}.")
+        check_choices(self, split=COLLECTED_SPLITS)
 
     @property
     def task_ids(self) -> tuple[int, ...]:

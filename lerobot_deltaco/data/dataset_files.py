@@ -31,14 +31,6 @@ STATS_FILE = Path("meta/stats.json")
 TASKS_FILE = Path("meta/tasks.parquet")
 DATA_FILE = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_FILE = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-# LeRobot adds these to the features of every dataset.
-DEFAULT_FEATURES = {
-    "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-    **{
-        name: {"dtype": "int64", "shape": [1], "names": None}
-        for name in ("frame_index", "episode_index", "index", "task_index")
-    },
-}
 _PNG_COMPRESSION = 6
 
 Features = Mapping[str, Mapping[str, Any]]  # as in LeRobot's info.json

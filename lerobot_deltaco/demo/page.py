@@ -14,10 +14,10 @@ from lerobot.datasets import LeRobotDataset
 
 from gym_deltaco.sheets import across, enlarged, framed, grid, save_gif, save_png, to_image
 from gym_deltaco.tasks import get_task
+from lerobot_deltaco.common.run_folder import checkpoints
 from lerobot_deltaco.demo import recipe
 from lerobot_deltaco.demo.steps import DEMONSTRATIONS, Demo
 from lerobot_deltaco.evaluation.record import Counterfactual, read_record, record_path
-from lerobot_deltaco.evaluation.runs import checkpoints
 from lerobot_deltaco.reporting.statistics import followed
 
 # Examples of each kind, and images of an episode.

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gym_deltaco.atomic_files import write_json
+from lerobot_deltaco.common.run_folder import last_policy, last_train_config
 from lerobot_deltaco.demo import recipe
 from lerobot_deltaco.demo.machine import fast_dtype, seconds_per_step
 
@@ -81,7 +82,7 @@ class Demo:
     @property
     def checkpoint(self) -> Path:
         """The policy at the end of the training."""
-        return self.run / "checkpoints" / "last" / "pretrained_model"
+        return last_policy(self.run)
 
     def seconds(self) -> dict[str, float]:
         """How long each finished step took, interruptions not counted."""
@@ -122,7 +123,7 @@ class Demo:
             self.settings["steps"] = self._affordable_steps()
             self._write_settings()
         steps = self.settings["steps"]
-        last = self.checkpoint / "train_config.json"
+        last = last_train_config(self.run)
         if last.exists():
             arguments = [f"--config_path={last}", "--resume=true"]
         else:
@@ -176,7 +177,7 @@ class Demo:
             text = {"trained": "in new scenes", "new": "on combinations that it was not trained on"}[name]
             self._do(f"evaluate_{name}", f"Evaluating {text}", self._lerobot("eval", arguments))
 
-    def ask_otherwise(self) -> None:
+    def evaluate_counterfactuals(self) -> None:
         """Shows the policy another task's demonstration, or tells it another task's instruction."""
         everything = recipe.selection((*self.settings["tasks"], *self.settings["new_combinations"]))
         for what in ("demo", "instruction"):

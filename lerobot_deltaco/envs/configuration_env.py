@@ -1,7 +1,5 @@
 """`--env.type=deltaco`: the benchmark as LeRobot's training and evaluation see it."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.tasks import TASKS, select_tasks
+from lerobot_deltaco.common.checks import check_choices, check_minimums
 from lerobot_deltaco.envs.vector_env import make_task_vector_envs
 
 
@@ -46,17 +45,15 @@ class DeltacoEnv(EnvConfig):
 
     def __post_init__(self):
         select_tasks(self.task)
-        for name, minimum in (
-            ("fps", 1),
-            ("episode_length", 1),
-            ("image_size", MIN_IMAGE_SIZE),
-            ("render_size", MIN_IMAGE_SIZE),
-            ("max_parallel_tasks", 1),
-        ):
-            if getattr(self, name) < minimum:
-                raise ValueError(f"`{name}` must be at least {minimum}. Got {getattr(self, name)}.")
-        if self.ambiguity not in AMBIGUITIES:
-            raise ValueError(f"`ambiguity` must be one of {', '.join(AMBIGUITIES)}. Got {self.ambiguity!r}.")
+        check_minimums(
+            self,
+            fps=1,
+            episode_length=1,
+            image_size=MIN_IMAGE_SIZE,
+            render_size=MIN_IMAGE_SIZE,
+            max_parallel_tasks=1,
+        )
+        check_choices(self, ambiguity=AMBIGUITIES)
         # The environment's names, and what LeRobot calls them in datasets and policies.
         self.features_map = {"pixels": OBS_IMAGE, "agent_pos": OBS_STATE, ACTION: ACTION}
         self.features = {

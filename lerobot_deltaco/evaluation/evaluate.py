@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -14,49 +13,17 @@ from lerobot.scripts.lerobot_eval import rollout
 from tqdm import tqdm
 
 from gym_deltaco import ENV_ID
-from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, Task, get_task, select_tasks
 from gym_deltaco.workspace import Quadrant, container_matches
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.envs.vector_env import make_task_vector_envs
-from lerobot_deltaco.evaluation.record import BENCHMARK, COUNTERFACTUALS, Counterfactual, EpisodeResult
+from lerobot_deltaco.evaluation.plan import EvaluationPlan
+from lerobot_deltaco.evaluation.record import BENCHMARK, Counterfactual, EpisodeResult
 from lerobot_deltaco.evaluation.recording_env import RecordingVectorEnv
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 
 PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
-
-
-@dataclass(frozen=True)
-class EvaluationPlan:
-    """Which episodes an evaluation set consists of.
-
-    Args:
-        tasks: A selection of tasks, as `--env.task` takes it.
-        trials: Episodes of each task.
-        seed: With the set's number, the task and the trial, it decides the scenes.
-        counterfactual: "demo" or "instruction": that one is another task's, whose object stands in the scene
-            and whose container is the other one, if there is such a task; "none": both are the scene's.
-        ambiguity: "container" or "object", the paper's schemes i and ii.
-
-    Raises:
-        ValueError: An argument is not valid; the message says what is.
-    """
-
-    tasks: str = "scenario_a_test"
-    trials: int = 2
-    seed: int = 0
-    counterfactual: Counterfactual = "none"
-    ambiguity: str = "container"
-
-    def __post_init__(self) -> None:
-        select_tasks(self.tasks)
-        for name, minimum in (("trials", 1), ("seed", 0)):
-            if getattr(self, name) < minimum:
-                raise ValueError(f"`{name}` must be at least {minimum}. Got {getattr(self, name)}.")
-        for name, valid in (("counterfactual", COUNTERFACTUALS), ("ambiguity", AMBIGUITIES)):
-            if getattr(self, name) not in valid:
-                raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
 
 
 def evaluate(

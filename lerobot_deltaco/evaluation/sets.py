@@ -9,7 +9,8 @@ import draccus
 from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.evaluation.evaluate import EvaluationPlan, evaluate, versions
+from lerobot_deltaco.evaluation.evaluate import evaluate, versions
+from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import EvaluationRecord, record_path, write_record
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 

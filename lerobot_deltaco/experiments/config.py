@@ -41,6 +41,13 @@ class ExperimentConfig:
     start_from: str | None = None
 
 
+def default_folder() -> Path:
+    """Folder of the project's experiments: in an installed wheel within the package, else in the clone."""
+    package = Path(__file__).parents[1]
+    installed = package / "experiment_files"
+    return installed if installed.is_dir() else package.parent / "experiments"
+
+
 def experiment_names(folder: Path) -> list[str]:
     """Names of the experiments in a folder."""
     return sorted(

@@ -1,4 +1,4 @@
-"""Runs an experiment: collects its data, trains, evaluates every checkpoint. Finished steps are skipped."""
+"""Runs an experiment: collects its data, trains and evaluates all checkpoints. Finished steps are skipped."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from gym_deltaco.atomic_files import write_json
+from lerobot_deltaco.common.run_folder import last_policy, last_step, last_train_config
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
 from lerobot_deltaco.experiments.config import ExperimentConfig
 
-LAST = Path("checkpoints", "last", "pretrained_model")
+
+class Command(NamedTuple):
+    """A command of this project: `deltaco-NAME ARGUMENTS`."""
+
+    name: str
+    arguments: list[str]
 
 
 class ExperimentRun:
@@ -20,7 +26,7 @@ class ExperimentRun:
 
     Args:
         config: The experiment.
-        seed: Of the training: the weights, the order of the data, the draws.
+        seed: Seed of the training: of the weights, the order of the data and the draws.
         outputs: Folder of all outputs: experiments share `data/`; a run's folder is `EXPERIMENT/seed_SEED`.
     """
 
@@ -29,44 +35,58 @@ class ExperimentRun:
         self.seed = seed
         self.outputs = outputs
         self.folder = run_folder(outputs, config.name, seed)
-        self.log = self.folder.with_name(f"{self.folder.name}.log")  # where several run at a time
+        self.log = self.folder.with_name(f"{self.folder.name}.log")  # if several run at the same time
 
     def run(self) -> None:
-        """Everything that is not done yet.
+        """Runs all steps that are not finished yet.
 
         Raises:
-            ExperimentError: A step failed, or the run was begun with other settings.
+            ExperimentError: A step failed, or the run was started with other settings.
         """
         self.check_settings()
         self.collect()
         self.train_and_evaluate(CommandRunner())
 
+    def commands(self) -> list[Command]:
+        """The commands that `run` would run now."""
+        train = self._train_command()
+        return [*self._collect_commands(), *([train] if train else []), self._evaluate_command()]
+
     def check_settings(self) -> None:
-        """Checks that the run, if there is one, was begun with the same settings.
+        """Checks that the run, if it exists, was started with the same settings.
 
         Raises:
-            ExperimentError: It was begun with others.
+            ExperimentError: It was started with others.
         """
         file, settings = self._settings_file(), self._settings()
-        there = json.loads(file.read_text()) if file.exists() else settings
+        found = json.loads(file.read_text(encoding="utf-8")) if file.exists() else settings
         for section, values in settings.items():
-            if there[section] != values:
+            if found[section] != values:
                 raise ExperimentError(
-                    f"{self.folder} was started with other settings: {section} was {there[section]}, now "
+                    f"{self.folder} was started with other settings: {section} was {found[section]}, now "
                     f"{values}. Use the same settings or another --out, or move the run and {file.name} away."
                 )
 
     def collect(self) -> None:
-        """Collects the datasets that the experiment needs and that are missing."""
-        for plan in (self.config.data, self.config.demonstrations):
-            options = [f"--{key.replace('_', '-')}={value}" for key, value in plan.items()]
-            CommandRunner().run("collect", [*options, f"--root={dataset_folder(self.outputs, plan)}"])
+        """Collects the datasets that the experiment needs; complete ones are kept as they are."""
+        for command in self._collect_commands():
+            CommandRunner().run(*command)
 
-    def train_and_evaluate(self, commands: CommandRunner) -> None:
-        """Trains on the datasets that were collected, and evaluates."""
-        self._keep_settings()
-        self._train(commands)
-        self._evaluate(commands)
+    def train_and_evaluate(self, runner: CommandRunner) -> None:
+        """Trains on the collected datasets, and evaluates.
+
+        Raises:
+            ExperimentError: A step failed, or the experiment that this one starts from was not trained.
+        """
+        write_json(self._settings_file(), self._settings())
+        train = self._train_command()
+        if train is not None:
+            if not last_train_config(self.folder).exists():
+                self._check_start()
+                # An interrupted training may have left a folder without any checkpoint.
+                shutil.rmtree(self.folder, ignore_errors=True)
+            runner.run(*train)
+        runner.run(*self._evaluate_command())
 
     def _settings_file(self) -> Path:
         return self.folder.with_name(f"{self.folder.name}.json")
@@ -80,19 +100,25 @@ class ExperimentRun:
             "start_from": self.config.start_from,
         }
 
-    def _keep_settings(self) -> None:
-        write_json(self._settings_file(), self._settings())
+    def _collect_commands(self) -> list[Command]:
+        return [
+            Command(
+                "collect",
+                [
+                    *(f"--{name.replace('_', '-')}={value}" for name, value in plan.items()),
+                    f"--root={dataset_folder(self.outputs, plan)}",
+                ],
+            )
+            for plan in (self.config.data, self.config.demonstrations)
+        ]
 
-    def _train(self, commands: CommandRunner) -> None:
-        """Trains, from the last checkpoint if there is one."""
-        last = self.folder / LAST / "train_config.json"
+    def _train_command(self) -> Command | None:
+        """The command that trains, or resumes the training; None if it is finished."""
+        last = last_train_config(self.folder)
         if last.exists():
-            if _steps_done(self.folder) >= self.config.training["steps"]:
-                return
-            commands.run("train", [f"--config_path={last}", "--resume=true"])
-            return
-        # What an interrupted training left before its first checkpoint.
-        shutil.rmtree(self.folder, ignore_errors=True)
+            if last_step(self.folder) >= self.config.training["steps"]:
+                return None
+            return Command("train", [f"--config_path={last}", "--resume=true"])
         options = {
             **{f"policy.{name}": value for name, value in self.config.policy.items() if value is not None},
             "policy.seed": self.seed,
@@ -112,22 +138,30 @@ class ExperimentRun:
                 "env.ambiguity": self.config.evaluation.get("ambiguity", "container"),
                 "eval.n_episodes": self.config.evaluation["trials"],
             }
-        if self.config.start_from is None:
+        start = self._start_folder()
+        if start is None:
             options = {"policy.type": "deltaco", **options}
         else:
-            start = run_folder(self.outputs, self.config.start_from, self.seed)
-            if not (start / LAST).exists():
-                raise ExperimentError(
-                    f"{self.config.name} starts from {self.config.start_from}, which was not trained with "
-                    f"seed {self.seed}. Run that experiment first."
-                )
-            options = {"policy.path": start / LAST, **options}
-        commands.run("train", [f"--{name}={_text(value)}" for name, value in options.items()])
+            options = {"policy.path": last_policy(start), **options}
+        return Command("train", [f"--{name}={_text(value)}" for name, value in options.items()])
 
-    def _evaluate(self, commands: CommandRunner) -> None:
-        """Evaluates the checkpoints that were not evaluated in training."""
+    def _start_folder(self) -> Path | None:
+        if self.config.start_from is None:
+            return None
+        return run_folder(self.outputs, self.config.start_from, self.seed)
+
+    def _check_start(self) -> None:
+        start = self._start_folder()
+        if start is not None and not last_policy(start).exists():
+            raise ExperimentError(
+                f"{self.config.name} starts from {self.config.start_from}, which was not trained with seed "
+                f"{self.seed}. Run that experiment first."
+            )
+
+    def _evaluate_command(self) -> Command:
+        """The command that evaluates the checkpoints that the training has not evaluated."""
         options = [f"--{name}={value}" for name, value in self.config.evaluation.items()]
-        commands.run("evaluate", [str(self.folder), *options, f"--experiment={self.config.name}"])
+        return Command("evaluate", [str(self.folder), *options, f"--experiment={self.config.name}"])
 
 
 def run_folder(outputs: Path, experiment_name: str, seed: int) -> Path:
@@ -136,13 +170,8 @@ def run_folder(outputs: Path, experiment_name: str, seed: int) -> Path:
 
 
 def dataset_folder(outputs: Path, plan: Mapping[str, Any]) -> Path:
-    """Where the dataset of a collection is, which experiments share."""
+    """The folder of a collection's dataset, which experiments share."""
     return outputs / "data" / "_".join(f"{key}-{value}" for key, value in sorted(plan.items()))
-
-
-def _steps_done(run: Path) -> int:
-    state = run / "checkpoints" / "last" / "training_state" / "training_step.json"
-    return int(json.loads(state.read_text())["step"])
 
 
 def _text(value: Any) -> str:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
-from lerobot_deltaco.evaluation.evaluate import EvaluationPlan
+from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.sets import run_set
 from lerobot_deltaco.lerobot_internals import (
     replaced_in_training_loop,

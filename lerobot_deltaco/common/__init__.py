@@ -1,0 +1,1 @@
+"""What several rooms share, without LeRobot and torch."""

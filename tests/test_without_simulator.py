@@ -1,0 +1,55 @@
+"""Without PyBullet, a policy trains and acts, and what needs the simulator says what to install."""
+
+import subprocess
+import sys
+
+PROGRAM = """
+import sys
+
+sys.modules["pybullet"] = None  # as if it were not installed
+import gymnasium, pytest, torch
+from small_policies import TASKS, batch_of, fake_encoder, observation, small_policy, write_dataset
+
+import gym_deltaco, lerobot_policy_deltaco
+from gym_deltaco import layout, object_sets, tasks, workspace
+from gym_deltaco.errors import SimulatorMissingError
+from lerobot_deltaco.commands import collect
+from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.envs.configuration_env import DeltacoEnv
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy import language
+from lerobot_deltaco.training.frames import FramesInMemory
+
+language.load_language_encoder, fake_encoder.calls = fake_encoder, []
+folder = sys.argv[1]
+dataset = write_dataset(f"{folder}/foreign", [task for task in TASKS for _ in range(2)])
+policy, before, after = small_policy(dataset, demo_repo_id="test/foreign", demo_root=f"{folder}/foreign")
+assert len(FramesInMemory(dataset)) == len(dataset)
+policy(before(batch_of(dataset, [0, 7, 12])))[0].backward()
+policy.save_pretrained(f"{folder}/policy")
+loaded = DeltacoPolicy.from_pretrained(f"{folder}/policy")
+assert loaded.select_action(before(observation(dataset, TASKS))).shape == (3, 3)
+
+CollectionPlan("4", 1)
+for make in (lambda: DeltacoEnv().create_envs(1), lambda: gymnasium.make(gym_deltaco.ENV_ID)):
+    with pytest.raises(SimulatorMissingError, match=r"pip install .lerobot_policy_deltaco\\[sim\\]"):
+        make()
+collect.main(["--tasks", "4", "--episodes-per-task", "1", "--root", f"{folder}/new"])
+"""
+
+
+def test_a_policy_needs_no_simulator_and_what_does_says_so(tmp_path):
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path.parent, env=_environment())
+    *_, last = result.stderr.strip().splitlines()
+    assert result.returncode == 1, result.stderr
+    assert last.startswith("deltaco-collect: The environment needs PyBullet")
+    assert not (tmp_path / "new").exists()
+
+
+def _environment():
+    import os
+    from pathlib import Path
+
+    paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
