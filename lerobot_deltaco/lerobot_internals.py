@@ -16,7 +16,7 @@ import inspect
 import json
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -75,7 +75,10 @@ def replaced_in_training_loop(functions: Mapping[str, Callable[..., Any]]) -> It
     Raises:
         UnsupportedLeRobotError: The loop does not call the functions that are to be replaced.
     """
-    with patch.multiple(training_loop(), **functions):
+    loop = training_loop()
+    with ExitStack() as stack:
+        for name, function in functions.items():
+            stack.enter_context(patch.object(loop, name, function))
         yield
 
 

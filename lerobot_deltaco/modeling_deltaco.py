@@ -202,7 +202,8 @@ class DeltacoPolicy(PreTrainedPolicy):
             known = self.instructions(list(distinct), device)  # (distinct, embedding)
             language = known[column]  # (batch, embedding)
 
-        if self.config.method == "mcil":
+        if self.project_language is not None:
+            # MCIL: the mean of the losses with the instruction's embedding and with the demonstration's.
             parts = [
                 self._imitation_loss(batch, images, film, None)
                 for film in (self.project_language(language), demo)
@@ -214,6 +215,8 @@ class DeltacoPolicy(PreTrainedPolicy):
             loss, logged = self._imitation_loss(batch, images, film, concat)
 
         if self.config.conditioning.encoder_loss != "none":
+            assert demo is not None
+            assert language is not None
             logits = contrastive_logits(demo.float(), known, self.config.temperature)  # (batch, distinct)
             if self.config.conditioning.encoder_loss == "contrastive":
                 encoder_loss = contrastive_loss(logits, column)
@@ -242,7 +245,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         rows = demonstrations.episode_rows(batch["episode_index"])
         known = (rows >= 0) & self.train_goals.found[rows]
         places = self.train_goals.places[rows]  # (batch, 2, 2)
-        logged = {}
+        logged: dict[str, Tensor] = {}
         if self.training:
             if not self._train_demonstrations_are_complete:
                 demonstrations.check_episodes(batch["episode_index"], rows)
@@ -361,6 +364,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         logged = {"motion_nll": likelihood.mean(), "motion_mse": error.mean()}
         if gripper is None:
             return likelihood, logged
+        assert target is not None
+        assert self.config.gripper_weight is not None
         error = gripper_loss(gripper.float(), target, self.config.gripper_loss)
         logged["gripper_loss"] = error.mean()
         logged["gripper_accuracy"] = ((gripper > 0) == (target > 0.5)).float().mean()
@@ -517,11 +522,12 @@ class DeltacoPolicy(PreTrainedPolicy):
             demo = self._encode_demo(demonstrations, rows, generator)
         if self.config.uses_language:
             language = self.instructions(tasks, images.device)
-        if self.config.method == "mcil":
-            # The trials of a task use the instruction and the demonstration in turn.
+        if self.project_language is not None:
+            assert demo is not None
+            # MCIL: the trials of a task use the instruction and the demonstration in turn.
             by_language = torch.tensor(trials, device=images.device) % 2 == 0
-            film = torch.where(by_language[:, None], self.project_language(language), demo)
-            return TaskConditioning(tasks, film, None, self._acting_model())
+            either = torch.where(by_language[:, None], self.project_language(language), demo)
+            return TaskConditioning(tasks, either, None, self._acting_model())
         film, concat = self.conditioning_inputs(tasks, demo, language)
         return TaskConditioning(tasks, film, concat, self._acting_model(), goals)
 
@@ -583,8 +589,8 @@ class DeltacoPolicy(PreTrainedPolicy):
                 return None
             if name == "one_hot":
                 return self._one_hot(tasks)
-            embeddings = {"demo": demo, "language": language}
-            return torch.cat([embeddings[part] for part in name.split("+")], dim=-1)
+            used = [demo if part == "demo" else language for part in name.split("+")]
+            return torch.cat([embedding for embedding in used if embedding is not None], dim=-1)
 
         film, concat, _ = self.config.conditioning
         return source(film), source(concat)
@@ -604,6 +610,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         self, demonstrations: DemonstrationSet, rows: Tensor, generator: torch.Generator
     ) -> Tensor:
         """Unit embeddings of demonstrations, (batch, embedding)."""
+        assert self.demo_encoder is not None
         frames = demonstrations.sample_frames(rows, self.config.n_demo_frames, generator)
         if self.training and self.config.demo_crop_padding:
             frames = random_crop(frames, self.config.demo_crop_padding, generator)
@@ -620,7 +627,7 @@ class DeltacoPolicy(PreTrainedPolicy):
     def _join_action(self, motion: Tensor, gripper: Tensor | None) -> Tensor:
         """The inverse of `_split_action`."""
         index = self.config.gripper_index
-        if index is None:
+        if index is None or gripper is None:
             return motion
         return torch.cat([motion[:, :index], 2 * gripper[:, None] - 1, motion[:, index:]], dim=1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gym_deltaco.solids import Color, Loft, Mesh, merged, polygon
+from gym_deltaco.solids import Color, Loft, Mesh, Row, merged, polygon
 
 _BLACK: Color = (0.13, 0.13, 0.14)
 _DARK: Color = (0.20, 0.20, 0.22)
@@ -18,7 +18,7 @@ def _beam(
     half_y: float, half_z: float, start: float, end: float, color: Color, outline: np.ndarray = _BEAM
 ) -> Mesh:
     """A bar along x, from `start` to `end` (m)."""
-    rows = [((half_z, half_y), start, color), ((half_z, half_y), end)]
+    rows: list[Row] = [((half_z, half_y), start, color), ((half_z, half_y), end)]
     return Loft(outline, rows, tilt=90).mesh()
 
 

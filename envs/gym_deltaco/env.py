@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, get_args
+from typing import Any, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -92,7 +92,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         ValueError: An argument is out of its range; the message says what is valid.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_FPS}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_FPS}
 
     def __init__(
         self,
@@ -129,7 +129,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.render_size = render_size
         self.instructions = instructions
         self._instruction: str | None = None  # of the current episode; None is the task's template
-        self.observation_space = spaces.Dict(
+        self.observation_space: gym.Space[Any] = spaces.Dict(
             {
                 "pixels": spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
                 "agent_pos": spaces.Box(
@@ -210,7 +210,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             # A generator of its own, so that scenes are the same with and without.
             (rng,) = self.np_random.spawn(1)
             sentences = self.instructions[task.index]
-            self._instruction = sentences[rng.integers(len(sentences))]
+            self._instruction = sentences[int(rng.integers(len(sentences)))]
         return self._observation(), self._info()
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -227,8 +227,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             ValueError: The action has another shape, or a number that is not finite. The scene is unchanged.
         """
         scene = self.scene
-        action = _validated(action)
-        scene.command(scene.arm.position + ACTION_SCALE * action[:3], is_open=bool(action[3] > 0))
+        motion, gripper = np.split(_validated(action), [3])
+        scene.command(scene.arm.position + ACTION_SCALE * motion, is_open=bool(gripper[0] > 0))
         for index in range(len(scene.bodies)):
             if scene.is_grasped(index):
                 self._grasped_object = index

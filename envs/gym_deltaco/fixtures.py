@@ -7,7 +7,7 @@ import functools
 import numpy as np
 
 from gym_deltaco.simulation import Box
-from gym_deltaco.solids import Color, Loft, Mesh
+from gym_deltaco.solids import Color, Loft, Mesh, Row
 from gym_deltaco.tasks import ContainerColor
 from gym_deltaco.workspace import (
     CONTAINER_FLOOR_THICKNESS,
@@ -62,7 +62,7 @@ def table_mesh() -> Mesh:
     """The table's top around the tray, in the world's frame. What the tray hides would only take time."""
     (x, y, _), (half_x, half_y, _) = TABLE_BOXES[0]
     hole_x, hole_y = TRAY_HALF_EXTENTS
-    rows = [((half_x, half_y), TABLE_TOP, _TABLE_COLOR), ((hole_x, hole_y), TABLE_TOP)]
+    rows: list[Row] = [((half_x, half_y), TABLE_TOP, _TABLE_COLOR), ((hole_x, hole_y), TABLE_TOP)]
     return _without_undersides(Loft(_SQUARE, rows, offset=(x, y, 0.0), closed=True).mesh())
 
 
@@ -85,11 +85,11 @@ def _open_box_mesh(boxes: tuple[Box, ...], wall_color: Color, floor_color: Color
     inner = outer - 2 * wall.half_extents[0]
     bottom, top = (wall.center[2] + side * wall.half_extents[2] for side in (-1, 1))
     floor_top = floor.center[2] + floor.half_extents[2]
-    rows = [
-        (tuple(outer), bottom, wall_color),
-        (tuple(outer), top),
-        (tuple(inner), top),
-        (tuple(inner), floor_top),
+    rows: list[Row] = [
+        ((outer[0], outer[1]), bottom, wall_color),
+        ((outer[0], outer[1]), top),
+        ((inner[0], inner[1]), top),
+        ((inner[0], inner[1]), floor_top),
         (0.0, floor_top, floor_color),
     ]
     return _without_undersides(Loft(_SQUARE, rows).mesh())

@@ -79,7 +79,8 @@ def parse_instructions(text: str, source: str) -> list[tuple[int, str]]:
                     f"{source}, line {reader.line_num}: there must be {len(header)} columns. Got {len(row)}; "
                     "a sentence with a comma is put between double quotes."
                 )
-            rows.append(_parse_row(*row[-2:], f"{source}, line {reader.line_num}"))
+            task_id, sentence = row[-2:]
+            rows.append(_parse_row(task_id, sentence, f"{source}, line {reader.line_num}"))
     except csv.Error as error:
         raise InstructionsError(f"{source}, line {reader.line_num}: {error}.") from error
     if not rows:

@@ -39,7 +39,7 @@ class Region(NamedTuple):
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of the points (..., 2) lie in it."""
-        return ((points >= self.low) & (points <= self.high)).all(axis=-1)
+        return np.all((points >= self.low) & (points <= self.high), axis=-1)
 
 
 class Quadrant(NamedTuple):

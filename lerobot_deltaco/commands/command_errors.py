@@ -22,9 +22,10 @@ def exit_on_error(
         errors: Errors whose messages a user can act on. Others are bugs, and show a traceback.
         interrupted: What to say after an interrupt.
     """
+    actionable: tuple[type[Exception], ...] = (SimulatorMissingError, *errors)
     try:
         yield
-    except (SimulatorMissingError, *errors) as error:
+    except actionable as error:
         parser.exit(1, f"{parser.prog}: {error}\n")
     except KeyboardInterrupt:
         parser.exit(130, f"\n{parser.prog}: {interrupted}\n")

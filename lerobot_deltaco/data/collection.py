@@ -395,12 +395,12 @@ def _run(job: _Job, n_workers: int) -> int:
                 if not running:
                     return n_missing
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    part, index = running.pop(future)
+                    part, collected = running.pop(future)
                     future.result()
-                    if index is None:
+                    if collected is None:
                         continue
                     progress.update()
-                    missing[part].remove(index)
+                    missing[part].remove(collected)
                     if not missing[part]:
                         running[_submit(executor, _join, part)] = (part, None)
         except BrokenProcessPool:

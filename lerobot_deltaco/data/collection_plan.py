@@ -159,6 +159,7 @@ def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, numbe
     from gym_deltaco.expert import expert_episode
 
     for attempt in range(MAX_ATTEMPTS):
+        assert plan.split is not None
         seed = episode_seed(plan.seed, plan.split, task_id, number, attempt)
         steps = list(expert_episode(env, task_id, seed, plan.noise))
         if not steps[-1].info["is_success"]:

@@ -47,7 +47,8 @@ def numbered(file: str, number: int) -> Path:
 
 def data_schema(features: Features) -> pa.Schema:
     """Columns of the frames, with what Hugging Face's `datasets` needs to read them as features."""
-    fields, hugging_face = [], {}
+    fields: list[pa.Field] = []
+    hugging_face: dict[str, dict[str, Any]] = {}
     for name, feature in features.items():
         dtype, (size, *_) = feature["dtype"], feature["shape"]
         if dtype == "image":

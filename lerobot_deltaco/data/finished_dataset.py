@@ -16,11 +16,11 @@ from PIL import Image
 from tqdm import tqdm
 
 from gym_deltaco.tasks import N_TASKS
+from lerobot_deltaco.common.typed_fields import in_words, is_a
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.dataset_statistics import STATISTICS, Statistics
 from lerobot_deltaco.data.integrity import DIGESTS_FILE, DatasetError, damaged, file_digest, read_digests
-from lerobot_deltaco.typed_fields import in_words, is_a
 
 HISTORY_FILE = Path("meta/deltaco.json")
 # Where a collection under way keeps its files, in the dataset's folder.
@@ -130,7 +130,7 @@ def read_statistics(root: Path, features: Mapping[str, Any]) -> dict[str, Statis
             raise damaged(path, f"{feature} lacks {missing}", _REMEDY)
         for name, value in statistics.items():
             try:
-                is_finite = np.isfinite(np.array(value, dtype=np.float64)).all()
+                is_finite = bool(np.isfinite(np.array(value, dtype=np.float64)).all())
             except (TypeError, ValueError):
                 is_finite = False
             if not is_finite:

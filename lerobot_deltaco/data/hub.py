@@ -65,7 +65,7 @@ def push_dataset(root: Path, repo_id: str, private: bool = False, branch: str | 
             for path in root.glob(pattern)
             if path.is_file() and not path.name.startswith(".")
         }
-        operations = [
+        operations: list[CommitOperationAdd | CommitOperationDelete] = [
             *(CommitOperationAdd(name, path) for name, path in sorted(local.items())),
             *(CommitOperationAdd(str(file), card / file) for file in CARD_FILES),
             # LeRobot reads every file in these folders, so those of an earlier, larger dataset must go.

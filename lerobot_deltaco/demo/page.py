@@ -75,7 +75,7 @@ def write_page(demo: Demo) -> Path:
         "success_rate_new_combinations": _rate(new).rate,
         "chance": recipe.CHANCE,
         "episodes": _rate(trained).episodes + _rate(new).episodes,
-        "minutes": sum(step["minutes"] for step in steps),
+        "minutes": sum(seconds[name] / 60 for name in STEP_NAMES if name in seconds),
     }
     settings = demo.settings
     values = {
@@ -203,8 +203,11 @@ def _draw_examples(demo: Demo, results: list[TaskResult]) -> list[dict[str, Any]
 
 def read_video(path: Path) -> list[np.ndarray]:
     """Frames of a video, (height, width, 3) uint8 each."""
-    with av.open(str(path)) as container:
+    container = av.open(str(path))
+    try:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    finally:
+        container.close()
 
 
 def _demonstration(shown: LeRobotDataset, instruction: str) -> list[np.ndarray]:

@@ -43,7 +43,7 @@ class DeltacoEnv(EnvConfig):
     image_size: int = 48
     render_size: int = 96
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         select_tasks(self.task)
         check_minimums(
             self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gym_deltaco.layout import AMBIGUITIES
+from gym_deltaco.layout import AMBIGUITIES, Ambiguity
 from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.common.checks import check_choices, check_minimums
 from lerobot_deltaco.evaluation.record import COUNTERFACTUALS, Counterfactual
@@ -32,7 +32,7 @@ class EvaluationPlan:
     trials: int = 2
     seed: int = 0
     counterfactual: Counterfactual = "none"
-    ambiguity: str = "container"
+    ambiguity: Ambiguity = "container"
 
     def __post_init__(self) -> None:
         select_tasks(self.tasks)

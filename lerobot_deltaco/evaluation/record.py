@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, fields
-from functools import cache
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args
 
 from gym_deltaco.atomic_files import write_json
 from gym_deltaco.tasks import N_TASKS, OBJECTS
+from lerobot_deltaco.common.typed_fields import in_words, is_a, type_hints
 
 RECORD_FORMAT = 1
 RECORDS_FOLDER = "evaluations"
@@ -152,15 +151,10 @@ def read_record(path: Path) -> EvaluationRecord:
     return EvaluationRecord(**{**content, "episodes": episodes})
 
 
-@cache
-def _types(kind: type[Any]) -> dict[str, Any]:
-    return get_type_hints(kind)
-
-
 def _check_fields(path: Path, content: Any, kind: type[Any], but: str | None = None) -> None:
     """Checks that a record or an episode has its fields, of their types (those of one field excepted)."""
     if not isinstance(content, dict):
-        raise RecordError(f"{path} is damaged: it has {content!r} where {kind.__name__} is due.")
+        raise RecordError(f"{path} is damaged: expected the fields of {kind.__name__}, got {content!r}.")
     expected = {field.name for field in fields(kind)}
     if set(content) != expected:
         missing, unknown = sorted(expected - set(content)), sorted(set(content) - expected)
@@ -168,35 +162,11 @@ def _check_fields(path: Path, content: Any, kind: type[Any], but: str | None = N
             f"{path} is damaged or of another version: {kind.__name__} lacks {missing or 'nothing'}, and has "
             f"the unknown {unknown or 'nothing'}."
         )
-    for name, value_kind in _types(kind).items():
-        if name != but and not _is_a(content[name], value_kind):
+    for name, value_kind in type_hints(kind).items():
+        if name != but and not is_a(content[name], value_kind):
             raise RecordError(
-                f"{path} is damaged: `{name}` must be {_in_words(value_kind)}. Got {content[name]!r}."
+                f"{path} is damaged: `{name}` must be {in_words(value_kind)}. Got {content[name]!r}."
             )
-
-
-def _is_a(value: Any, kind: Any) -> bool:
-    """Whether a value of JSON is of a field's type."""
-    origin = get_origin(kind)
-    if origin is Literal:
-        return value in get_args(kind)
-    if origin is UnionType:
-        return any(_is_a(value, option) for option in get_args(kind))
-    if origin is list:
-        return isinstance(value, list) and all(_is_a(item, get_args(kind)[0]) for item in value)
-    if origin is dict:
-        return isinstance(value, dict) and all(_is_a(item, get_args(kind)[1]) for item in value.values())
-    if kind is Any:
-        return True
-    if kind is float:
-        return type(value) in (int, float)
-    return type(value) is kind  # True is no int here
-
-
-def _in_words(kind: Any) -> str:
-    if get_origin(kind) is Literal:
-        return f"one of {', '.join(get_args(kind))}"
-    return kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
 
 
 def _check_numbers(path: Path, episode: EpisodeResult) -> None:

@@ -35,6 +35,10 @@ class DemonstrationSet(torch.nn.Module):
 
     frames: Tensor
     episodes: Tensor
+    _order: Tensor
+    _start: Tensor
+    _place: Tensor
+    _row_of_episode: Tensor
 
     def __init__(self, frames: Tensor, tasks: Sequence[str], episodes: Sequence[int]) -> None:
         super().__init__()

@@ -48,6 +48,9 @@ def folded(network: ConditionedPolicy) -> ConditionedPolicy:
 
 
 def _fold(parent: nn.Module, convolution: str, norm: str) -> None:
-    fused = fuse_conv_bn_eval(parent.get_submodule(convolution), parent.get_submodule(norm))
+    before, after = parent.get_submodule(convolution), parent.get_submodule(norm)
+    assert isinstance(before, nn.Conv2d)
+    assert isinstance(after, nn.BatchNorm2d)
+    fused = fuse_conv_bn_eval(before, after)
     setattr(parent, convolution, fused)
     setattr(parent, norm, nn.Identity())

@@ -276,7 +276,8 @@ def gaussian_maps(places: Tensor, height: int, width: int, std: float | Tensor) 
 
 def features_at(maps: Tensor, places: Tensor) -> Tensor:
     """What maps (batch, channels, h, w) are around places (batch, places, 2): (batch, places, channels)."""
-    weights = gaussian_maps(places, *maps.shape[-2:], GOAL_STD)
+    height, width = maps.shape[-2:]
+    weights = gaussian_maps(places, height, width, GOAL_STD)
     weights = weights / weights.sum(dim=(2, 3), keepdim=True).clamp_min(1e-3)
     return torch.einsum("bphw,bchw->bpc", weights.to(maps.dtype), maps)
 

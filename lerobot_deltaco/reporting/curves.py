@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_deltaco.reporting.paper_results import CHANCE, PAPER_RESULTS, label_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 PANEL_SIZE = (9.0, 4.4)  # inches
 DOTS_PER_INCH = 140
@@ -83,7 +87,7 @@ def draw_curves(panels: Sequence[tuple[str, Sequence[Curve]]], authors_levels: b
     return image.getvalue()
 
 
-def _draw_panel(ax, curves: Sequence[Curve], authors_levels: bool) -> None:
+def _draw_panel(ax: Axes, curves: Sequence[Curve], authors_levels: bool) -> None:
     from matplotlib.lines import Line2D
 
     other_styles = iter(_OTHER_STYLES * (1 + len(curves) // len(_OTHER_STYLES)))

@@ -11,7 +11,7 @@ import logging
 import re
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,7 @@ class InMemoryTraining:
     @contextmanager
     def active(self) -> Iterator[None]:
         """Lets LeRobot's loop run over frames in memory."""
-        functions = {
+        functions: dict[str, Callable[..., Any]] = {
             "make_train_eval_datasets": self.make_datasets,
             "make_policy": self.make_policy,
             "EpisodeAwareSampler": self.make_sampler,
@@ -102,11 +102,10 @@ class InMemoryTraining:
         config.num_workers = 0
         train, evaluation = self._make_datasets(config)
         # Scaled beforehand where that takes less memory than the images as they are.
-        size: int | None = config.policy.image_size
+        size = config.policy.image_size
         shapes = [train.meta.features[camera]["shape"] for camera in train.meta.camera_keys]
-        if all(3 * size**2 >= np.prod(shape) for shape in shapes):
-            size = None
-        self._frames = FramesInMemory(train, self._device(config.policy), size)
+        is_smaller = any(3 * size**2 < np.prod(shape) for shape in shapes)
+        self._frames = FramesInMemory(train, self._device(config.policy), size if is_smaller else None)
         return FrameIndexDataset(train), evaluation
 
     def make_policy(self, **arguments: Any) -> PreTrainedPolicy:

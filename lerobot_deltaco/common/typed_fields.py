@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from dataclasses import fields
 from functools import cache
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 
 def check_field_types(instance: Any, but: tuple[str, ...] = ()) -> None:
@@ -29,9 +30,13 @@ def check_field_types(instance: Any, but: tuple[str, ...] = ()) -> None:
 
 
 @cache
+def _type_hints(kind: Hashable) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
 def type_hints(kind: type[Any]) -> dict[str, Any]:
     """The declared types of a class's attributes, by name."""
-    return get_type_hints(kind)
+    return _type_hints(cast(Hashable, kind))
 
 
 def is_a(value: Any, kind: Any) -> bool:
@@ -69,11 +74,11 @@ def in_words(kind: Any) -> str:
         return f"a list whose items are each {in_words(options[0])}"
     if origin is dict:
         return f"a mapping from {in_words(options[0])} to {in_words(options[1])}"
-    names = {
+    names: dict[Any, str] = {
         int: "an integer",
         float: "a finite number",
         str: "a string",
         bool: "true or false",
         NoneType: "None",
     }
-    return names.get(kind) or getattr(kind, "__name__", str(kind))
+    return names.get(kind) or str(getattr(kind, "__name__", kind))
