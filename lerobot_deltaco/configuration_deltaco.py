@@ -23,7 +23,7 @@ class Conditioning(NamedTuple):
     encoder_loss: str  # what aligns demonstrations with instructions
 
 
-# Rows of the paper's tables 1 to 3.
+# The methods of the paper's tables 1 and 2.
 METHODS = MappingProxyType(
     {
         "deltaco": Conditioning("demo", "language", "contrastive"),
@@ -72,9 +72,9 @@ DTYPES = ("float32", "bfloat16")
 @PreTrainedConfig.register_subclass("deltaco")
 @dataclass
 class DeltacoConfig(PreTrainedConfig):
-    """DeL-TaCo (Yu & Mooney, ICLR 2023): a policy told its task by a demonstration and an instruction.
+    """DeL-TaCo (Yu & Mooney, ICLR 2023): a policy conditioned on a demonstration and an instruction.
 
-    The defaults are the paper's (appendix B), for images of 48 x 48 pixels. On a small machine, choose
+    The defaults are the paper's (tables 5 to 7), for images of 48 x 48 pixels. On a small machine, choose
     `backbone=strided`: half of the residual blocks, with up to 64 channels, on maps of half the size, for a
     seventeenth of the arithmetic, and, with `demo_encoder=cnn`, a demonstration encoder on maps of half the
     size.
@@ -106,7 +106,7 @@ class DeltacoConfig(PreTrainedConfig):
             contains "gripper", if any) or "none".
         gripper_loss: squared_error, or cross_entropy (ours).
         gripper_weight: Of the gripper's loss in the imitation loss; by default 30, or 3 for cross_entropy.
-        encoder_loss_weight: Of the encoder's loss, lambda in the paper's equation 4.
+        encoder_loss_weight: Weight of the encoder loss, alpha_d in the paper's equation 3.
         temperature: Of the contrastive loss.
         crop_padding: Pixels by which observations are shifted at random in training, 0 for none.
         demo_crop_padding: The same for demonstrations. Without it, the encoder soon knows those of a small

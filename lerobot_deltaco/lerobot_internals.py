@@ -5,6 +5,8 @@
 - Neither the policy nor its card is told which episodes of a dataset are trained on; that is read from the
   command line or the configuration file, as LeRobot reads it.
 - A processor step keeps the transition that it processes in an attribute, which several threads overwrite.
+- Some of LeRobot's log messages are pages long: a traceback for each version of FFmpeg that torchcodec does
+  not find, and the paths of all videos of an evaluation.
 
 What is replaced is checked first: with an unsupported version of LeRobot, an error names those that are
 supported.
@@ -14,6 +16,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -154,3 +157,45 @@ def make_processor_steps_thread_safe() -> None:
 
     if getattr(ProcessorStep, _TRANSITION, ...) is None:
         setattr(ProcessorStep, _TRANSITION, _PerThread())
+
+
+# Log messages
+
+_LONG_LOGS = ("lerobot.utils.import_utils", "lerobot.scripts.lerobot_eval", "__main__")
+_NO_TORCHCODEC = "'torchcodec' is installed but cannot be loaded"
+_VIDEO_PATHS = ("video_paths", "predicted_video_paths")
+
+
+class _ShortMessages(logging.Filter):
+    """Shortens messages, and lets the one about torchcodec through once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._has_said_no_torchcodec = False
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if isinstance(record.msg, dict):
+            record.msg = _without_video_paths(record.msg)
+        elif isinstance(record.msg, str) and _NO_TORCHCODEC in record.msg:
+            if self._has_said_no_torchcodec:
+                return False
+            self._has_said_no_torchcodec = True
+            record.msg = "Videos are decoded by PyAV, since torchcodec finds no FFmpeg that it supports."
+        return True
+
+
+_SHORT_MESSAGES = _ShortMessages()
+
+
+def shorten_logs() -> None:
+    """Keeps pages of library errors and of video paths out of LeRobot's logs."""
+    for name in _LONG_LOGS:
+        logging.getLogger(name).addFilter(_SHORT_MESSAGES)
+
+
+def _without_video_paths(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {
+            name: _without_video_paths(value) for name, value in content.items() if name not in _VIDEO_PATHS
+        }
+    return content

@@ -8,9 +8,10 @@ import torch
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline, make_default_pre_post_processors
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.lerobot_internals import make_processor_steps_thread_safe
+from lerobot_deltaco.lerobot_internals import make_processor_steps_thread_safe, shorten_logs
 
 make_processor_steps_thread_safe()
+shorten_logs()
 
 
 def make_deltaco_pre_post_processors(

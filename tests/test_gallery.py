@@ -19,6 +19,7 @@ from gym_deltaco.tasks import OBJECTS, get_task
 from lerobot_deltaco.commands.gallery import main
 
 IMAGES = {
+    "objects_by_name.png",
     "objects_by_shape.png",
     "objects_by_color.png",
     "scenes.png",

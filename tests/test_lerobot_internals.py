@@ -1,10 +1,12 @@
 """What relies on LeRobot's internals finds them here, and says so where another version lacks them."""
 
 import inspect
+import logging
 from pathlib import Path
 
 import pytest
-from lerobot.scripts import lerobot_train
+from lerobot.scripts import lerobot_eval, lerobot_train
+from lerobot.utils import import_utils
 
 from lerobot_deltaco import lerobot_internals
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
@@ -12,6 +14,7 @@ from lerobot_deltaco.lerobot_internals import (
     LOOP_FUNCTIONS,
     UnsupportedLeRobotError,
     replaced_in_training_loop,
+    shorten_logs,
     step_of_videos,
     training_loop,
 )
@@ -61,3 +64,20 @@ def test_the_annotation_of_the_configuration_is_a_class():
     """LeRobot's own tests of policies ask `issubclass` of it."""
     annotation = inspect.signature(DeltacoPolicy.__init__).parameters["config"].annotation
     assert annotation is DeltacoConfig
+
+
+def test_logs_have_neither_pages_of_library_errors_nor_of_video_paths(monkeypatch, caplog):
+    def not_found(name):
+        raise OSError("\n".join(["libavutil.so.60: cannot open shared object file"] * 100))
+
+    shorten_logs()
+    monkeypatch.setattr(lerobot_internals._SHORT_MESSAGES, "_has_said_no_torchcodec", False)
+    monkeypatch.setattr(import_utils.importlib, "import_module", not_found)
+    monkeypatch.setattr(import_utils.importlib.util, "find_spec", lambda name: object())
+    with caplog.at_level(logging.INFO):
+        assert [import_utils.get_safe_default_video_backend() for _ in range(3)] == ["pyav"] * 3
+        lerobot_eval.logger.info({"pc_success": 50.0, "video_paths": ["a.mp4"]})
+        lerobot_eval.logger.info({"name": {"pc_success": 50.0, "predicted_video_paths": []}})
+    decoder, *results = [record.getMessage() for record in caplog.records]
+    assert decoder == "Videos are decoded by PyAV, since torchcodec finds no FFmpeg that it supports."
+    assert results == ["{'pc_success': 50.0}", "{'name': {'pc_success': 50.0}}"]

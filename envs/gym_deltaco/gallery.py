@@ -61,6 +61,11 @@ _LAST_FRAME_MS = 1500
 _STEPS_AFTER_SUCCESS = 2  # to show
 _TRIES = 50  # seeds, to find a scene that shows what is meant
 
+_OBJECTS_TEXT = (
+    f"Large: seen from nearby. Small: the same in the {POLICY_SIZE} px image that a policy sees. Framed in "
+    "orange: the 8 that scenario A does not train on by name."
+)
+
 TEST_OBJECTS = frozenset(SCENARIOS["a"].test_rows) & frozenset(range(len(OBJECTS)))
 
 
@@ -108,14 +113,15 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int], max_scenes: int)
         pass  # so that a folder that cannot be written to is an error before anything is drawn
     shown = _drawn(task_ids, max_scenes, seed)
     filmed = shown[:: max(1, len(shown) // N_EPISODES)][:N_EPISODES]
-    n_images = len(OBJECTS) + len(shown) + len(filmed) + 2
-    progress = tqdm(total=n_images, desc="gallery", unit="image")
+    n_updates = len(OBJECTS) + len(shown) + len(filmed) + 2
+    progress = tqdm(total=n_updates, desc="gallery", unit="image")
     with progress, closing(Simulation()) as simulation:
         cells = []
         for index in range(len(OBJECTS)):
             cells.append(object_cell(simulation, object_model(index)))
             progress.update()
         figures = [
+            draw_objects_by_name(out, cells),
             draw_objects(out, "shape", SHAPES, cells),
             draw_objects(out, "color", COLORS, cells),
             draw_scenes(out, seed, shown, progress.update),
@@ -141,7 +147,7 @@ def page(figures: Iterable[Figure]) -> str:
 
 
 def draw_objects(out: Path, what: str, names: Sequence[str], cells: Sequence[Image.Image]) -> Figure:
-    """The 32 objects in groups.
+    """The 32 objects in groups by shape or color, as in the paper's figures 6 and 5.
 
     Args:
         out: Folder to write to.
@@ -158,11 +164,19 @@ def draw_objects(out: Path, what: str, names: Sequence[str], cells: Sequence[Ima
     file = f"objects_by_{what}.png"
     shelves = [across(shelf, gap=GAP) for shelf in _shelves(groups)]
     save_png(framed(down(shelves, gap=2 * GAP), thickness=GAP), out / file)
-    text = (
-        f"All 32 objects, by {what}. Large: seen from nearby. Small: the same in the {POLICY_SIZE} px "
-        "image that a policy sees. Framed in orange: the 8 that scenario A does not train on by name."
-    )
-    return Figure(file, f"Objects by {what}", text)
+    return Figure(file, f"Objects by {what}", f"All 32 objects, by {what}. {_OBJECTS_TEXT}")
+
+
+def draw_objects_by_name(out: Path, cells: Sequence[Image.Image]) -> Figure:
+    """The 32 objects in the order of their numbers, as in the paper's figure 4.
+
+    Args:
+        out: Folder to write to.
+        cells: An image for each object.
+    """
+    file = "objects_by_name.png"
+    save_png(framed(grid(cells, _N_COLUMNS, gap=GAP), thickness=GAP), out / file)
+    return Figure(file, "Objects by name", f"All 32 objects, by number. {_OBJECTS_TEXT}")
 
 
 def object_cell(simulation: Simulation, model: ObjectModel) -> Image.Image:

@@ -8,7 +8,8 @@ from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel, Task
 
 OBJECT_SETS = MappingProxyType(
     {
-        # As in the authors' code: test objects stand as distractors in training scenes.
+        # Test objects stand as distractors in training scenes, as in the authors' code:
+        # https://github.com/Alacarter/roboverse-deltaco, commit d6d407b.
         "all": OBJECTS,
         # Without the 8 test objects of scenario A.
         "scenario_a_train": tuple(label for label in OBJECTS if label.index in SCENARIOS["a"].train_rows),

@@ -1,7 +1,7 @@
 """The 32 objects as geometry: what is drawn, what collides, and where the gripper takes hold.
 
-The authors' meshes are not public. These are our own parametric solids, made to resemble the paper's figure
-of the objects in name, shape and color. The labels are in `gym_deltaco.tasks.OBJECTS`.
+The authors' meshes are not public. These are our own parametric solids, made to resemble the paper's figures
+4 to 6 of the objects in name, shape and color. The labels are in `gym_deltaco.tasks.OBJECTS`.
 
 Recipes are in millimeters, with the table at z = 0 and the fingers closing along x; models are in meters,
 with the origin in the middle of the bounding box. The gripper opens to 74 mm and arrives with an error of

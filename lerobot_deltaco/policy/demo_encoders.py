@@ -14,7 +14,7 @@ from lerobot_deltaco.policy.networks import mean_position, multilayer_perceptron
 
 
 class ArrayEncoder(nn.Module):
-    """The paper's (appendix B): a convolutional network on an array of frames, as if it were one image.
+    """The paper's encoder (figure 7): a convolutional network on an array of frames, as if it were one image.
 
     Args:
         height: Of a frame, px.

@@ -1,4 +1,4 @@
-"""The losses of the paper (section 4.2 and appendix B), and one of several Gaussians, of plain tensors."""
+"""The losses: of the paper (equations 1 and 2), of BC-Z, and of a mixture of Gaussians (ours)."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def gripper_loss(logit: Tensor, target: Tensor, kind: str) -> Tensor:
 
 
 def contrastive_logits(demo: Tensor, language: Tensor, temperature: float) -> Tensor:
-    """How alike each demonstration is to each instruction: the logits of the paper's equation 3.
+    """How alike each demonstration is to each instruction: the logits of the paper's equation 1.
 
     Args:
         demo: Unit embeddings of the samples' demonstrations, (batch, embedding).

@@ -1,4 +1,4 @@
-"""The policy's network (the paper's figure 3, appendix B), which task embeddings condition.
+"""The policy's network (the paper's figure 7, appendix B), which task embeddings condition.
 
     image (3, H, W)
         |
@@ -16,6 +16,8 @@
 
 Task embedding: a unit vector that stands for a task, made from a demonstration or an instruction. What goes
 through FiLM and what is concatenated is the caller's to choose.
+
+The authors' code that some comments refer to: https://github.com/Alacarter/deltaco, commit a5423d8.
 """
 
 from __future__ import annotations
@@ -97,7 +99,7 @@ class ConditionedPolicy(nn.Module):
         share = (INITIAL_LOG_STD - MIN_LOG_STD) / (MAX_LOG_STD - MIN_LOG_STD)
         stds = (motion_dim,) if motion_modes == 1 else (motion_modes, motion_dim)
         self.raw_log_std = nn.Parameter(torch.full(stds, math.log(share / (1 - share))))
-        # After the authors' code: on the concatenated features (the paper's figure: after the layers above).
+        # After the authors' code: on the concatenated features (the paper's figure 7: after those layers).
         self.gripper = multilayer_perceptron([feature_dim, gripper_hidden_dim, 1]) if has_gripper else None
 
     @property
@@ -209,7 +211,7 @@ class FilmBlock(nn.Module):
 class Film(nn.Module):
     """Feature-wise linear modulation, (1 + gamma) x + beta, with gamma and beta linear in an embedding.
 
-    It begins close to the identity. (After the authors' code; the paper's figure has gamma x + beta.)
+    It begins close to the identity. (After the authors' code; the paper's figure 7 has gamma x + beta.)
     """
 
     def __init__(self, embedding_dim: int, channels: int) -> None:

@@ -16,7 +16,7 @@ CHANCE = 1 / 6
 
 
 class PaperResult(NamedTuple):
-    """A row of one of the paper's tables.
+    """A row of one of the paper's tables 1 to 3 (results), 8 (ablations) or 9 (ambiguity).
 
     Attributes:
         label: What the row is called in tables and images.

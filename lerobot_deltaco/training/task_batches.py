@@ -1,4 +1,4 @@
-"""Batches of k tasks with b samples each (the paper's appendix B): in which order frames are drawn."""
+"""The order in which frames are drawn: batches of k tasks with b samples each (the paper's algorithm 1)."""
 
 from __future__ import annotations
 
