@@ -192,7 +192,7 @@ def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder
         (["another_run", "--out", "out"], "the records of a single run. Got 2 runs"),
         (["--tasks", "301"], "301"),
         (["--trials", "0"], "`trials` must be at least 1"),
-        (["--steps", "5"], "no checkpoint of step 5. There are 1, 2"),
+        (["--steps", "5"], "no checkpoint of step 5. It has those of 1, 2"),
         (["--steps", "first"], "must be 'all', 'last' or steps"),
     ],
 )

@@ -6,9 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
-import tomllib
 from contextlib import ExitStack
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -208,13 +206,6 @@ def test_a_card_of_other_images_names_the_options_of_the_environment(copy):
         block = re.search(rf"```bash\n{program}.+?```", card_text(copy), re.DOTALL)[0]
         assert {"--env.image_size=64", "--env.ambiguity=object"} <= set(block.split())
     assert "identical" in card_text(copy)
-
-
-def test_the_wheel_has_the_templates():
-    project = Path(__file__).parents[1]
-    build = tomllib.loads((project / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
-    assert build["targets"]["wheel"]["force-include"] == {"datasets_cards": "lerobot_deltaco/datasets_cards"}
-    assert list((project / "datasets_cards").glob("*.md"))
 
 
 def test_a_dataset_that_was_edited_has_a_card_too(copy):

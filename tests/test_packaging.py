@@ -33,7 +33,7 @@ def lerobot_outputs():
         )
         for name, arguments in commands.items()
     }
-    return {name: process.communicate(timeout=180)[0] for name, process in processes.items()}
+    return {name: process.communicate(timeout=900)[0] for name, process in processes.items()}
 
 
 def test_lerobot_requires_the_distribution_name_to_have_underscores():
