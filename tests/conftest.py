@@ -1,8 +1,39 @@
 """The default tests need neither a network nor a GPU, and leave the user's caches alone."""
 
+import functools
 import os
+
+import pytest
 
 # Before anything imports huggingface_hub, which reads it once. `HF_HUB_OFFLINE=0 pytest -m hub` goes online.
 for name in ("HF_HUB_OFFLINE", "HF_DATASETS_OFFLINE", "TRANSFORMERS_OFFLINE"):
     os.environ.setdefault(name, "1")
 os.environ.setdefault("WANDB_MODE", "disabled")
+
+
+# Small policies. Their module is imported where it is used: it imports LeRobot, which takes 10 s.
+
+
+@pytest.fixture
+def fake_language(monkeypatch):
+    """A fake sentence encoder in the place of all others."""
+    from small_policies import use_fake_encoder
+
+    use_fake_encoder(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """A small dataset unlike the benchmark's."""
+    from small_policies import EPISODES_PER_TASK, TASKS, write_dataset
+
+    episodes = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
+    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
+
+
+@pytest.fixture
+def make(dataset):
+    """Makes a small policy and its processors."""
+    from small_policies import small_policy
+
+    return functools.partial(small_policy, dataset)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
-from small_policies import batch_of, small_policy, use_fake_encoder
+from small_policies import batch_of, small_policy
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
@@ -20,9 +20,7 @@ COLORS = {"move the red thing left": (230, 40, 30), "move the blue thing right":
 CORRESPONDENCE = {"demo_encoder": "correspondence", "image_size": SIZE, "motion_modes": 2}
 
 
-@pytest.fixture(autouse=True)
-def _language(monkeypatch):
-    use_fake_encoder(monkeypatch)
+pytestmark = pytest.mark.usefixtures("fake_language")
 
 
 def image_with(*things):

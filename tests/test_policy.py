@@ -1,7 +1,6 @@
 """The policy on a small dataset unlike the benchmark's: two cameras, a gripper in the middle."""
 
 import copy
-import functools
 import itertools
 import sys
 import threading
@@ -10,14 +9,11 @@ import pytest
 import torch
 from lerobot.configs import NormalizationMode
 from small_policies import (
-    EPISODES_PER_TASK,
     LENGTH,
     TASKS,
     batch_of,
     fake_encoder,
     observation,
-    small_policy,
-    use_fake_encoder,
     write_dataset,
 )
 
@@ -29,26 +25,11 @@ from lerobot_deltaco.policy.language import LanguageEncoderError
 from lerobot_deltaco.policy.step_generator import step_generator
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
-
-@pytest.fixture(autouse=True)
-def _language(monkeypatch):
-    use_fake_encoder(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    episodes = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
-    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
+pytestmark = pytest.mark.usefixtures("fake_language")
 
 
 # What is not the paper's, together.
 OURS = {"demo_encoder": "attention", "motion_modes": 3}
-
-
-@pytest.fixture
-def make(dataset):
-    """Makes a small policy and its processors."""
-    return functools.partial(small_policy, dataset)
 
 
 # Configuration

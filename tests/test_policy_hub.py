@@ -18,7 +18,7 @@ from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.robots import so_follower  # noqa: F401  (`--robot.type=so101_follower`)
 from lerobot.rollout.configs import RolloutConfig
-from small_policies import EPISODES_PER_TASK, REPO_ID, TASKS, small_policy, use_fake_encoder, write_dataset
+from small_policies import REPO_ID, TASKS, small_policy, write_dataset
 
 from gym_deltaco import ENV_ID
 from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
@@ -31,15 +31,7 @@ from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
 POLICY_ID = f"{USER}/policy"
 
 
-@pytest.fixture(autouse=True)
-def _language(monkeypatch):
-    use_fake_encoder(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    episodes = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
-    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
+pytestmark = pytest.mark.usefixtures("fake_language")
 
 
 @pytest.fixture(scope="module")

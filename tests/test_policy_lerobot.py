@@ -1,7 +1,6 @@
 """What LeRobot asks of its own policies: they are made, saved, loaded, optimized, and trained on videos."""
 
 import copy
-import functools
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -26,8 +25,6 @@ from small_policies import (
     fake_encoder,
     observation,
     small_policy,
-    use_fake_encoder,
-    write_dataset,
 )
 
 from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
@@ -36,22 +33,7 @@ from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy import language
 from lerobot_deltaco.policy.language import InstructionTable
 
-
-@pytest.fixture(autouse=True)
-def _language(monkeypatch):
-    use_fake_encoder(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    episodes = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
-    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
-
-
-@pytest.fixture
-def make(dataset):
-    """Makes a small policy and its processors."""
-    return functools.partial(small_policy, dataset)
+pytestmark = pytest.mark.usefixtures("fake_language")
 
 
 def assert_equal_weights(policy, other):

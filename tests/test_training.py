@@ -13,7 +13,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.scripts import lerobot_train
 from PIL import Image
 from safetensors.torch import load_file
-from small_policies import REPO_ID, TASKS, batch_of, use_fake_encoder, write_dataset
+from small_policies import REPO_ID, TASKS, batch_of, write_dataset
 
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import load_demonstrations
@@ -23,9 +23,7 @@ from lerobot_deltaco.training.loop import InMemoryTraining
 EPISODES = [task for task in TASKS for _ in range(4)]
 
 
-@pytest.fixture(autouse=True)
-def _language(monkeypatch):
-    use_fake_encoder(monkeypatch)
+pytestmark = pytest.mark.usefixtures("fake_language")
 
 
 @pytest.fixture(scope="module")
