@@ -105,12 +105,12 @@ class DeltacoConfig(PreTrainedConfig):
         gripper: Which dimension of the action is the gripper: an index, "auto" (the last one whose name
             contains "gripper", if any) or "none".
         gripper_loss: squared_error, or cross_entropy (ours).
-        gripper_weight: Of the gripper's loss in the imitation loss; by default 30, or 3 for cross_entropy.
+        gripper_weight: Weight of the gripper loss in the policy loss; by default 30, or 3 for cross_entropy.
         encoder_loss_weight: Weight of the encoder loss, alpha_d in the paper's equation 3.
-        temperature: Of the contrastive loss.
+        temperature: Temperature of the contrastive loss.
         crop_padding: Pixels by which observations are shifted at random in training, 0 for none.
-        demo_crop_padding: The same for demonstrations. Without it, the encoder soon knows those of a small
-            dataset by heart, and misreads new ones.
+        demo_crop_padding: The same for demonstrations. Without it, the encoder overfits to a small
+            dataset, and misreads new demonstrations.
         demo_camera: Name of the camera for demonstrations and goals, such as "observation.images.front". By
             default, the first.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation, with
@@ -125,13 +125,13 @@ class DeltacoConfig(PreTrainedConfig):
         frames_after_release: With `deltaco-train`, the number of frames that are trained on after the gripper
             has last opened in an episode, instead of leaving out the last `drop_n_last_frames`; None for all.
         demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at
-            least 2, so that none is shown its own episode; 0 for one drawn anew for every sample. Sharing
+            least 2, so that none gets its own episode; 0 for a new one for every sample. Sharing
             saves most of the demonstration encoder's time.
-        demo_repo_id: Dataset that shows the tasks at evaluation; at least one episode of each.
-        demo_root: Its folder, if it is not in LeRobot's cache.
+        demo_repo_id: Dataset of demonstrations for evaluation, with at least one episode of each task.
+        demo_root: Folder of that dataset, if it is not in LeRobot's cache.
         demo_episode: Its one episode that shows the task whatever the instruction; for paraphrases and for
             sentences of one's own.
-        demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default those
+        demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default, those
             that are trained on.
         drop_n_last_frames: How many of the last frames of each episode are not trained on.
         tasks_per_batch: With `deltaco-train`, the number of tasks in a batch, with as many samples each (the
@@ -139,14 +139,14 @@ class DeltacoConfig(PreTrainedConfig):
         upsampled_tasks: With `deltaco-train`, a regular expression; the tasks in which it is found get
             `upsampled_share` of each batch.
         upsampled_share: See above; the paper's scenario B has 0.5.
-        seed: Of the draws of demonstrations and crops, which are a function of it and the step.
-        dtype: float32 or bfloat16, of the networks' arithmetic; their last layers' is float32.
-        compile: Whether the networks are compiled, which pays on a GPU.
+        seed: Seed of the draws of demonstrations and crops, which also depend on the step.
+        dtype: Precision of the networks: float32 or bfloat16; their last layers always use float32.
+        compile: Whether to compile the networks, which makes training on a GPU faster.
         optimizer_lr: Learning rate of Adam.
-        optimizer_weight_decay: Of the weights, as in AdamW.
-        scheduler_name: Course of the learning rate: constant, or cosine, down to 0 at the training's end.
-        scheduler_warmup_steps: Over which a learning rate on a cosine rises from 0.
-        grad_clip_norm: Greatest norm of the gradient, 0 for no limit.
+        optimizer_weight_decay: Weight decay, as in AdamW.
+        scheduler_name: Schedule of the learning rate: constant, or cosine, which decays to 0.
+        scheduler_warmup_steps: Number of steps of the cosine schedule's warmup.
+        grad_clip_norm: Maximum norm of the gradient; 0 does not clip.
     """
 
     method: str = "deltaco"
@@ -257,8 +257,8 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(f"`frames_after_release` must be at least 0. Got {self.frames_after_release}.")
         if self.demos_per_task == 1:
             raise ValueError(
-                "`demos_per_task` cannot be 1: the sample from the one episode would be shown itself. Choose "
-                "2 or more, or 0 for a demonstration of each sample's own."
+                "`demos_per_task` cannot be 1: samples of that episode would be demonstrated by themselves. "
+                "Set it to 2 or more, or to 0 for a demonstration per sample."
             )
         if self.n_demo_frames < 2:
             raise ValueError(
@@ -295,7 +295,7 @@ class DeltacoConfig(PreTrainedConfig):
             self._check_correspondence(film, concat, encoder_loss)
             return
         if film == concat == "none":
-            raise ValueError("`film` and `concat` are both 'none': the policy would not know its task.")
+            raise ValueError("`film` and `concat` are both 'none': the policy would get no task.")
         if encoder_loss != "none" and not self.uses_demo:
             raise ValueError(
                 f"`encoder_loss` is {encoder_loss!r}, but no demonstration is used. Set it to 'none', or use "
@@ -377,7 +377,7 @@ class DeltacoConfig(PreTrainedConfig):
         """Decides what the training dataset tells: which dimension is the gripper, how actions are scaled.
 
         Args:
-            dataset_features: Of the training dataset; None at evaluation, where all is decided.
+            dataset_features: Features of the training dataset; None in evaluation, where all is known.
         """
         names = (dataset_features or {}).get("action", {}).get("names")
         if isinstance(names, dict):
@@ -440,7 +440,7 @@ class DeltacoConfig(PreTrainedConfig):
         )
 
     def get_scheduler_preset(self) -> CosineSchedulerConfig | None:
-        """The learning rate's course; None is a constant."""
+        """The schedule of the learning rate; None is a constant."""
         if self.scheduler_name == "constant":
             return None
         return CosineSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)

@@ -2,7 +2,7 @@
 
 - LeRobot's training loop has no hook for datasets, samplers and evaluation. `deltaco-train` therefore
   replaces some of the functions that the loop calls, while it runs.
-- Neither the policy nor its card is told which episodes of a dataset are trained on; that is read from the
+- Neither the policy nor its card learns which episodes of a dataset are trained on; they are read from the
   command line or the configuration file, as LeRobot reads it.
 - A processor step keeps the transition that it processes in an attribute, which several threads overwrite.
 - Some of LeRobot's log messages are pages long: a traceback for each version of FFmpeg that torchcodec does

@@ -808,7 +808,7 @@ def test_a_damaged_file_that_waits_is_named_and_can_be_collected_anew(
     path = tmp_path / STAGING / damaged
     flipped(path, 0.4)
     part_file = tmp_path / STAGING / "parts/00001.json"
-    with pytest.raises(CollectionError, match="damaged.*collected anew") as error:
+    with pytest.raises(CollectionError, match="damaged.*collected again") as error:
         collect(tmp_path, PLAN)
     assert str(path) in str(error.value)
     assert f"Delete {part_file}" in str(error.value)

@@ -44,7 +44,7 @@ def test_a_step_is_done_once(demo, tmp_path, capsys):
 def test_a_failed_step_is_named_and_done_again(demo, tmp_path):
     flag = tmp_path / "flag"
     command = [sys.executable, "-c", f"import os, sys; sys.exit(0 if os.path.exists({str(flag)!r}) else 3)"]
-    with pytest.raises(DemoError, match="(?s)Greeting failed .exit status 3.*goes on from here"):
+    with pytest.raises(DemoError, match="(?s)Greeting failed .exit status 3.*it continues from here"):
         demo._do("greet", "Greeting", command)
     first = demo.seconds()
     assert "greet" not in first

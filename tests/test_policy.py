@@ -73,7 +73,7 @@ def test_the_defaults_are_the_papers():
         ({"demos_per_task": 1}, "`demos_per_task` cannot be 1"),
         ({"temperature": 0.0}, "`temperature` must be greater than 0"),
         ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
-        ({"film": "none", "concat": "none"}, "would not know its task"),
+        ({"film": "none", "concat": "none"}, "would get no task"),
         ({"method": "language_only", "encoder_loss": "contrastive"}, "no demonstration is used"),
         ({"method": "mcil", "film": "demo"}, "`film` cannot be changed"),
     ],

@@ -178,7 +178,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         """Draws and builds a new scene.
 
         Args:
-            seed: Seeds `np_random`; None goes on with the present draws.
+            seed: Seed of `np_random`; None continues its draws.
             options: "task_id": the task of this and the following episodes, 0..299. Others are for wrappers.
 
         Returns:

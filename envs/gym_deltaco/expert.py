@@ -63,7 +63,7 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EX
     Args:
         env: The environment, without wrappers.
         task_id: 0..299.
-        seed: Of the scene, the drop point and the noise.
+        seed: Seed of the scene, the drop point and the noise.
         noise: Standard deviation of the noise on the motions.
 
     Yields:

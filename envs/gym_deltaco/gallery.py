@@ -101,7 +101,7 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int], max_scenes: int)
 
     Args:
         out: Folder to write to.
-        seed: Of the scenes.
+        seed: Seed of the scenes.
         task_ids: Tasks whose scenes are shown; of some, an episode of the expert too.
         max_scenes: Greatest number of tasks; so many are drawn at random from more.
 
@@ -112,8 +112,8 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int], max_scenes: int)
     with tempfile.TemporaryFile(dir=out):
         pass  # so that a folder that cannot be written to is an error before anything is drawn
     shown = _drawn(task_ids, max_scenes, seed)
-    filmed = shown[:: max(1, len(shown) // N_EPISODES)][:N_EPISODES]
-    n_updates = len(OBJECTS) + len(shown) + len(filmed) + 2
+    recorded = shown[:: max(1, len(shown) // N_EPISODES)][:N_EPISODES]
+    n_updates = len(OBJECTS) + len(shown) + len(recorded) + 2
     progress = tqdm(total=n_updates, desc="gallery", unit="image")
     with progress, closing(Simulation()) as simulation:
         cells = []
@@ -125,7 +125,7 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int], max_scenes: int)
             draw_objects(out, "shape", SHAPES, cells),
             draw_objects(out, "color", COLORS, cells),
             draw_scenes(out, seed, shown, progress.update),
-            *draw_episodes(out, seed, filmed, progress.update),
+            *draw_episodes(out, seed, recorded, progress.update),
             draw_ambiguity(out, seed, progress.update),
         ]
     write_text(out / "index.md", page(figures))
@@ -152,7 +152,7 @@ def draw_objects(out: Path, what: str, names: Sequence[str], cells: Sequence[Ima
     Args:
         out: Folder to write to.
         what: "shape" or "color".
-        names: Of the groups.
+        names: Names of the groups.
         cells: An image for each object.
     """
     groups = []
@@ -297,8 +297,8 @@ def draw_episodes(out: Path, seed: int, task_ids: Sequence[int], tick: Callable[
             "episode.png",
             "An episode of the expert",
             f'"{first.task.instruction}", every other step: {first.outcome}. The scripted expert knows '
-            "where everything is. Its actions are noisy on purpose, as in the paper, and what goes wrong, it "
-            "does again.",
+            "where everything is. Its actions are noisy on purpose, as in the paper, and it "
+            "repeats what goes wrong.",
         ),
         Figure(
             "episode.gif",

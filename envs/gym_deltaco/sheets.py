@@ -40,9 +40,9 @@ def caption(text: str, width: int, size: int = 15, color: RGB = INK, n_lines: in
 
     Args:
         text: May have line breaks of its own.
-        width: Of the image, px.
-        size: Of the font, px.
-        color: Of the text.
+        width: Width of the image, px.
+        size: Size of the font, px.
+        color: Color of the text.
         n_lines: Leave room for at least so many lines, so that captions in a row are equally high.
 
     Returns:
@@ -114,9 +114,9 @@ def save_gif(frames: Sequence[Image.Image], durations: Sequence[int], path: Path
     """Writes an endless animation.
 
     Args:
-        frames: All of one size.
-        durations: Of each frame, ms.
-        path: Where to.
+        frames: Images of equal size.
+        durations: Duration of each frame, ms.
+        path: File to write.
     """
     # One palette for all frames, so that only what moves is stored again.
     palette = down(frames, gap=0).quantize(_PALETTE_SIZE, Image.Quantize.MEDIANCUT)

@@ -1,7 +1,7 @@
 """A PyBullet client behind a small interface: the only module that uses PyBullet.
 
 Bodies are made from arrays, never from asset files: images from triangle meshes with a color for each face,
-contacts from boxes and convex hulls. A scene is built anew for every episode, because a rebuilt world repeats
+contacts from boxes and convex hulls. A scene is rebuilt for every episode, because a rebuilt world repeats
 to the last bit, and one that is restored from a saved state does not.
 """
 
@@ -69,17 +69,17 @@ class Link:
     """A link of an articulated body, moved by one joint at its origin.
 
     Attributes:
-        name: Of the link.
+        name: Name of the link.
         parent: Index of the parent link, -1 for the base.
-        origin: Of the joint in the parent's frame, m.
-        axis: Of the joint, in the link's frame.
+        origin: Origin of the joint in the parent's frame, m.
+        axis: Axis of the joint in the link's frame.
         is_prismatic: Whether the joint slides (m) or turns (rad).
         is_rolled: Whether the link's frame is rolled by pi about the parent's x axis.
         mass: kg.
         inertia: Diagonal of the inertia tensor, kg m².
         mesh: What it looks like.
         boxes: What it touches with, if anything.
-        limits: Of the joint, m or rad; None is no limit.
+        limits: Limits of the joint, m or rad; None for no limits.
     """
 
     name: str
@@ -184,8 +184,8 @@ class Simulation:
         Args:
             mesh: What it looks like, in the body's frame.
             hulls: Vertices of the hulls, (P, 3) each, m, in the body's frame.
-            position: Of the body's origin and center of mass, (3,), m.
-            yaw: About the vertical, rad.
+            position: Position of the body's origin and center of mass, (3,), m.
+            yaw: Angle about the vertical axis, rad.
             mass: kg.
             contact: Properties of its surface.
 

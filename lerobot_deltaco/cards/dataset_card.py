@@ -90,8 +90,8 @@ def write_card(root: Path, folder: Path | None = None, repo_id: str | None = Non
 
     Args:
         root: The dataset's folder. The dataset is finished, and of the benchmark.
-        folder: Where to write to; None is the dataset's folder.
-        repo_id: Of the dataset on the Hub, which the card's examples then name. None: they name a folder.
+        folder: Folder to write to; None for the dataset's folder.
+        repo_id: Name of the dataset on the Hub for the card's examples; None for its folder.
 
     Raises:
         DatasetError: A file of the dataset is damaged.
@@ -127,7 +127,7 @@ def card_text(root: Path, repo_id: str | None = None) -> str:
 
     Args:
         root: The dataset's folder.
-        repo_id: Of the dataset on the Hub; None if it is only in a folder.
+        repo_id: Name of the dataset on the Hub; None if it is only in a folder.
     """
     info = read_info(root)
     history = read_history(root) if (root / HISTORY_FILE).exists() else []

@@ -1,4 +1,4 @@
-"""A policy's card on the Hub: what is known when it is pushed, and nothing of how well it does."""
+"""The card of a policy on the Hub: what is known when it is pushed, which excludes success rates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lerobot_deltaco.policy.training_episodes import kept_episodes
 TAGS = ("robotics", "lerobot", "deltaco", "imitation-learning")
 MAX_TASKS_LISTED = 10
 
-# The method's name, and how it is told its task.
+# Name of each method, and what conditions the policy.
 METHOD_TEXTS = {
     "deltaco": (
         "DeL-TaCo",
@@ -82,14 +82,14 @@ def policy_card(
     """A policy's card. What is not known is left out.
 
     Args:
-        config: The policy's.
-        shown_tasks: Of which the policy carries demonstrations, each once.
+        config: Configuration of the policy.
+        shown_tasks: Tasks that the policy carries demonstrations of, each once.
         n_instructions: Number of instructions whose embeddings the policy carries.
-        dataset_repo_id: Of the training dataset.
-        license: Of the weights, by its name on the Hub; None is LeRobot's default.
-        tags: More of them.
-        train_config: What `lerobot-train` was told.
-        meta: Of the training dataset.
+        dataset_repo_id: Repository id of the training dataset.
+        license: License of the weights, by its name on the Hub; None for LeRobot's default.
+        tags: Additional tags.
+        train_config: Configuration of the training.
+        meta: Metadata of the training dataset.
     """
     name, summary = METHOD_TEXTS[config.method]
     film, concat, _ = config.conditioning

@@ -94,10 +94,10 @@ class Summary:
 
     Attributes:
         episodes: Number of episodes in the dataset.
-        new_episodes: Of those, collected by this plan.
-        attempts: Episodes that were run for them.
-        success_rates: Of the expert, over those attempts, for each kind of task.
-        episodes_per_s: Of this run, which may have collected only a part; None if there was nothing to do.
+        new_episodes: Number of those that this plan collected.
+        attempts: Number of episodes that were run for them.
+        success_rates: Success rate of the expert over those attempts, for each kind of task.
+        episodes_per_s: Speed of this run, which may have collected a part; None if there was nothing to do.
         bytes_per_episode: Size of the dataset on disk, for each episode.
     """
 
@@ -179,7 +179,7 @@ class _Job:
 
 
 def collect(root: Path, plan: CollectionPlan, n_workers: int = 1, append: bool = False) -> Summary:
-    """Collects a dataset, or goes on with one.
+    """Collects a dataset, or continues an interrupted collection.
 
     Args:
         root: The dataset's folder: new, empty, or that of an interrupted collection with the same plan.
@@ -532,7 +532,7 @@ def _join(part: int) -> None:
 
 
 def _read_episode(path: Path) -> pa.Table:
-    remedy = "Delete it and run the command again: its episode is then collected anew."
+    remedy = "Delete it and run the command again: its episode is then collected again."
     try:
         with pa.ipc.open_file(read_checked(path, remedy)) as reader:
             return reader.read_all()
@@ -586,7 +586,7 @@ def _prepare_commit(job: _Job, base: _Base | None) -> None:
 def _read_part(job: _Job, part: int) -> dict[str, Any]:
     """What is known of a complete data file, which still is as it was written."""
     part_file = job.part_file(part)
-    remedy = f"Delete {part_file} and run the command again: its episodes are then collected anew."
+    remedy = f"Delete {part_file} and run the command again: its episodes are then collected again."
     known = read_checked_json(part_file, remedy)
     for name, digest in known["sha256"].items():
         path = job.joined / name

@@ -55,7 +55,7 @@ class CollectionPlan:
         tasks: A task set, a named data set (T198, T48, T54, E48, E54, E102 of the authors; T150 and V48 for
             choosing settings), or indices and ranges.
         episodes_per_task: Number of successful episodes of each task, at least 1.
-        seed: Of the whole collection, at least 0.
+        seed: Seed of the whole collection, at least 0.
         split: What the episodes are for: "train" or "validation", whose scenes never coincide. None is that
             of the data set, or "validation" for test and validation tasks and "train" for all else.
         ambiguity: "container" or "object", the paper's schemes i and ii.
@@ -147,10 +147,10 @@ def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, numbe
     """Runs the expert until it succeeds.
 
     Args:
-        env: Where to run it.
+        env: Environment to run the expert in.
         plan: The collection.
-        task_id: Of the episode.
-        number: Of the episode among those of its task, from 0.
+        task_id: Task of the episode.
+        number: Number of the episode among those of its task, from 0.
 
     Raises:
         CollectionError: It never succeeded.

@@ -73,8 +73,8 @@ def episode_columns(
     Args:
         frames: The recorded features, (N, ...) each.
         fps: Frames per second.
-        episode_index: Of the episode in the dataset.
-        first_index: Of its first frame in the dataset.
+        episode_index: Index of the episode in the dataset.
+        first_index: Index of its first frame in the dataset.
         task_index: Row of its task in the dataset's table of tasks.
     """
     number = np.arange(len(next(iter(frames.values()))))
@@ -138,7 +138,7 @@ def write_episodes_file(
 
     Args:
         path: The file.
-        file_number: Of the data file, and of this file, counted over all chunks.
+        file_number: Number of the data file, and of this file, over all chunks.
         first_episode: Index of the first of them in the dataset.
         first_index: Index of its first frame in the dataset.
         tasks: Task of each episode.

@@ -27,7 +27,7 @@ HISTORY_FILE = Path("meta/deltaco.json")
 STAGING = ".collecting"
 # LeRobot reads this as a version number, and names it in the error: that is what a user then reads.
 UNFINISHED = "this dataset is unfinished; run its `deltaco-collect` command again to go on"
-_REMEDY = "Copy the dataset anew, or collect it again in a new folder."
+_REMEDY = "Copy the dataset again, or collect it again in a new folder."
 _CHANGED = f"{_REMEDY} If LeRobot's tools have changed it since it was collected, delete {DIGESTS_FILE}."
 
 _INFO_FIELDS = {

@@ -37,7 +37,7 @@ def push_dataset(root: Path, repo_id: str, private: bool = False, branch: str | 
         repo_id: "USER/NAME" on the Hub. It is made if there is none; what it has of an earlier dataset is
             replaced.
         private: Whether a new repository is for its owner only. False leaves it to the owner's settings.
-        branch: Where to upload to, made if missing, without a tag. None is the main one.
+        branch: Branch to upload to, created if missing, without a tag; None for the main branch.
 
     Returns:
         The dataset's address.
@@ -144,7 +144,7 @@ def _one_line_errors(repo_id: str | None = None, arrived: str = "") -> Iterator[
     """Turns what can go wrong with a network into a sentence.
 
     Args:
-        repo_id: Of the repository that is written to.
+        repo_id: Name of the repository that is written to.
         arrived: What the repository has, should something go wrong now, as a sentence.
     """
     arrived = f" {arrived}" if arrived else ""

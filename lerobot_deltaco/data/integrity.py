@@ -136,6 +136,6 @@ def read_digests(root: Path) -> dict[str, str] | None:
                 raise ValueError(f"no file of a dataset, or named twice: {name!r}")
             digests[name] = digest
     except (OSError, ValueError) as error:
-        remedy = "Copy the dataset anew, or collect it again in a new folder."
+        remedy = "Copy the dataset again, or collect it again in a new folder."
         raise damaged(path, error, remedy) from None
     return digests

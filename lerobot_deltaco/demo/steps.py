@@ -1,4 +1,4 @@
-"""The demo's steps, each a command of its own, and each done once: an interrupted demo goes on."""
+"""The steps of the demo: each is a command, and runs once. An interrupted demo continues."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class DemoError(RuntimeError):
 
 
 class Demo:
-    """The folder of a demo, and what is done there.
+    """A demo in a folder.
 
     Args:
-        folder: Where everything goes. A demo that was made with other settings there is refused.
+        folder: Folder of all outputs. It must not hold a demo with other settings.
         settings: Changes of the recipe, for tests: steps, episodes per task, trials.
 
     Raises:
-        DemoError: The folder has a demo of another recipe.
+        DemoError: The folder holds a demo with other settings.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any] | None = None) -> None:
@@ -148,8 +148,8 @@ class Demo:
         self._do("train", f"Training for {steps} steps", self._lerobot("train", arguments))
 
     def _affordable_steps(self) -> int:
-        """How many training steps this machine does in the time for them."""
-        sys.stdout.write("\n[demo] Measuring how many training steps this machine does in the time.\n")
+        """Number of training steps that this machine manages in the time for them."""
+        sys.stdout.write("\n[demo] Measuring how many training steps this machine manages in the time.\n")
         sys.stdout.flush()
         start = time.monotonic()
         seconds = seconds_per_step(
@@ -178,7 +178,7 @@ class Demo:
             self._do(f"evaluate_{name}", f"Evaluating {text}", self._lerobot("eval", arguments))
 
     def evaluate_counterfactuals(self) -> None:
-        """Shows the policy another task's demonstration, or tells it another task's instruction."""
+        """Evaluates with another task's demonstration, and with another task's instruction."""
         everything = recipe.selection((*self.settings["tasks"], *self.settings["new_combinations"]))
         for what in ("demo", "instruction"):
             arguments = ("--tasks", everything, "--steps", "last", "--counterfactual", what)
@@ -206,7 +206,7 @@ class Demo:
         if code != 0:
             raise DemoError(
                 f"{what} failed (exit status {code}); see above for why. The command was\n"
-                f"{shlex.join(words)}\nOnce its reason is gone, the demo goes on from here."
+                f"{shlex.join(words)}\nAfter fixing the cause, run the demo again: it continues from here."
             )
         so_far = self.seconds().get(f"{name}_so_far", 0.0)
         self._note(name, so_far)

@@ -37,10 +37,10 @@ def evaluate(
 
     Args:
         policy: In evaluation mode, on its device.
-        preprocessor: The policy's.
-        postprocessor: The policy's.
-        plan: What is run.
-        set_number: Which set; usually the training step. Sets of different numbers share no scene.
+        preprocessor: Preprocessor of the policy.
+        postprocessor: Postprocessor of the policy.
+        plan: Episodes to run.
+        set_number: Number of the evaluation set, usually the training step. Different sets share no scene.
 
     Returns:
         The episodes, task after task.
@@ -129,9 +129,9 @@ def counterfactual_task(others: Sequence[Task], info: dict[str, Any], rng: rando
     for the other container.
 
     Args:
-        others: Which tasks may be chosen.
-        info: The scene's.
-        rng: Of the choice.
+        others: Tasks to choose from.
+        info: Info of the scene.
+        rng: Source of the choice.
 
     Raises:
         ValueError: There is no other task.

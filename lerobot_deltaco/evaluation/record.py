@@ -35,9 +35,9 @@ class EpisodeResult:
     Args:
         task_id: The scene's task, 0..299, which decides success.
         trial: Which episode of its task in this evaluation set, from 0.
-        seed: Of the environment's reset.
-        instruction: What the policy was told.
-        demonstration: The task string of the demonstration that it was shown; None without one.
+        seed: Seed of the environment's reset.
+        instruction: Instruction that the policy received.
+        demonstration: Task string of the demonstration that the policy received; None without one.
         success: Whether the scene's task succeeded, at any step.
         objects: Which of the 32 objects stand in the scene, three of them.
         object_containers: Where each of them lies at the end: 0 green, 1 red.
@@ -71,21 +71,21 @@ class EvaluationRecord:
     """An evaluation set of one checkpoint.
 
     Args:
-        experiment: What was trained, such as "scenario_a/deltaco": runs that differ in their seeds alone
-            share it.
-        method: Of the policy: deltaco, language_only, ...
+        experiment: Name of what was trained, such as "scenario_a/deltaco"; runs that differ only in their
+            seeds share it.
+        method: Method of the policy: deltaco, language_only, ...
         run_seed: Seed of the training run.
         step: Training step of the checkpoint.
-        evaluation_seed: With the step, it decides the scenes.
+        evaluation_seed: Seed of the scenes, together with the step.
         counterfactual: "none"; "demo" or "instruction": that was another task's.
-        ambiguity: Of the scenes: "container", the paper's scheme (i), or "object", scheme (ii).
+        ambiguity: Ambiguity of the scenes: "container", the paper's scheme (i), or "object", scheme (ii).
         tasks: The selection of tasks, such as "scenario_a_test".
         trials: Episodes of each task.
-        episodes: What happened.
+        episodes: Result of each episode.
         policy: The policy's configuration.
-        versions: Of the benchmark ("benchmark": the environment's id) and the packages that matter.
-        command: What was typed.
-        seconds: How long the episodes took, s.
+        versions: Versions of the benchmark ("benchmark": the environment's id) and of the relevant packages.
+        command: Command line of the evaluation.
+        seconds: Duration of the episodes, s.
     """
 
     experiment: str

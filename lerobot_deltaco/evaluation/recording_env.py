@@ -1,4 +1,4 @@
-"""A task's vector environment that remembers how its episodes ended, and may tell something else."""
+"""A task's vector environment that records how its episodes end, and may give other instructions."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class RecordingVectorEnv:
 
     Args:
         env: The vector environment.
-        seeds: Of the environments' resets, just as they are.
-        sample_instructions: Tells the instructions of the drawn scenes; None leaves them to the environment.
+        seeds: Seeds of the environments' resets, used as they are.
+        sample_instructions: Returns the instructions for drawn scenes; None takes the environment's.
     """
 
     def __init__(

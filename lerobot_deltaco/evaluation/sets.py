@@ -30,15 +30,15 @@ def run_set(
     """Runs an evaluation set, and writes its record.
 
     Args:
-        folder: Whose folder `evaluations` gets the record; usually the training run's.
-        step: How many steps the policy has trained; it also numbers the set.
+        folder: Folder that contains `evaluations`, usually that of the training run.
+        step: Training step of the policy, which is also the number of the set.
         policy: In evaluation mode, on its device.
-        preprocessor: The policy's.
-        postprocessor: The policy's.
-        plan: What is run.
+        preprocessor: Preprocessor of the policy.
+        postprocessor: Postprocessor of the policy.
+        plan: Episodes to run.
         experiment: What was trained, for the record; runs of one name differ in their seeds alone.
         run_seed: Seed of the training run, for the record.
-        command: What was typed, for the record.
+        command: Command line, for the record.
 
     Returns:
         The record.

@@ -57,8 +57,8 @@ class CommandRunner:
                 raise
         if code != 0:
             raise ExperimentError(
-                f"deltaco-{command} failed (exit status {code}); see {self.log or 'above'} for why. The same "
-                "command goes on from here."
+                f"deltaco-{command} failed (exit status {code}); see {self.log or 'above'} for why. Run "
+                "the same command again to continue."
             )
 
     def stop(self) -> None:

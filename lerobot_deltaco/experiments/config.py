@@ -22,7 +22,7 @@ class ExperimentConfig:
     """An experiment: one row of one of the paper's tables, or one of ours.
 
     Args:
-        name: Such as "scenario_a/deltaco".
+        name: Name of the experiment, such as "scenario_a/deltaco".
         data: Arguments of the collection that is trained on, as `CollectionPlan` has them.
         demonstrations: The same of the collection that shows the test tasks.
         policy: Options of `--policy`.
@@ -61,9 +61,9 @@ def read_experiment(folder: Path, name: str, settings: Sequence[str] = ()) -> Ex
     """Reads an experiment.
 
     Args:
-        folder: Of the experiments.
-        name: Such as "scenario_a/deltaco".
-        settings: What differs from the files: "training.steps=2000", "policy.device=cuda".
+        folder: Folder of the experiments.
+        name: Name of the experiment, such as "scenario_a/deltaco".
+        settings: Settings that override the files: "training.steps=2000", "policy.device=cuda".
 
     Raises:
         ExperimentConfigError: The experiment does not exist, or a file or a setting has an unknown section.

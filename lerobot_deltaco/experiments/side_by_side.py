@@ -1,7 +1,7 @@
 """Runs several experiments at the same time.
 
-A small network does not keep several processor cores busy: two trainings with a core each get further in an
-hour than one after the other with both cores. (Measured with `small_a` on two cores: 1.4 times as far.)
+A small network does not keep several processor cores busy: two trainings with a core each have a higher
+throughput than one after the other with both cores. (Measured with `small_a` on two cores: 1.4x.)
 """
 
 from __future__ import annotations

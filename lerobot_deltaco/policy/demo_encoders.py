@@ -17,14 +17,14 @@ class ArrayEncoder(nn.Module):
     """The paper's encoder (figure 7): a convolutional network on an array of frames, as if it were one image.
 
     Args:
-        height: Of a frame, px.
-        width: Of a frame, px.
-        rows: Of the array.
-        columns: Of the array.
+        height: Height of a frame, px.
+        width: Width of a frame, px.
+        rows: Number of rows of the array.
+        columns: Number of columns of the array.
         embedding_dim: Size of the embedding: the language encoder's.
-        stride: Of the first convolution.
-        channels: Of the convolutions.
-        hidden_dims: Of the fully connected layers.
+        stride: Stride of the first convolution.
+        channels: Number of channels of the convolutions.
+        hidden_dims: Sizes of the hidden fully connected layers.
     """
 
     def __init__(
@@ -66,18 +66,18 @@ class ArrayEncoder(nn.Module):
 class AttentionEncoder(nn.Module):
     """Ours: compares the frames at each place, and attends to a few places.
 
-    What a demonstration says is what changed: an object is gone here, and there is one in a container there.
-    The paper's encoder has to learn this anew for each place, since its fully connected layers take the maps
-    as they lie. Here the frames lie upon each other, convolutions see what changed, and attention takes from
-    the maps what is at the places that matter, and where these are. So a demonstration in one corner teaches
-    how to read those in all the others.
+    A demonstration is what changed: an object has left one place, and one lies in a container at another.
+    The paper's encoder has to learn this for each place separately, since its fully connected layers take the
+    flattened maps. Here, the frames are stacked, convolutions see what changed, and attention reads the maps
+    at the places that matter, along with their positions. So a demonstration in one corner teaches how to
+    read those in all others.
 
     Args:
-        n_frames: Of a demonstration.
+        n_frames: Number of frames of a demonstration.
         embedding_dim: Size of the embedding: the language encoder's.
-        channels: Of the convolutions. The first two halve the maps.
-        n_heads: Places that are attended to.
-        hidden_dim: Of the fully connected layer.
+        channels: Numbers of channels of the convolutions, of which the first two halve the maps.
+        n_heads: Number of places that are attended to.
+        hidden_dim: Size of the hidden fully connected layer.
     """
 
     def __init__(

@@ -23,7 +23,7 @@ N_KEPT_FRAMES = 16
 
 
 class DemonstrationSet(torch.nn.Module):
-    """Episodes that show tasks.
+    """Episodes that demonstrate tasks.
 
     Its tensors move with the policy, but are not among its weights.
 
@@ -84,8 +84,8 @@ class DemonstrationSet(torch.nn.Module):
             episodes: The samples' own, (batch,), as indices of the dataset.
             generator: Source of the draws, on the CPU.
             check: Whether to look if they are all in the set, for which a GPU is waited for.
-            tasks: Of each sample. If they are given, episodes may be missing in the set, as those that
-                `--dataset.eval_split` holds back: any episode of the same task shows them.
+            tasks: Task of each sample. If it is given, episodes may be missing from the set, as those that
+                `--dataset.eval_split` holds back: any episode of their task demonstrates them.
 
         Returns:
             Rows, (batch,). A task's only episode demonstrates itself.
@@ -189,7 +189,7 @@ class DemonstrationSet(torch.nn.Module):
 
         Args:
             rows: (batch,).
-            n_frames: Of each demonstration, at least 2.
+            n_frames: Number of frames per demonstration, at least 2.
             generator: Source of the draws, on the CPU.
 
         Returns:
@@ -214,12 +214,12 @@ def load_demonstrations(
     """Reads demonstrations from a LeRobotDataset.
 
     Args:
-        repo_id: Of the dataset.
-        root: Its folder, None for LeRobot's cache.
-        episodes: Which of its episodes, None for all.
+        repo_id: Repository id of the dataset.
+        root: Folder of the dataset; None for LeRobot's cache.
+        episodes: Episodes to read; None for all.
         camera: Key of the images, such as "observation.image".
-        image_size: Height and width to which they are scaled.
-        n_demo_frames: Frames of a demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
+        image_size: Height and width to which images are scaled, px.
+        n_demo_frames: Number of frames per demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
 
     Raises:
         ValueError: The dataset has no such camera or episode.
@@ -282,7 +282,7 @@ def kept_frame_indices(first: int, last: int, n_demo_frames: int) -> Tensor:
     Args:
         first: Its first frame.
         last: Its last frame.
-        n_demo_frames: Frames of a demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
+        n_demo_frames: Number of frames per demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
     """
     n_kept = 2 if n_demo_frames == 2 else max(N_KEPT_FRAMES, n_demo_frames)
     # In double precision, which holds every index of a large dataset.

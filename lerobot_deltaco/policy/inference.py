@@ -1,4 +1,4 @@
-"""Networks as they act: with their batch norms folded into the convolutions before them, which saves time."""
+"""Faster networks for acting, whose batch norms are folded into the preceding convolutions."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from lerobot_deltaco.policy.networks import ConditionedPolicy, FilmBlock
 
 
 class FoldedPolicy:
-    """A copy of a policy's network for acting, made anew once the network's weights are others.
+    """A copy of a policy's network for acting, which is renewed when the network's weights change.
 
-    It is no module, so that it is neither trained nor saved.
+    It is not a module, so that it is neither trained nor saved.
     """
 
     def __init__(self, network: ConditionedPolicy) -> None:
@@ -22,9 +22,9 @@ class FoldedPolicy:
         self._version: tuple[tuple[int, int], ...] = ()
 
     def network(self) -> ConditionedPolicy:
-        """The copy, in evaluation mode. It gives what the network does, up to rounding.
+        """The copy, in evaluation mode. Its outputs equal the network's up to rounding.
 
-        (Of two modes that are as likely, rounding may choose.)
+        (Between two equally likely modes, rounding may decide.)
         """
         tensors = (*self._network.parameters(), *self._network.buffers())
         version = tuple((tensor.data_ptr(), tensor._version) for tensor in tensors)

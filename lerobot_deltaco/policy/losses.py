@@ -29,7 +29,7 @@ def mixture_negative_log_likelihood(means: Tensor, logits: Tensor, log_std: Tens
 
     Args:
         means: (batch, modes, dims).
-        logits: Of the modes, (batch, modes).
+        logits: Logits of the modes, (batch, modes).
         log_std: (dims,) or (modes, dims), the same for all samples.
         target: (batch, dims).
 
@@ -57,7 +57,7 @@ def gripper_loss(logit: Tensor, target: Tensor, kind: str) -> Tensor:
 
 
 def contrastive_logits(demo: Tensor, language: Tensor, temperature: float) -> Tensor:
-    """How alike each demonstration is to each instruction: the logits of the paper's equation 1.
+    """Similarity of each demonstration to each instruction: the logits of the paper's equation 1.
 
     Args:
         demo: Unit embeddings of the samples' demonstrations, (batch, embedding).

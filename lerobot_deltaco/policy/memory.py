@@ -1,4 +1,4 @@
-"""Memory that training frees at each step stays with the process, for the next step."""
+"""Prevents glibc from returning freed memory to the operating system."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _GREATEST = 2**31 - 1
 
 @functools.cache
 def keep_freed_memory() -> bool:
-    """Asks the C library to keep what is freed, instead of giving it back to the system: for good.
+    """Prevents glibc from returning freed memory to the operating system, for the rest of the process.
 
-    Otherwise glibc returns the memory of large tensors at each step and asks for it anew, and the system
-    clears it page by page: up to a quarter of a small network's training step on a CPU.
+    Otherwise, glibc returns the memory of large tensors at each step and requests it again, and the system
+    clears it page by page. Without that, training steps of a small network on a CPU are up to 25 % faster.
 
     Returns:
-        Whether there is a glibc that does so; nothing changes with another C library.
+        Whether it worked; nothing changes with another C library.
     """
     if platform.libc_ver()[0] != "glibc":
         return False
-    logger.info("From now on, this process keeps the memory that it frees, which makes training faster.")
+    logger.info("Freed memory stays with this process, which makes training steps up to 25 % faster.")
     mallopt = ctypes.CDLL(None).mallopt
     return bool(mallopt(_MMAP_MAX, 0)) and bool(mallopt(_TRIM_THRESHOLD, _GREATEST))

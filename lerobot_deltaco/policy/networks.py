@@ -62,12 +62,12 @@ class ConditionedPolicy(nn.Module):
         concat_dim: Size of what is concatenated to the feature points: embeddings and proprioception.
         motion_dim: Size of the action without the gripper.
         has_gripper: Whether the action has a gripper.
-        channels: Of the residual blocks, one number each.
-        stem_stride: Of the first convolution.
-        hidden_dims: Of the fully connected layers.
-        gripper_hidden_dim: Of the gripper's hidden layer.
-        spatial_softmax_temperature: Divides the activations.
-        motion_modes: Gaussians of the motion's distribution.
+        channels: Number of channels of each residual block.
+        stem_stride: Stride of the first convolution.
+        hidden_dims: Sizes of the hidden fully connected layers.
+        gripper_hidden_dim: Size of the gripper's hidden layer.
+        spatial_softmax_temperature: Temperature of the spatial softmax, which divides the activations.
+        motion_modes: Number of Gaussians of the motion's distribution.
         n_goals: Number of places in the first camera's image that the policy is given as goals.
     """
 
@@ -157,8 +157,8 @@ class FilmResNet(nn.Module):
 
     Args:
         film_dim: Size of the embedding, 0 for no FiLM.
-        channels: Of the blocks.
-        stem_stride: Of the first convolution. With the paper's 1, the maps have half the image's size.
+        channels: Number of channels of each block.
+        stem_stride: Stride of the first convolution. With the paper's 1, the maps have half the image's size.
         in_channels: Number of channels of the image.
     """
 

@@ -1,4 +1,4 @@
-"""The numbers that a training step logs, which are fetched from the device when they are asked for."""
+"""Scalars that a training step logs, which are copied from the device only when they are read."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class LoggedScalars:
     They stay on the device until one of them is read. LeRobot reads them when the step is done, so that the
     backward pass is under way before anyone waits for the forward pass.
 
-    It is no `Mapping`: accelerate takes those apart and puts them together again, value by value.
+    It is not a `Mapping`, because accelerate rebuilds those value by value.
 
     Args:
         values: Tensors of shape ().

@@ -23,11 +23,11 @@ def training_episodes(meta: LeRobotDatasetMetadata) -> list[int]:
 def kept_episodes(
     meta: LeRobotDatasetMetadata, episodes: Sequence[int] | None, eval_split: float
 ) -> list[int]:
-    """What is left of episodes for training.
+    """The episodes that remain for training.
 
     Args:
-        meta: Of their dataset.
-        episodes: Which ones; None or none is all of them.
+        meta: Metadata of their dataset.
+        episodes: Episodes of the dataset; None or an empty sequence for all.
         eval_split: Share of each task that is held back, the last ones.
     """
     tasks = meta.episodes["tasks"][:]  # at once: one after another takes long

@@ -48,7 +48,7 @@ def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = Fals
     All files are written, or none. Those of an earlier report are replaced.
 
     Args:
-        folders: Of runs, or folders with such folders in them, however deep.
+        folders: Folders of runs, or folders that contain them at any depth.
         out: The report's folder, which is made.
         authors_levels: Draw the authors' rates into the image.
 
@@ -202,7 +202,7 @@ def _markdown(report: Report) -> str:
     if report.counterfactual:
         sections.append(_counterfactual_section(report.counterfactual))
     notes = [f"- {note}" for note in report.notes] or ["Nothing."]
-    sections.append("## Left out, and to be minded\n\n" + "\n".join(notes) + "\n")
+    sections.append("## Caveats\n\n" + "\n".join(notes) + "\n")
     sections.append(_origin_section(report))
     return "\n".join(sections)
 
@@ -210,7 +210,7 @@ def _markdown(report: Report) -> str:
 def _introduction(report: Report) -> str:
     return (
         f"Success rates in {report.series[0].sets[0].benchmark}, in %. Those in another version of the "
-        f"benchmark are not to be compared with them. Picking at random comes to {_percent(CHANCE)}.\n\n"
+        f"benchmark are not comparable. Random choices succeed in {_percent(CHANCE)}.\n\n"
         f"- **Rate (SD)** is the paper's: over the {N_BEST_SETS} evaluation sets (steps) with the highest "
         "mean over seeds, or all if there are fewer, the mean, and the mean of the standard deviation over "
         "seeds (the population's; – with one seed). It picks its sets by what it then averages, which "

@@ -1,4 +1,4 @@
-"""The optimizer and the learning rate's course, as LeRobot's configurations."""
+"""The optimizer and the schedule of the learning rate, as configurations of LeRobot."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from torch.optim.lr_scheduler import LambdaLR
 class FusedAdamWConfig(AdamWConfig):
     """AdamW (Adam, where `weight_decay` is 0), updated in one pass over the weights.
 
-    The steps of a small network are short: on a CPU, LeRobot's Adam, operation by operation, takes a fifth of
-    them.
+    On a CPU, LeRobot's Adam, which runs operation by operation, takes a fifth of a small network's step.
     """
 
     def build(self, params: Any) -> torch.optim.Optimizer:
@@ -30,10 +29,10 @@ class FusedAdamWConfig(AdamWConfig):
 @LRSchedulerConfig.register_subclass("deltaco_cosine")
 @dataclass
 class CosineSchedulerConfig(LRSchedulerConfig):
-    """From the learning rate down to 0, along half a cosine that lasts as long as the training.
+    """A cosine schedule that decays to 0 at the end of the training.
 
     Args:
-        num_warmup_steps: Over which the learning rate rises from 0.
+        num_warmup_steps: Number of steps over which the learning rate rises linearly from 0.
     """
 
     num_warmup_steps: int = 0

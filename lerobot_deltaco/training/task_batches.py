@@ -13,7 +13,7 @@ class TaskBatchSampler:
 
     In an epoch, every task of a group is in the same number of batches, give or take one, and every frame of
     a task is drawn the same number of times, give or take one. The order is a function of the seed and the
-    epoch alone, so that every process finds the same one, and a resumed run goes on with it. It has the
+    epoch alone, so that every process computes the same one, and a resumed run continues it. It has the
     interface of LeRobot's `EpisodeAwareSampler`, which it replaces.
 
     Args:
@@ -21,8 +21,8 @@ class TaskBatchSampler:
         batch_size: Samples of a batch, a multiple of `tasks_per_batch`.
         tasks_per_batch: k, distinct tasks of a batch.
         upsampled: Tasks that get a share of each batch; none by default.
-        upsampled_share: That share of `tasks_per_batch`, which must come to a whole number of tasks.
-        seed: Of the order.
+        upsampled_share: That share of `tasks_per_batch`, which must be a whole number of tasks.
+        seed: Seed of the order.
         use: Which frames are drawn, (frames,) bool; all by default.
 
     Raises:
