@@ -305,6 +305,12 @@ def test_the_datasets_page_lists_the_data_sets():
     assert all(f"`{name}`" in text for name in DATA_SETS)
 
 
+def test_the_experiments_page_lists_the_folders():
+    text = (DOCS / "experiments.md").read_text()
+    folders = {path.parent.name for path in (ROOT / "experiments").glob("*/*.yaml")}
+    assert all(f"| `{name}` |" in text for name in folders)
+
+
 # Generated pages
 
 
