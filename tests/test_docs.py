@@ -165,8 +165,8 @@ def check_make(words, monkeypatch):
 
 
 def check_pip(words, monkeypatch):
-    assert words[1] == "install"
-    for word in words[2:]:
+    assert "install" in words
+    for word in words:
         if extras := re.fullmatch(r"\.\[(.+)\]", word):
             assert set(extras[1].split(",")) <= set(PROJECT["optional-dependencies"])
 
@@ -189,6 +189,7 @@ CHECKS = {
     "pip": check_pip,
     "python": check_python,
     "torchrun": check_torchrun,
+    "uv": check_pip,
     **dict.fromkeys(PROJECT["scripts"], check_deltaco),
     **dict.fromkeys([*LEROBOT_CONFIGURATIONS, "lerobot-dataset-viz"], check_lerobot),
 }
