@@ -30,8 +30,8 @@ extensions = [
 exclude_patterns = ["_build", "generated"]
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
-# Names that several modules have are not linked; a folder of pages in the contents may be empty.
-suppress_warnings = ["ref.python", "toc.empty_glob"]
+# Names that several modules have are not linked.
+suppress_warnings = ["ref.python"]
 
 html_theme = "furo"
 html_static_path = ["_static"]
