@@ -34,9 +34,7 @@ def test_it_carries_a_demonstration_and_the_embedding_of_every_test_task(loaded)
 def test_it_acts_as_recorded(loaded):
     record = read_record(RECORD)
     expected = {(e.task_id, e.trial): e for e in record.episodes if e.task_id in TASKS}
-    plan = EvaluationPlan(
-        tasks=",".join(map(str, TASKS)), trials=record.trials, seed=record.evaluation_seed
-    )
+    plan = EvaluationPlan(tasks=",".join(map(str, TASKS)), trials=record.trials, seed=record.evaluation_seed)
     episodes = evaluate(*loaded, plan, record.step)
     assert len(episodes) == len(expected) == len(TASKS) * record.trials
     for episode in episodes:
