@@ -4,12 +4,14 @@
 
 import re
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
-from lerobot_deltaco.common.checks import check_choices, check_minimums
+from lerobot_deltaco.common.checks import check_choices
+from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.data.feature_names import ACTION_NAMES
 from lerobot_deltaco.policy.language_encoders import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
 from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAdamWConfig
@@ -67,6 +69,34 @@ DEMO_ENCODERS = ("cnn", "attention", CORRESPONDENCE)
 GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
 SCHEDULERS = ("constant", "cosine")
 DTYPES = ("float32", "bfloat16")
+# The least and the greatest valid value. Beyond them, memory would not do, or arithmetic would overflow.
+RANGES = MappingProxyType(
+    {
+        "demo_rows": (1, 64),
+        "demo_columns": (1, 64),
+        "image_size": (16, 1024),
+        "motion_modes": (1, 1000),
+        "gripper_weight": (0, 1e6),
+        "encoder_loss_weight": (0, 1e6),
+        "temperature": (1e-3, 1e3),
+        "crop_padding": (0, 1024),
+        "demo_crop_padding": (0, 1024),
+        "n_demonstrations": (1, 1000),
+        "goal_noise": (0, 10),
+        "locator_share": (1e-6, 1),
+        "recolor_share": (0, 1),
+        "frames_after_release": (0, 1_000_000),
+        "demos_per_task": (0, 10_000),
+        "demo_episode": (0, 2**63 - 1),
+        "drop_n_last_frames": (0, 1_000_000),
+        "tasks_per_batch": (0, 1_000_000),
+        "seed": (0, 2**63 - 1),
+        "optimizer_lr": (1e-12, 10),
+        "optimizer_weight_decay": (0, 1e3),
+        "scheduler_warmup_steps": (0, 1_000_000_000),
+        "grad_clip_norm": (0, 1e6),
+    }
+)
 
 
 @PreTrainedConfig.register_subclass("deltaco")
@@ -205,6 +235,10 @@ class DeltacoConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("demo_root", "instruction_embeddings"):
+            if isinstance(getattr(self, name), Path):
+                setattr(self, name, str(getattr(self, name)))
+        check_field_types(self)
         check_choices(
             self,
             method=METHODS,
@@ -223,38 +257,7 @@ class DeltacoConfig(PreTrainedConfig):
             self.gripper_weight = GRIPPER_LOSSES[self.gripper_loss]
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
             raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
-        check_minimums(
-            self,
-            demo_rows=1,
-            demo_columns=1,
-            image_size=16,
-            motion_modes=1,
-            gripper_weight=0,
-            encoder_loss_weight=0,
-            crop_padding=0,
-            demo_crop_padding=0,
-            n_demonstrations=1,
-            goal_noise=0,
-            recolor_share=0,
-            demos_per_task=0,
-            drop_n_last_frames=0,
-            tasks_per_batch=0,
-            seed=0,
-            optimizer_weight_decay=0,
-            scheduler_warmup_steps=0,
-            grad_clip_norm=0,
-        )
-        for name in ("temperature", "optimizer_lr"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"`{name}` must be greater than 0. Got {getattr(self, name)}.")
-        if not self.recolor_share <= 1:
-            raise ValueError(f"`recolor_share` must be at most 1. Got {self.recolor_share}.")
-        if not 0 < self.locator_share <= 1:
-            raise ValueError(
-                f"`locator_share` must be greater than 0 and at most 1. Got {self.locator_share}."
-            )
-        if self.frames_after_release is not None and not self.frames_after_release >= 0:
-            raise ValueError(f"`frames_after_release` must be at least 0. Got {self.frames_after_release}.")
+        check_ranges(self, RANGES)
         if self.demos_per_task == 1:
             raise ValueError(
                 "`demos_per_task` cannot be 1: samples of that episode would be demonstrated by themselves. "
@@ -409,6 +412,15 @@ class DeltacoConfig(PreTrainedConfig):
         shapes = {name: tuple(feature.shape) for name, feature in self.image_features.items()}
         if any(len(shape) != 3 or shape[0] != 3 for shape in shapes.values()):
             raise ValueError(f"Images must have the shape (3, height, width). Got {shapes}.")
+        for name, feature in (
+            ("action", self.action_feature),
+            ("observation.state", self.robot_state_feature),
+        ):
+            if feature is not None and (len(feature.shape) != 1 or feature.shape[0] < 1):
+                raise ValueError(
+                    f"`{name}` must be a vector, of the shape (n,). The dataset's has the shape "
+                    f"{tuple(feature.shape)}."
+                )
         (action_dim,) = self.action_feature.shape
         if self.gripper_index is not None and not self.gripper_index < action_dim:
             raise ValueError(
@@ -429,6 +441,25 @@ class DeltacoConfig(PreTrainedConfig):
         if action_dim == 1 and self.gripper_index is not None:
             raise ValueError(
                 "The action is nothing but a gripper. Set `gripper` to 'none' to learn it as a motion."
+            )
+
+    def check_episodes(self, n_episodes: int) -> None:
+        """Checks the episodes that demonstrations are drawn from.
+
+        Args:
+            n_episodes: Number of episodes of the training dataset.
+
+        Raises:
+            ValueError: One is not in the dataset, or is named twice.
+        """
+        episodes = self.demo_episodes
+        if episodes is None:
+            return
+        wrong = [episode for episode in episodes if not 0 <= episode < n_episodes]
+        if not episodes or wrong or len(set(episodes)) < len(episodes):
+            raise ValueError(
+                f"`demo_episodes` must be different episodes of the training dataset, 0 to {n_episodes - 1}. "
+                f"Got {wrong[:5] or episodes[:5]}."
             )
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:

@@ -309,7 +309,7 @@ def test_several_demonstrations_are_combined(dataset):
         ({"film": "demo"}, "can be 'none' or 'language'"),
         ({"encoder_loss": "contrastive"}, "`encoder_loss` 'none'"),
         ({"recolor_share": 1.5}, "`recolor_share` must be at most 1"),
-        ({"locator_share": 0.0}, "`locator_share` must be greater than 0"),
+        ({"locator_share": 0.0}, "`locator_share` must be at least 1e-06"),
         ({"n_demonstrations": 0}, "`n_demonstrations` must be at least 1"),
         ({"color_blind_tasks": "("}, "`color_blind_tasks` must be a regular expression"),
         ({"frames_after_release": -1}, "`frames_after_release` must be at least 0"),

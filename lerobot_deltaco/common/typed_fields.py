@@ -2,40 +2,55 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Hashable
-from dataclasses import fields
+from collections.abc import Hashable, Mapping
 from functools import cache
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, cast, get_args, get_origin
 
 
-def check_field_types(instance: Any, but: tuple[str, ...] = ()) -> None:
-    """Checks that the fields of a dataclass have values of their declared types.
+def check_field_types(instance: Any) -> None:
+    """Checks that the fields of a dataclass have values of their declared types; not those that it inherits.
 
     Numbers are finite; an integer stands for a float, but a boolean for no number.
 
     Args:
         instance: The dataclass's instance.
-        but: Names of fields that are not checked.
 
     Raises:
         ValueError: A field has a value of another type; the message names it and says what is valid.
     """
-    kinds = type_hints(type(instance))
-    for field in fields(instance):
-        value, kind = getattr(instance, field.name), kinds[field.name]
-        if field.name not in but and not is_a(value, kind):
-            raise ValueError(f"`{field.name}` must be {in_words(kind)}. Got {value!r}.")
+    for name, kind in type_hints(type(instance)).items():
+        if not is_a(getattr(instance, name), kind):
+            raise ValueError(f"`{name}` must be {in_words(kind)}. Got {getattr(instance, name)!r}.")
+
+
+def check_ranges(instance: Any, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Checks that numbers are within their ranges.
+
+    Args:
+        instance: What has them as attributes.
+        ranges: For each name, the least and the greatest valid value. None is always valid.
+
+    Raises:
+        ValueError: A number is not; the message names it and says what is valid.
+    """
+    for name, (least, greatest) in ranges.items():
+        value = getattr(instance, name)
+        if value is not None and not value >= least:
+            raise ValueError(f"`{name}` must be at least {least}. Got {value}.")
+        if value is not None and value > greatest:
+            raise ValueError(f"`{name}` must be at most {greatest}. Got {value}.")
 
 
 @cache
 def _type_hints(kind: Hashable) -> dict[str, Any]:
-    return get_type_hints(kind)
+    return inspect.get_annotations(cast(type[Any], kind), eval_str=True)
 
 
 def type_hints(kind: type[Any]) -> dict[str, Any]:
-    """The declared types of a class's attributes, by name."""
+    """The declared types of a class's own attributes, by name."""
     return _type_hints(cast(Hashable, kind))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -15,7 +14,8 @@ from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS, EXPERT_NOISE, MIN_IM
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
 from gym_deltaco.seeding import Split, episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, select_tasks
-from lerobot_deltaco.common.checks import check_choices, check_minimums
+from lerobot_deltaco.common.checks import check_choices
+from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.data.feature_names import ACTION_NAMES, DEFAULT_FEATURES, PRIVILEGED, STATE_NAMES
 
 if TYPE_CHECKING:
@@ -75,10 +75,17 @@ class CollectionPlan:
     image_size: int = 48
 
     def __post_init__(self) -> None:
+        check_field_types(self)
         task_ids = self.task_ids
-        check_minimums(self, episodes_per_task=1, seed=0, noise=0, image_size=MIN_IMAGE_SIZE)
-        if not math.isfinite(self.noise):
-            raise ValueError(f"`noise` must be finite. Got {self.noise}.")
+        check_ranges(
+            self,
+            {
+                "episodes_per_task": (1, 1_000_000),
+                "seed": (0, 2**63 - 1),
+                "noise": (0, 1e6),
+                "image_size": (MIN_IMAGE_SIZE, 4096),
+            },
+        )
         check_choices(self, ambiguity=AMBIGUITIES)
         if self.split is None:
             object.__setattr__(self, "split", _default_split(self.tasks, task_ids))

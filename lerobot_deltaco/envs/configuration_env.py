@@ -9,10 +9,12 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS, MIN_IMAGE_SIZE
+from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS
 from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.tasks import TASKS, select_tasks
-from lerobot_deltaco.common.checks import check_choices, check_minimums
+from lerobot_deltaco.common.checks import check_choices
+from lerobot_deltaco.common.env_ranges import ENV_RANGES
+from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.envs.vector_env import make_task_vector_envs
 
 
@@ -44,15 +46,9 @@ class DeltacoEnv(EnvConfig):
     render_size: int = 96
 
     def __post_init__(self) -> None:
+        check_field_types(self)
         select_tasks(self.task)
-        check_minimums(
-            self,
-            fps=1,
-            episode_length=1,
-            image_size=MIN_IMAGE_SIZE,
-            render_size=MIN_IMAGE_SIZE,
-            max_parallel_tasks=1,
-        )
+        check_ranges(self, ENV_RANGES)
         check_choices(self, ambiguity=AMBIGUITIES)
         # The environment's names, and what LeRobot calls them in datasets and policies.
         self.features_map = {"pixels": OBS_IMAGE, "agent_pos": OBS_STATE, ACTION: ACTION}
