@@ -17,6 +17,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_transition
 from lerobot.utils.constants import ACTION, OBS_STATE
+from safetensors import safe_open
 from torch import Tensor, nn
 
 from lerobot_deltaco.cards.policy_card import policy_card
@@ -31,9 +32,11 @@ from lerobot_deltaco.policy.demonstration_choice import (
 from lerobot_deltaco.policy.demonstrations import (
     DemonstrationSet,
     RobotData,
+    kept_frame_indices,
     load_demonstrations,
     load_robot_data,
 )
+from lerobot_deltaco.policy.finite_loss import FiniteLoss, check_weights_to_save, non_finite_weight
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals, GoalConditioning
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.language import InstructionTable
@@ -46,11 +49,21 @@ from lerobot_deltaco.policy.losses import (
 )
 from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop, random_shifts, shift_images
+from lerobot_deltaco.policy.processor_files import check_processor_files
 from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
 from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.step_generator import step_generator
 from lerobot_deltaco.policy.task_conditioning import EpisodeTasks, TaskConditioning
-from lerobot_deltaco.policy.task_file import TASK_FILE, find_task_file, read_demonstrations, write_task_file
+from lerobot_deltaco.policy.task_file import (
+    TASK_FILE,
+    StoredDemonstrations,
+    TaskFile,
+    check_demonstrations,
+    find_task_file,
+    hub_options,
+    read_task_file,
+    write_task_file,
+)
 from lerobot_deltaco.policy.training_episodes import training_episodes
 from lerobot_deltaco.policy.training_goals import TrainingGoals, find_training_goals
 
@@ -93,6 +106,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         self.config: DeltacoConfig = config
         self._meta, self._stats = dataset_meta, dataset_stats
         config.resolve(dataset_meta.features if dataset_meta else None)
+        if dataset_meta is not None:
+            config.check_episodes(dataset_meta.total_episodes)
         self.instructions = InstructionTable(config.language_encoder)
         if config.instruction_embeddings is not None:
             self.instructions.read(Path(config.instruction_embeddings))
@@ -146,6 +161,7 @@ class DeltacoPolicy(PreTrainedPolicy):
                 if network is not None:
                     network.compile()
         self._folded = FoldedPolicy(self.model)
+        self._finite_loss = FiniteLoss()
 
     def _make_demo_encoder(self) -> nn.Module:
         config = self.config
@@ -184,8 +200,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         """
         tasks = list(batch["task"])
         device = batch[ACTION].device
-        if self.training and device.type == "cpu":
-            keep_freed_memory()
+        if self.training:
+            self._finite_loss.check()
+            if device.type == "cpu":
+                keep_freed_memory()
         step = int(self.step) if self.training else 0
         generator = step_generator(self.config.seed, step, _process_rank())
         if self.goals is not None:
@@ -227,6 +245,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             logged["demo_accuracy"] = (logits.argmax(dim=1) == column).float().mean()
         if self.training:
             self.step += 1
+            self._finite_loss.remember(loss, self._numbers_of(batch), self.step)
         return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
 
     def _goal_forward(
@@ -274,6 +293,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             loss = loss.index_add(0, some.to(device), share * locator_loss.sum(dim=1))
             logged |= {"grasp_loss": locator_loss[:, 0].mean(), "release_loss": locator_loss[:, 1].mean()}
             self.step += 1
+            self._finite_loss.remember(loss, self._numbers_of(batch), self.step)
         return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
 
     def _locator_loss(
@@ -485,9 +505,9 @@ class DeltacoPolicy(PreTrainedPolicy):
             Actions, (batch, action), normalized as in `forward`.
 
         Raises:
-            ValueError: A task has no demonstration.
+            ValueError: There is no instruction, or a task has no demonstration.
         """
-        tasks = tuple(batch["task"])
+        tasks = self._instructions_of(batch)
         images = self._images(batch)
         with self._autocast(images.device):
             task = self._episode_tasks.conditioning(tasks, lambda tasks: self.encode_task(tasks, images))
@@ -497,6 +517,18 @@ class DeltacoPolicy(PreTrainedPolicy):
         if gripper is not None:
             gripper = torch.sigmoid(gripper.float())
         return self._join_action(motion.mean.float(), gripper)
+
+    @staticmethod
+    def _instructions_of(batch: dict[str, Any]) -> tuple[str, ...]:
+        """The instruction of each sample."""
+        tasks = batch.get("task")
+        if isinstance(tasks, (list, tuple)) and tasks and all(isinstance(task, str) for task in tasks):
+            return tuple(tasks)
+        raise ValueError(
+            "`task` must be a list with an instruction for each sample of the batch. Got "
+            f"{'none' if tasks is None else repr(tasks)}. LeRobot takes it from the environment's "
+            '`task_description`, or from --task; in Python, set observation["task"] before the preprocessor.'
+        )
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The action as a chunk of one, (batch, 1, action)."""
@@ -549,6 +581,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         return torch.autocast(device.type, torch.bfloat16)
 
     # Training and evaluation
+
+    def _numbers_of(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """The actions and states of a batch, by name."""
+        names = (ACTION, OBS_STATE) if self.config.robot_state_feature else (ACTION,)
+        return {name: batch[name] for name in names}
 
     def _images(self, batch: dict[str, Any]) -> Tensor:
         """Images of all cameras, that of the demonstrations first, (batch, cameras, 3, size, size)."""
@@ -656,6 +693,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         )
 
     def _save_pretrained(self, save_directory: Path, *args: Any, **kwargs: Any) -> None:
+        self._finite_loss.check()
+        check_weights_to_save(self, int(self.step))
         # LeRobot 0.6.1 may pass a `state_dict`, later versions do not; it is handed on as it comes.
         # What was read from these files is saved with the policy, whose next user has other files.
         sources = ("demo_repo_id", "demo_root", "instruction_embeddings")
@@ -669,26 +708,51 @@ class DeltacoPolicy(PreTrainedPolicy):
                 setattr(self.config, name, value)
         if not _is_main_process():
             return  # versions after 0.6.1 call this on every process
-        demonstrations = self.eval_demonstrations if self.config.uses_demo else None
-        write_task_file(save_directory / TASK_FILE, self.instructions, demonstrations)
+        contents = self.instructions.contents()
+        if self.eval_demonstrations is not None and self.config.uses_demo:
+            frames, episodes = self.eval_demonstrations.frames.cpu(), self.eval_demonstrations.episodes.cpu()
+            stored = StoredDemonstrations(frames, episodes, self.eval_demonstrations.tasks)
+            contents = contents._replace(demonstrations=stored)
+        write_task_file(save_directory / TASK_FILE, contents)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:
         """Loads a policy with the instructions and demonstrations that were saved with it.
 
         See `PreTrainedPolicy.from_pretrained` for the arguments.
+
+        Raises:
+            ProcessorFileError: The checkpoint's processors would run code of their own when they are loaded.
+            ValueError: A file of the checkpoint is damaged, or does not fit the others.
         """
+        # Whoever loads a policy loads its processors next.
+        check_processor_files(pretrained_name_or_path, **hub_options(kwargs))
         path = find_task_file(pretrained_name_or_path, **kwargs)
+        contents = read_task_file(path)
         config = kwargs.get("config")
         if config is not None:
             # Another language encoder is an error of its own, before the weights turn out not to fit.
-            InstructionTable(config.language_encoder).read(path)
+            InstructionTable(config.language_encoder).take(contents, path)
         policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
-        policy.instructions.read(path)
-        # Demonstrations that the configuration names take precedence over those of the checkpoint.
-        demonstrations = read_demonstrations(path)
-        if policy.eval_demonstrations is None and demonstrations is not None:
-            policy.eval_demonstrations = demonstrations.to(policy.config.device)
+        policy._take_tasks(contents, path)
+        return policy
+
+    @classmethod
+    def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
+        policy = super()._load_as_safetensor(model, model_file, map_location, strict)
+        with safe_open(model_file, framework="pt") as file:
+            stored = set(file.keys())
+        expected = set(policy.state_dict())
+        if stored != expected:
+            missing, unknown = sorted(expected - stored), sorted(stored - expected)
+            raise ValueError(
+                f"{model_file} does not have the weights of this policy: it lacks {missing[:3] or 'none'}, "
+                f"and has the unknown {unknown[:3] or 'none'}. The config.json beside it belongs to other "
+                "weights, or to another version."
+            )
+        name = non_finite_weight(policy)
+        if name is not None:
+            raise ValueError(f"{model_file} is damaged: the weight {name} has numbers that are not finite.")
         return policy
 
     def load_state_dict(
@@ -722,6 +786,18 @@ class DeltacoPolicy(PreTrainedPolicy):
         return policy_card(
             self.config, demonstrations, n_known, dataset_repo_id, license, tags, cfg, dataset_meta
         )
+
+    def _take_tasks(self, contents: TaskFile, path: Path) -> None:
+        """Takes what the checkpoint knows of tasks."""
+        self.instructions.take(contents, path)
+        if contents.demonstrations is None:
+            return
+        n_kept = len(kept_frame_indices(0, 0, self.config.n_demo_frames))
+        check_demonstrations(path, contents.demonstrations, self.config.image_size, n_kept)
+        # Demonstrations named on the command line come before those of the checkpoint.
+        if self.eval_demonstrations is None:
+            frames, episodes, tasks = contents.demonstrations
+            self.eval_demonstrations = DemonstrationSet(frames, tasks, episodes).to(self.config.device)
 
 
 def _process_rank() -> int:

@@ -18,11 +18,11 @@ from small_policies import (
 )
 
 from lerobot_deltaco.commands import embed as embed_command
-from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
-from lerobot_deltaco.policy.language import LanguageEncoderError
 from lerobot_deltaco.policy.step_generator import step_generator
+from lerobot_deltaco.policy.task_file import TaskFileError
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
 pytestmark = pytest.mark.usefixtures("fake_language")
@@ -71,7 +71,7 @@ def test_the_defaults_are_the_papers():
         ({"demo_columns": 1}, "at least 2. Got 1"),
         ({"motion_modes": 0}, "`motion_modes` must be at least 1"),
         ({"demos_per_task": 1}, "`demos_per_task` cannot be 1"),
-        ({"temperature": 0.0}, "`temperature` must be greater than 0"),
+        ({"temperature": 0.0}, "`temperature` must be at least 0.001"),
         ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
         ({"film": "none", "concat": "none"}, "would get no task"),
         ({"method": "language_only", "encoder_loss": "contrastive"}, "no demonstration is used"),
@@ -105,42 +105,6 @@ def test_the_draws_of_a_step_are_a_function_of_seed_step_and_rank():
     )
     assert first == again
     assert len(set(first)) == len(numbers)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        *({"method": method} for method in METHODS),
-        {"film": "demo+language", "concat": "none"},
-        {"film": "none", "concat": "demo+language"},
-        {"film": "language", "concat": "demo"},
-        {"encoder_loss": "cosine"},
-        {"encoder_loss": "none"},
-        {"demo_rows": 2},
-        {"demo_encoder": "attention"},
-        {"demo_encoder": "attention", "demo_rows": 2},
-        {"motion_modes": 3},
-        {"gripper": "none"},
-        {"language_encoder": "all-distilroberta-v1"},
-    ],
-    ids=str,
-)
-def test_every_method_trains_and_acts_and_leaves_the_batch_alone(make, dataset, options):
-    policy, before, _ = make(**options)
-    batch = before(batch_of(dataset, [0, 7, 12, 20, 29]))
-    kept = copy.deepcopy(batch)
-    loss, logged = policy(batch)
-    loss.backward()
-    assert torch.isfinite(loss)
-    assert {"motion_nll", "motion_mse"} <= set(logged)
-    assert ("gripper_accuracy" in logged) == (policy.config.gripper_index is not None)
-    assert ("demo_accuracy" in logged) == (policy.config.conditioning.encoder_loss != "none")
-    without = [name for name, parameter in policy.named_parameters() if parameter.grad is None]
-    assert without == []
-    policy.eval()
-    assert policy.select_action(batch).shape == (5, 3)
-    for key, value in kept.items():
-        assert torch.equal(batch[key], value) if isinstance(value, torch.Tensor) else batch[key] == value
 
 
 def test_the_loss_is_the_papers_sum(make, dataset):
@@ -283,7 +247,7 @@ def test_instructions_can_be_embedded_elsewhere(make, dataset, tmp_path):
     with pytest.raises(ValueError, match="made with the language encoder paraphrase-MiniLM-L3-v2"):
         make(instruction_embeddings=str(file), language_encoder="all-MiniLM-L6-v2")
     for wrong in (tmp_path / "missing", tmp_path / "sentences.txt", tmp_path / "policy/model.safetensors"):
-        with pytest.raises(LanguageEncoderError, match="no embeddings of instructions"):
+        with pytest.raises(TaskFileError, match="no embeddings of instructions"):
             make(instruction_embeddings=str(wrong))
 
 

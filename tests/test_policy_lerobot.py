@@ -27,7 +27,7 @@ from small_policies import (
     small_policy,
 )
 
-from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy import language
@@ -83,34 +83,7 @@ def test_inputs_that_are_given_are_kept(dataset):
     assert list(policy.config.input_features) == ["observation.images.wrist"]
 
 
-def test_a_chunk_is_one_action(make, dataset):
-    policy, before, _ = make(method="language_only")
-    batch = before(observation(dataset, TASKS))
-    policy.eval()
-    assert torch.equal(policy.predict_action_chunk(batch), policy.select_action(batch)[:, None])
-
-
 # Saving and loading
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        *({"method": method} for method in METHODS),
-        {"film": "demo+language", "concat": "none"},
-        {"demo_rows": 2, "crop_padding": 0, "seed": 3},
-        {"gripper": "none", "dtype": "bfloat16", "grad_clip_norm": 1.0},
-    ],
-    ids=str,
-)
-def test_a_policy_and_its_configuration_survive_saving(make, tmp_path, options):
-    policy, _, _ = make(**options)
-    policy.save_pretrained(tmp_path)
-    loaded = DeltacoPolicy.from_pretrained(tmp_path)
-    assert_equal_weights(policy, loaded)
-    assert not loaded.training
-    assert loaded.config == policy.config
-    assert PreTrainedConfig.from_pretrained(tmp_path) == policy.config
 
 
 @pytest.mark.parametrize(
@@ -206,30 +179,6 @@ def test_processors_normalize_and_undo_it(make, dataset):
     torch.testing.assert_close(after(batch["action"]), raw["action"], atol=1e-3, rtol=0)
     for camera in dataset.meta.camera_keys:
         assert torch.equal(batch[camera], raw[camera])
-
-
-# The optimizer
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_the_optimizer_has_every_weight_of_the_networks_and_no_other(make, dataset, method):
-    policy, before, _ = make(method=method)
-    policy(before(batch_of(dataset, [0, 7])))  # by now, all that is read later is there
-    config = TrainPipelineConfig(DatasetConfig(REPO_ID), policy=policy.config)
-    config.optimizer = policy.config.get_optimizer_preset()
-    optimizer, _ = make_optimizer_and_scheduler(config, policy)
-    (group,) = optimizer.param_groups
-    assert (group["lr"], group["weight_decay"]) == (3e-4, 0)
-    expected = {
-        id(parameter)
-        for network in (policy.model, policy.demo_encoder, policy.project_language)
-        if network is not None
-        for parameter in network.parameters()
-    }
-    assert {id(parameter) for parameter in group["params"]} == expected
-    assert len(group["params"]) == len(expected)
-    # Neither demonstrations nor embeddings are weights: a checkpoint of the networks stays small.
-    assert not any("demonstrations" in name for name in policy.state_dict())
 
 
 # Evaluation by several threads

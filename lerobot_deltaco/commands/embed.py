@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> None:
     with exit_on_error(parser, LanguageEncoderError, OSError):
         table.add(instructions)
         with atomic_write(options.out) as temporary:
-            write_task_file(temporary, table)
+            write_task_file(temporary, table.contents())
     sys.stdout.write(
         f"{options.out}: {len(table.rows)} instructions. Train with "
         f"--policy.instruction_embeddings={options.out} "

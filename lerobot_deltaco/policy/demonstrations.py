@@ -16,6 +16,8 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_deltaco.policy.dataset_folders import check_dataset_folder
+
 logger = logging.getLogger(__name__)
 
 # Frames of an episode that are kept, if a demonstration has random ones: from the first to the last, evenly.
@@ -60,9 +62,10 @@ class DemonstrationSet(torch.nn.Module):
         self.register_buffer(
             "_place", torch.tensor([place[row] for row in range(len(self.tasks))]), persistent=False
         )
-        lookup = torch.full((int(max(episodes)) + 1,), -1)
-        lookup[self.episodes] = torch.arange(len(self.tasks))
-        self.register_buffer("_row_of_episode", lookup, persistent=False)
+        # Sorted, since a table by index could be far larger than the set.
+        ascending, row_of_place = self.episodes.sort()
+        self.register_buffer("_ascending", ascending, persistent=False)
+        self.register_buffer("_row_of_place", row_of_place, persistent=False)
         single = [task for task, rows in self.rows.items() if len(rows) == 1]
         if single:
             logger.info(
@@ -157,8 +160,8 @@ class DemonstrationSet(torch.nn.Module):
 
     def episode_rows(self, episodes: Tensor) -> Tensor:
         """Rows of episodes, (batch,); -1 of those that are not in the set."""
-        known = episodes < len(self._row_of_episode)
-        return torch.where(known, self._row_of_episode[episodes.clamp(max=len(self._row_of_episode) - 1)], -1)
+        place = torch.searchsorted(self._ascending, episodes).clamp(max=len(self._ascending) - 1)
+        return torch.where(self._ascending[place] == episodes, self._row_of_place[place], -1)
 
     def check_episodes(self, episodes: Tensor, rows: Tensor) -> None:
         """Checks that episodes (batch,) were found in these rows (batch,).
@@ -222,8 +225,10 @@ def load_demonstrations(
         n_demo_frames: Number of frames per demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
 
     Raises:
+        FileNotFoundError: There is no network, and no dataset in the folder.
         ValueError: The dataset has no such camera or episode.
     """
+    check_dataset_folder("--policy.demo_root", root)
     dataset = LeRobotDataset(repo_id, root=root, return_uint8=True)
     if camera not in dataset.meta.camera_keys:
         raise ValueError(

@@ -6,18 +6,17 @@ sentence-transformers does not support it, a branch of `load_language_encoder`.
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6
 from lerobot_deltaco.policy.packaged_encoders import LanguageEncoderError, packaged_l3, packaged_l6
+from lerobot_deltaco.policy.task_file import TaskFile, read_task_file
 
 BATCH_SIZE = 64
 
@@ -104,35 +103,33 @@ class InstructionTable:
             self.embeddings = torch.cat([self.embeddings, embeddings.to(self.embeddings)])
             self.rows |= {text: n_known + i for i, text in enumerate(instructions)}
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, str]]:
-        """What is known, as tensors and metadata of a safetensors file."""
+    def contents(self) -> TaskFile:
+        """What is known, as the contents of a file, without demonstrations."""
         with _LOCK:
-            known = {"language_encoder": self.encoder_name, "instructions": json.dumps(list(self.rows))}
-            return {"embeddings": self.embeddings.cpu().contiguous()}, known
+            return TaskFile(self.encoder_name, list(self.rows), self.embeddings.cpu(), None)
 
     def read(self, path: Path) -> None:
-        """Adds what `state` gave, from a file.
+        """Adds the embeddings of a file.
 
         Raises:
-            LanguageEncoderError: The file is missing, or is no such file.
+            TaskFileError: The file is missing, or has something in it that cannot be.
             ValueError: It is of another language encoder.
         """
-        try:
-            with safe_open(path, framework="pt") as file:
-                known, embeddings = file.metadata() or {}, file.get_tensor("embeddings")
-                name, instructions = known["language_encoder"], json.loads(known["instructions"])
-        except (OSError, SafetensorError, KeyError) as error:
-            raise LanguageEncoderError(
-                f"{path} has no embeddings of instructions ({error}). Name a checkpoint's tasks.safetensors, "
-                "or a file that deltaco-embed wrote."
-            ) from error
-        if name != self.encoder_name:
+        self.take(read_task_file(path), path)
+
+    def take(self, contents: TaskFile, path: Path) -> None:
+        """Adds the embeddings of a file that has been read.
+
+        Raises:
+            ValueError: They are of another language encoder.
+        """
+        if contents.language_encoder != self.encoder_name:
             raise ValueError(
-                f"{path} was made with the language encoder {name}. `language_encoder` cannot be "
-                f"{self.encoder_name}."
+                f"{path} was made with the language encoder {contents.language_encoder}. `language_encoder` "
+                f"cannot be {self.encoder_name}."
             )
-        new = [n for n, text in enumerate(instructions) if text not in self.rows]
-        self.put([instructions[n] for n in new], embeddings[new])
+        new = [n for n, text in enumerate(contents.instructions) if text not in self.rows]
+        self.put([contents.instructions[n] for n in new], contents.embeddings[new])
 
     def __call__(self, instructions: Sequence[str], device: torch.device | str) -> Tensor:
         """Embeddings of instructions, (instructions, embedding)."""

@@ -1,50 +1,57 @@
 """The file `tasks.safetensors` beside a policy's weights: what the policy knows about tasks.
 
 It holds embeddings of instructions, so that no language encoder is needed for those, and the demonstrations
-for evaluation, so that their dataset is not needed.
+for evaluation, so that their dataset is not needed. Checkpoints may come from strangers: the whole file is
+checked before anything of it is used.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import torch
 from huggingface_hub import hf_hub_download
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
-from lerobot_deltaco.policy.demonstrations import DemonstrationSet
-from lerobot_deltaco.policy.language import InstructionTable
+from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
 
 TASK_FILE = "tasks.safetensors"
 _DOWNLOAD_OPTIONS = ("revision", "cache_dir", "token", "local_files_only", "force_download")
+# Of a unit vector's length, in single precision.
+LENGTH_TOLERANCE = 1e-3
+_EMBEDDINGS, _FRAMES, _EPISODES = "embeddings", "frames", "episodes"
+_NAMES = (_EMBEDDINGS, _FRAMES, _EPISODES)
 
 
-def write_task_file(
-    path: Path, instructions: InstructionTable, demonstrations: DemonstrationSet | None = None
-) -> None:
-    """Writes instructions and demonstrations.
-
-    Args:
-        path: File to write.
-        instructions: Embeddings of instructions.
-        demonstrations: Demonstrations for evaluation, if any.
-    """
-    tensors, metadata = instructions.state()
-    if demonstrations is not None:
-        tensors |= {"frames": demonstrations.frames.cpu(), "episodes": demonstrations.episodes.cpu()}
-        metadata["tasks"] = json.dumps(demonstrations.tasks)
-    save_file(tensors, path, metadata=metadata)
+class TaskFileError(ValueError):
+    """A file of embeddings and demonstrations cannot be used; the message says why, and what to do."""
 
 
-def read_demonstrations(path: Path) -> DemonstrationSet | None:
-    """Reads the demonstrations of a file; None if it has none."""
-    with safe_open(path, framework="pt") as file:
-        if "frames" not in file.keys():  # noqa: SIM118  (no dictionary)
-            return None
-        tasks = json.loads(file.metadata()["tasks"])
-        return DemonstrationSet(file.get_tensor("frames"), tasks, file.get_tensor("episodes").tolist())
+class StoredDemonstrations(NamedTuple):
+    """Demonstrations, as a file has them."""
+
+    frames: Tensor  # (demonstrations, kept frames, 3, height, width) uint8
+    episodes: Tensor  # (demonstrations,) int64, indices in their dataset
+    tasks: list[str]  # of each demonstration
+
+
+class TaskFile(NamedTuple):
+    """What a file knows of tasks."""
+
+    language_encoder: str
+    instructions: list[str]
+    embeddings: Tensor  # (instructions, embedding), unit vectors
+    demonstrations: StoredDemonstrations | None
+
+
+def hub_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Of the arguments of `PreTrainedPolicy.from_pretrained`, those that concern the Hub."""
+    return {name: options[name] for name in _DOWNLOAD_OPTIONS if name in options}
 
 
 def find_task_file(pretrained_name_or_path: str | Path, **options: Any) -> Path:
@@ -57,5 +64,116 @@ def find_task_file(pretrained_name_or_path: str | Path, **options: Any) -> Path:
     folder = Path(pretrained_name_or_path)
     if folder.is_dir():
         return folder / TASK_FILE
-    given = {name: options[name] for name in _DOWNLOAD_OPTIONS if name in options}
-    return Path(hf_hub_download(str(pretrained_name_or_path), TASK_FILE, **given))
+    return Path(hf_hub_download(str(pretrained_name_or_path), TASK_FILE, **hub_options(options)))
+
+
+def write_task_file(path: Path, contents: TaskFile) -> None:
+    """Writes a file, which `read_task_file` reads."""
+    tensors = {_EMBEDDINGS: contents.embeddings.cpu().contiguous()}
+    known = {
+        "language_encoder": contents.language_encoder,
+        "instructions": json.dumps(contents.instructions),
+    }
+    if contents.demonstrations is not None:
+        frames, episodes, tasks = contents.demonstrations
+        tensors |= {_FRAMES: frames.cpu().contiguous(), _EPISODES: episodes.cpu().contiguous()}
+        known["tasks"] = json.dumps(tasks)
+    save_file(tensors, path, metadata=known)
+
+
+def read_task_file(path: Path) -> TaskFile:
+    """Reads a file, and checks it whole.
+
+    Raises:
+        TaskFileError: The file is missing, is no such file, or has something in it that cannot be.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            known: Mapping[str, str] = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys() if name in _NAMES}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise _error(path, error) from error
+    if _EMBEDDINGS not in tensors:
+        raise _error(path, f"the tensor `{_EMBEDDINGS}` is missing")
+    encoder = known.get("language_encoder")
+    if encoder not in LANGUAGE_ENCODERS:
+        known_encoders = ", ".join(LANGUAGE_ENCODERS)
+        raise _error(path, f"`language_encoder` must be one of {known_encoders}, not {encoder!r}")
+    instructions = _strings(path, known, "instructions")
+    if len(set(instructions)) < len(instructions):
+        raise _error(path, "`instructions` has an instruction twice")
+    embeddings = tensors[_EMBEDDINGS]
+    _check(path, _EMBEDDINGS, embeddings, torch.float32, (len(instructions), _dim(encoder)))
+    # Not finite, a number has no distance below the tolerance.
+    lengths = embeddings.norm(dim=1)
+    if not bool(((lengths - 1).abs() < LENGTH_TOLERANCE).all()):
+        raise _error(path, f"`{_EMBEDDINGS}` must be unit vectors of finite numbers")
+    demonstrations = _demonstrations(path, tensors, known) if set(tensors) > {_EMBEDDINGS} else None
+    return TaskFile(encoder, instructions, embeddings, demonstrations)
+
+
+def check_demonstrations(
+    path: Path, demonstrations: StoredDemonstrations, image_size: int, n_kept: int
+) -> None:
+    """Checks that demonstrations of a file are those of a policy.
+
+    Args:
+        path: The file.
+        demonstrations: Of the file.
+        image_size: Height and width of the policy's images, px.
+        n_kept: Number of frames that the policy keeps of each demonstration.
+
+    Raises:
+        TaskFileError: They have other numbers of frames or pixels.
+    """
+    shape = (len(demonstrations.tasks), n_kept, 3, image_size, image_size)
+    _check(path, _FRAMES, demonstrations.frames, torch.uint8, shape)
+
+
+def _demonstrations(
+    path: Path, tensors: Mapping[str, Tensor], known: Mapping[str, str]
+) -> StoredDemonstrations:
+    if missing := [name for name in (_FRAMES, _EPISODES) if name not in tensors]:
+        raise _error(path, f"demonstrations need the tensor `{missing[0]}`")
+    frames, episodes = tensors[_FRAMES], tensors[_EPISODES]
+    tasks = _strings(path, known, "tasks")
+    _check(path, _EPISODES, episodes, torch.int64, (len(tasks),))
+    if not tasks:
+        raise _error(path, "it has demonstrations, but none of a task")
+    if int(episodes.min()) < 0 or len(episodes.unique()) < len(episodes):
+        raise _error(path, f"`{_EPISODES}` must be different, and at least 0")
+    if frames.ndim != 5 or frames.shape[1] < 2:
+        shape = tuple(frames.shape)
+        raise _error(path, f"`{_FRAMES}` must have the shape (n, 2 or more, 3, h, w), not {shape}")
+    _check(path, _FRAMES, frames, torch.uint8, (len(tasks), frames.shape[1], 3, *frames.shape[3:]))
+    return StoredDemonstrations(frames, episodes, tasks)
+
+
+def _strings(path: Path, known: Mapping[str, str], name: str) -> list[str]:
+    try:
+        strings = json.loads(known[name])
+    except (KeyError, ValueError) as error:
+        raise _error(path, f"`{name}` must be a list in JSON: {error!r}") from error
+    if not isinstance(strings, list) or not all(isinstance(item, str) for item in strings):
+        raise _error(path, f"`{name}` must be a list of strings")
+    return strings
+
+
+def _check(path: Path, name: str, tensor: Tensor, dtype: torch.dtype, shape: tuple[int, ...]) -> None:
+    if tensor.dtype != dtype or tuple(tensor.shape) != shape:
+        raise _error(
+            path,
+            f"`{name}` must be of the type {str(dtype).removeprefix('torch.')} and the shape {shape}, not "
+            f"{str(tensor.dtype).removeprefix('torch.')} and {tuple(tensor.shape)}",
+        )
+
+
+def _dim(encoder: str) -> int:
+    return LANGUAGE_ENCODERS[encoder].embedding_dim
+
+
+def _error(path: Path, reason: object) -> TaskFileError:
+    return TaskFileError(
+        f"{path} has no embeddings of instructions that can be used ({reason}). Name a checkpoint's "
+        "tasks.safetensors, or a file that deltaco-embed wrote."
+    )
