@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.scripts import lerobot_train
 from small_policies import use_fake_encoder
 
@@ -17,7 +18,10 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.commands import collect as collect_command
 from lerobot_deltaco.commands import evaluate as evaluate_command
-from lerobot_deltaco.common.run_folder import RunError, checkpoints
+from lerobot_deltaco.common.run_folder import RunError, checkpoints, describe
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.envs.configuration_env import DeltacoEnv
+from lerobot_deltaco.envs.policy_fit import check_policy_fits
 from lerobot_deltaco.evaluation import sets
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.evaluation.evaluate import counterfactual_task, evaluate
@@ -207,6 +211,16 @@ def test_a_folder_without_checkpoints_is_refused(tmp_path, capsys):
         checkpoints(tmp_path)
 
 
+def test_a_checkpoint_that_is_being_written_is_left_out(tmp_path):
+    folder = tmp_path / "checkpoints"
+    for step in ("000002", "000004", "000006"):
+        (folder / step / "pretrained_model").mkdir(parents=True)
+        (folder / step / "pretrained_model" / "model.safetensors").touch()
+    assert [checkpoint.step for checkpoint in checkpoints(tmp_path)] == [2, 4, 6]
+    (folder / "last").symlink_to("000004")
+    assert [checkpoint.step for checkpoint in checkpoints(tmp_path)] == [2, 4]
+
+
 def test_the_record_is_plain_json(run):
     evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "1", "--steps", "last"])
     content = json.loads(record_path(run, 2).read_text())
@@ -227,3 +241,78 @@ def test_evaluations_in_training_leave_the_records_that_evaluations_afterwards_d
         assert (record.experiment, record.run_seed, record.tasks) == ("small/deltaco", 7, "4,14")
         assert record.policy == after.policy
         assert record.command.startswith("deltaco-train --policy.type=deltaco")
+
+
+# The environment's settings
+
+
+def test_image_size_and_episode_length_are_those_of_the_training(tmp_path, monkeypatch, capsys):
+    root, folder = str(tmp_path / "data"), tmp_path / "run"
+    collect = ["--tasks", "4,14", "--episodes-per-task", "1", "--image-size", "32", "--workers", "1"]
+    collect_command.main([*collect, "--root", root])
+    environment = {"env.type": "deltaco", "env.task": "4", "env_eval_freq": "1", "eval.n_episodes": "1"}
+    environment |= {"env.episode_length": "7", "steps": "1"}
+    with pytest.raises(ValueError, match=r"images of 32 x 32 pixels.*have 48 x 48.*--env.image_size=32"):
+        train(root, tmp_path / "refused", **environment)
+
+    n_steps = []
+    step = PickPlaceEnv.step
+    monkeypatch.setattr(PickPlaceEnv, "step", lambda self, action: n_steps.append(1) or step(self, action))
+    train(root, folder, **environment, **{"env.image_size": "32"})
+    during = read_record(record_path(folder, 1))
+    assert (during.image_size, during.episode_length, len(n_steps)) == (32, 7, 7)
+
+    shutil.rmtree(folder / "evaluations")
+    n_steps.clear()
+    arguments = [str(folder), "--tasks", "4", "--trials", "1"]
+    evaluate_command.main(arguments)
+    after = read_record(record_path(folder, 1))
+    assert (after.image_size, after.episode_length, len(n_steps)) == (32, 7, 7)
+    assert after.episodes == during.episodes
+
+    n_steps.clear()
+    evaluate_command.main([*arguments, "--episode-length", "3", "--out", str(tmp_path / "short")])
+    assert read_record(record_path(tmp_path / "short", 1)).episode_length == len(n_steps) == 3
+    for options, message in (
+        (["--episode-length", "3"], "belongs to another evaluation"),
+        (["--image-size", "48", "--out", str(tmp_path / "large")], "images of 32 x 32 pixels"),
+        (["--image-size", "2"], "`image_size` must be at least"),
+    ):
+        with pytest.raises(SystemExit):
+            evaluate_command.main([*arguments, *options])
+        assert message in capsys.readouterr().err
+
+
+def features(image=("observation.image", 48), state=10, action=4):
+    name, size = image
+    return {
+        "input_features": {
+            name: PolicyFeature(FeatureType.VISUAL, (3, size, size)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (state,)),
+        },
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (action,))},
+    }
+
+
+@pytest.mark.parametrize(
+    ("trained_on", "message"),
+    [
+        ({"image": ("observation.image", 64)}, "64 x 64 pixels, but those of the environment have 48 x 48"),
+        ({"image": ("observation.images.front", 48)}, "images of observation.images.front, but"),
+        ({"state": 6}, r"`observation.state` of the shape \(6,\), but .* is \(10,\)"),
+        ({"action": 7}, r"`action` of the shape \(7,\), but .* is \(4,\)"),
+    ],
+)
+def test_a_policy_for_something_else_is_refused(trained_on, message):
+    check_policy_fits(DeltacoConfig(device="cpu", **features()), DeltacoEnv())
+    with pytest.raises(ValueError, match=message):
+        check_policy_fits(DeltacoConfig(device="cpu", **features(**trained_on)), DeltacoEnv())
+
+
+@pytest.mark.parametrize("damage", ["", "[]", '{"job_name": 3}'])
+def test_a_damaged_description_of_a_run_is_named(run, tmp_path, damage):
+    folder = shutil.copytree(run, tmp_path / "run")
+    checkpoint = checkpoints(folder)[0]
+    (checkpoint.folder / "train_config.json").write_text(damage)
+    with pytest.raises(RunError, match="train_config.json or config.json is damaged"):
+        describe(checkpoint)

@@ -16,6 +16,7 @@ from gym_deltaco import ENV_ID
 from gym_deltaco.tasks import CONTAINER_WORDS, TASKS
 from lerobot_deltaco.commands import report as report_command
 from lerobot_deltaco.evaluation.record import (
+    RECORD_FORMAT,
     EpisodeResult,
     EvaluationRecord,
     RecordError,
@@ -380,8 +381,11 @@ def with_value(name, value, in_episode=True):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (without("format"), "in format 1: its format is None.*deltaco-evaluate"),
+        (without("format"), "in format 2: its format is None.*deltaco-evaluate"),
         (without("trials"), r"lacks \['trials'\]"),
+        (without("image_size"), r"lacks \['image_size'\]"),
+        (with_value("format", 3, False), "its format is 3"),
+        (with_value("format", True, False), "its format is True"),
         (with_value("more", 1), r"EpisodeResult lacks nothing, and has the unknown \['more'\]"),
         (with_value("counterfactual", "both", False), "one of none, demo, instruction. Got 'both'"),
         (with_value("step", "10", False), "`step` must be an integer. Got '10'"),
@@ -399,7 +403,7 @@ def with_value(name, value, in_episode=True):
     ],
 )
 def test_a_damaged_record_is_refused(tmp_path, damage, message):
-    content = {"format": 1, **asdict(record())}
+    content = {"format": RECORD_FORMAT, **asdict(record())}
     damage(content)
     path = tmp_path / "evaluations/0010000.json"
     path.parent.mkdir()
@@ -407,6 +411,19 @@ def test_a_damaged_record_is_refused(tmp_path, damage, message):
     with pytest.raises(RecordError, match=message) as caught:
         read_record(path)
     assert str(path) in str(caught.value)
+
+
+def test_a_record_of_the_first_format_says_what_was_so_then(tmp_path):
+    content = asdict(record())
+    for name in ("image_size", "episode_length"):
+        del content[name]
+    path = tmp_path / "0010000.json"
+    path.write_text(json.dumps({"format": 1, **content}))
+    assert read_record(path) == record()
+    assert (record().image_size, record().episode_length) == (48, 30)
+    path.write_text(json.dumps({"format": 1, **content, "image_size": "48"}))
+    with pytest.raises(RecordError, match="`image_size` must be an integer"):
+        read_record(path)
 
 
 @pytest.mark.parametrize("text", ['{"format": 1, "epis', "[]", ""])
@@ -489,6 +506,8 @@ def test_options_that_are_newer_than_a_record_were_as_they_are_by_default(tmp_pa
         ({"versions": {"benchmark": "gym_deltaco/PickPlace-v1"}}, "version of the benchmark: .*-v0.*-v1"),
         ({"evaluation_seed": 7}, "records of 'scenario_a' differ in their evaluation seed: 0 in .* 7 in"),
         ({"ambiguity": "object"}, "ambiguity scheme: 'container' .* 'object'"),
+        ({"image_size": 64}, "image size: 48 .* 64"),
+        ({"episode_length": 7}, "episode length: 30 .* 7"),
         ({"trials": 2}, "trials: 1 in .* 2 in"),
         ({"tasks": "24", "episodes": [episode(24)]}, "tasks: '24,32,.*' in .* '24' in"),
     ],

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from gym_deltaco.layout import AMBIGUITIES
 from lerobot_deltaco.commands.command_errors import exit_on_error
-from lerobot_deltaco.common.run_folder import Checkpoint, RunError, checkpoints, describe
+from lerobot_deltaco.common.run_folder import Checkpoint, RunDescription, RunError, checkpoints, describe
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import (
     COUNTERFACTUALS,
@@ -30,6 +30,12 @@ def main(arguments: list[str] | None = None) -> None:
         plan = EvaluationPlan(
             options.tasks, options.trials, options.seed, options.counterfactual, options.ambiguity
         )
+        given = {
+            name: getattr(options, name)
+            for name in ("image_size", "episode_length")
+            if getattr(options, name) is not None
+        }
+        plan = replace(plan, **given)
         if options.out is not None and len(options.runs) > 1:
             parser.error(f"--out holds the records of a single run. Got {len(options.runs)} runs.")
         if options.demo_root is not None and options.demo_repo_id is None:
@@ -44,7 +50,13 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error(str(error))
     with exit_on_error(parser, RunError, RecordError, ValueError, OSError):
         for run, checkpoint in todo:
-            _evaluate(run, checkpoint, plan, options, command)
+            description = describe(checkpoint)
+            trained_with = {
+                "image_size": description.image_size,
+                "episode_length": description.episode_length,
+            }
+            of_run = replace(plan, **{**trained_with, **given})
+            _evaluate(run, checkpoint, description, of_run, options, command)
 
 
 def _chosen(run: Path, steps: str) -> list[Checkpoint]:
@@ -63,10 +75,14 @@ def _chosen(run: Path, steps: str) -> list[Checkpoint]:
 
 
 def _evaluate(
-    run: Path, checkpoint: Checkpoint, plan: EvaluationPlan, options: argparse.Namespace, command: str
+    run: Path,
+    checkpoint: Checkpoint,
+    description: RunDescription,
+    plan: EvaluationPlan,
+    options: argparse.Namespace,
+    command: str,
 ) -> None:
     folder = options.out or run
-    description = describe(checkpoint)
     experiment = options.experiment or description.experiment
     path = record_path(folder, checkpoint.step, plan.counterfactual)
     if path.exists():
@@ -77,7 +93,13 @@ def _evaluate(
                 f"{experiment!r} with seed {description.seed}. Name another folder with --out."
             )
         made_for = EvaluationPlan(
-            record.tasks, record.trials, record.evaluation_seed, record.counterfactual, record.ambiguity
+            record.tasks,
+            record.trials,
+            record.evaluation_seed,
+            record.counterfactual,
+            record.ambiguity,
+            record.image_size,
+            record.episode_length,
         )
         if made_for != plan:
             raise RecordError(
@@ -161,6 +183,19 @@ def _parser() -> argparse.ArgumentParser:
         default=plan.ambiguity,
         help="ambiguity scheme of the scenes: container (the paper's scheme i) or object (scheme ii) "
         "(default: %(default)s)",
+    )
+    parser.add_argument(
+        "--image-size",
+        type=int,
+        metavar="PX",
+        help="height and width of the environment's images (by default, those of the training's)",
+    )
+    parser.add_argument(
+        "--episode-length",
+        type=int,
+        metavar="STEPS",
+        help="steps of an episode (by default, of the training's environment, or else the benchmark's "
+        f"{plan.episode_length})",
     )
     parser.add_argument(
         "--steps",

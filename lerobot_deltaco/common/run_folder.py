@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
+
+from gym_deltaco import EPISODE_STEPS
+from lerobot_deltaco.common.typed_fields import in_words, is_a, type_hints
 
 CHECKPOINTS = "checkpoints"
 LAST = "last"
@@ -12,6 +16,7 @@ PRETRAINED_MODEL = "pretrained_model"
 TRAINING_STEP = Path("training_state", "training_step.json")
 WEIGHTS = "model.safetensors"
 TRAIN_CONFIG = "train_config.json"
+POLICY_CONFIG = "config.json"
 
 
 class RunError(ValueError):
@@ -25,23 +30,38 @@ class Checkpoint(NamedTuple):
     folder: Path  # of the policy
 
 
-class RunDescription(NamedTuple):
-    """The name and the seed of a training run."""
+@dataclass(frozen=True)
+class RunDescription:
+    """What a training run says of itself.
+
+    Attributes:
+        experiment: Its job name.
+        seed: Seed of its training.
+        image_size: Height and width of the images that it was trained on, px.
+        episode_length: Steps of an episode of its environment, or of the benchmark's if it had none.
+    """
 
     experiment: str
     seed: int
+    image_size: int
+    episode_length: int
 
 
 def checkpoints(run: Path) -> list[Checkpoint]:
     """The complete checkpoints of a run, ascending by step.
 
+    What is beyond the link `last`, which LeRobot sets when a checkpoint is complete, is being written, or was
+    when the training was killed.
+
     Raises:
         RunError: There are none.
     """
+    last = (run / CHECKPOINTS / LAST).resolve().name
     found = [
         Checkpoint(int(folder.name), folder / PRETRAINED_MODEL)
         for folder in sorted((run / CHECKPOINTS).glob("*"))
         if folder.name.isdecimal() and (folder / PRETRAINED_MODEL / WEIGHTS).is_file()
+        if not last.isdecimal() or int(folder.name) <= int(last)
     ]
     if not found:
         raise RunError(
@@ -68,6 +88,31 @@ def last_step(run: Path) -> int:
 
 
 def describe(checkpoint: Checkpoint) -> RunDescription:
-    """The job name and the seed of a checkpoint's run."""
-    config = json.loads((checkpoint.folder / TRAIN_CONFIG).read_text(encoding="utf-8"))
-    return RunDescription(config["job_name"], config["seed"] if config["seed"] is not None else 0)
+    """The run's job name and seed, and its environment.
+
+    Raises:
+        RunError: What the run has written down of itself is damaged, or it was not trained on the benchmark.
+    """
+    try:
+        run = json.loads((checkpoint.folder / TRAIN_CONFIG).read_text(encoding="utf-8"))
+        policy = json.loads((checkpoint.folder / POLICY_CONFIG).read_text(encoding="utf-8"))
+        cameras = [name for name, item in policy["input_features"].items() if item["type"] == "VISUAL"]
+        env = run["env"] if (run.get("env") or {}).get("type") == "deltaco" else {}
+        description = RunDescription(
+            experiment=run["job_name"],
+            seed=run["seed"] if run["seed"] is not None else 0,
+            image_size=policy["input_features"][cameras[0]]["shape"][-1],
+            episode_length=env.get("episode_length", EPISODE_STEPS),
+        )
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise RunError(
+            f"{checkpoint.folder} has no description of its training that can be read ({error!r}): its "
+            "train_config.json or config.json is damaged, or of another version of LeRobot."
+        ) from None
+    for name, kind in type_hints(RunDescription).items():
+        if not is_a(getattr(description, name), kind):
+            raise RunError(
+                f"{checkpoint.folder} says of its training that `{name}` is {getattr(description, name)!r}, "
+                f"which must be {in_words(kind)}."
+            )
+    return description

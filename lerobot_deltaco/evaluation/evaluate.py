@@ -17,6 +17,7 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, Task, get_task, select_tasks
 from gym_deltaco.workspace import Quadrant, container_matches
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
+from lerobot_deltaco.envs.policy_fit import check_policy_fits
 from lerobot_deltaco.envs.vector_env import make_task_vector_envs
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import BENCHMARK, Counterfactual, EpisodeResult
@@ -46,13 +47,17 @@ def evaluate(
         The episodes, task after task.
 
     Raises:
-        ValueError: A task has no demonstration.
+        ValueError: A task has no demonstration, or the policy is not one for this environment.
     """
+    env_config = DeltacoEnv(
+        ambiguity=plan.ambiguity, image_size=plan.image_size, episode_length=plan.episode_length
+    )
+    check_policy_fits(policy.config, env_config)
     task_ids = select_tasks(plan.tasks)
     # What another task's instruction or demonstration asks for depends on the scene, so that each episode of
     # a counterfactual evaluation has its own demonstration or instruction.
     n_envs = 1 if plan.counterfactual != "none" else plan.trials
-    gym_kwargs = {**DeltacoEnv(ambiguity=plan.ambiguity).gym_kwargs, "render_mode": None}
+    gym_kwargs = {**env_config.gym_kwargs, "render_mode": None}
     envs = make_task_vector_envs(ENV_ID, gym_kwargs, task_ids, n_envs)
     identity: PolicyProcessorPipeline = PolicyProcessorPipeline(steps=[])
     results = []

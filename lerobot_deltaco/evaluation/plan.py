@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gym_deltaco import EPISODE_STEPS
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
 from gym_deltaco.tasks import select_tasks
-from lerobot_deltaco.common.checks import check_choices, check_minimums
+from lerobot_deltaco.common.checks import check_choices
+from lerobot_deltaco.common.env_ranges import ENV_RANGES
+from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.evaluation.record import COUNTERFACTUALS, Counterfactual
 
 
@@ -23,6 +26,8 @@ class EvaluationPlan:
             "instruction": that one is another task's, which asks for another object of the scene and for the
             other container, if there is such a task.
         ambiguity: "container" or "object", the paper's schemes i and ii.
+        image_size: Height and width of the policy's images in the environment, px.
+        episode_length: Number of steps of an episode.
 
     Raises:
         ValueError: An argument is invalid; the message says what is valid.
@@ -33,8 +38,12 @@ class EvaluationPlan:
     seed: int = 0
     counterfactual: Counterfactual = "none"
     ambiguity: Ambiguity = "container"
+    image_size: int = 48
+    episode_length: int = EPISODE_STEPS
 
     def __post_init__(self) -> None:
+        check_field_types(self)
         select_tasks(self.tasks)
-        check_minimums(self, trials=1, seed=0)
+        ranges = {name: ENV_RANGES[name] for name in ("image_size", "episode_length")}
+        check_ranges(self, {"trials": (1, 1_000_000), "seed": (0, 2**63 - 1), **ranges})
         check_choices(self, counterfactual=COUNTERFACTUALS, ambiguity=AMBIGUITIES)

@@ -7,15 +7,18 @@ file in the folder `evaluations` of the training run.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from gym_deltaco import EPISODE_STEPS
 from gym_deltaco.atomic_files import write_json
 from gym_deltaco.tasks import N_TASKS, OBJECTS
 from lerobot_deltaco.common.typed_fields import in_words, is_a, type_hints
 
-RECORD_FORMAT = 1
+# Format 2 has more fields than format 1. Those have defaults, which say what was so in all records before.
+RECORD_FORMAT = 2
+READABLE_FORMATS = (1, RECORD_FORMAT)
 RECORDS_FOLDER = "evaluations"
 
 Counterfactual = Literal["none", "demo", "instruction"]
@@ -86,6 +89,8 @@ class EvaluationRecord:
         versions: Versions of the benchmark ("benchmark": the environment's id) and of the relevant packages.
         command: Command line of the evaluation.
         seconds: Duration of the episodes, s.
+        image_size: Height and width of the policy's images in the environment, px.
+        episode_length: Number of steps of an episode.
     """
 
     experiment: str
@@ -102,6 +107,8 @@ class EvaluationRecord:
     versions: dict[str, str]
     command: str
     seconds: float
+    image_size: int = 48
+    episode_length: int = EPISODE_STEPS
 
     @property
     def success_rate(self) -> float:
@@ -131,30 +138,41 @@ def read_record(path: Path) -> EvaluationRecord:
         content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise RecordError(f"{path} is not a record of an evaluation: it is no JSON ({error}).") from None
-    if not isinstance(content, dict) or content.get("format") != RECORD_FORMAT:
-        found = content.get("format") if isinstance(content, dict) else None
+    found = content.get("format") if isinstance(content, dict) else None
+    if type(found) is not int or found not in READABLE_FORMATS:
         raise RecordError(
             f"{path} is not a record of an evaluation in format {RECORD_FORMAT}: its format is {found!r}. "
             "Evaluate the checkpoint again with `deltaco-evaluate`."
         )
     del content["format"]
-    _check_fields(path, content, EvaluationRecord, but="episodes")
+    is_older = found < RECORD_FORMAT
+    content = _check_fields(path, content, EvaluationRecord, but="episodes", is_older=is_older)
     if BENCHMARK not in content["versions"]:
         raise RecordError(f"{path} does not say of which version of the benchmark it is (`versions`).")
     if not isinstance(content["episodes"], list) or not content["episodes"]:
         raise RecordError(f"{path} has no episodes.")
-    for episode in content["episodes"]:
-        _check_fields(path, episode, EpisodeResult)
-    episodes = [EpisodeResult(**episode) for episode in content["episodes"]]
+    episodes = [
+        EpisodeResult(**_check_fields(path, episode, EpisodeResult, is_older=is_older))
+        for episode in content["episodes"]
+    ]
     for episode in episodes:
         _check_numbers(path, episode)
     return EvaluationRecord(**{**content, "episodes": episodes})
 
 
-def _check_fields(path: Path, content: Any, kind: type[Any], but: str | None = None) -> None:
-    """Checks that a record or an episode has its fields, of their types (those of one field excepted)."""
+def _check_fields(
+    path: Path, content: Any, kind: type[Any], but: str | None = None, is_older: bool = False
+) -> dict[str, Any]:
+    """Checks that a record or an episode has its fields, of their types (those of one field excepted).
+
+    Returns:
+        The content; one of an older format has the defaults of the fields that came later.
+    """
     if not isinstance(content, dict):
         raise RecordError(f"{path} is damaged: expected the fields of {kind.__name__}, got {content!r}.")
+    if is_older:
+        defaults = {field.name: field.default for field in fields(kind) if field.default is not MISSING}
+        content = {**defaults, **content}
     expected = {field.name for field in fields(kind)}
     if set(content) != expected:
         missing, unknown = sorted(expected - set(content)), sorted(set(content) - expected)
@@ -167,6 +185,7 @@ def _check_fields(path: Path, content: Any, kind: type[Any], but: str | None = N
             raise RecordError(
                 f"{path} is damaged: `{name}` must be {in_words(value_kind)}. Got {content[name]!r}."
             )
+    return content
 
 
 def _check_numbers(path: Path, episode: EpisodeResult) -> None:

@@ -63,6 +63,8 @@ def run_set(
         versions=versions(policy),
         command=command,
         seconds=time.monotonic() - start,
+        image_size=plan.image_size,
+        episode_length=plan.episode_length,
     )
     write_record(record, record_path(folder, step, plan.counterfactual))
     return record

@@ -138,6 +138,8 @@ class ExperimentRun:
                 "env.ambiguity": self.config.evaluation.get("ambiguity", "container"),
                 "eval.n_episodes": self.config.evaluation["trials"],
             }
+            if "image_size" in self.config.data:
+                options["env.image_size"] = self.config.data["image_size"]
         start = self._start_folder()
         if start is None:
             options = {"policy.type": "deltaco", **options}

@@ -234,6 +234,8 @@ def _check_together(everything: Sequence[Series]) -> None:
         _check_same("trials", records, group, lambda item: item.record.trials)
         _check_same("evaluation seed", records, group, lambda item: item.record.evaluation_seed)
         _check_same("ambiguity scheme", records, group, lambda item: item.record.ambiguity)
+        _check_same("image size", records, group, lambda item: item.record.image_size)
+        _check_same("episode length", records, group, lambda item: item.record.episode_length)
 
 
 def _check_same(
