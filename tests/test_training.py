@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import sys
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from small_policies import REPO_ID, TASKS, batch_of, write_dataset
 
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import load_demonstrations
+from lerobot_deltaco.policy.finite_loss import TrainingDivergedError
 from lerobot_deltaco.training.frames import FramesInMemory, decoded, needed_bytes
 from lerobot_deltaco.training.loop import InMemoryTraining
 
@@ -146,17 +148,24 @@ def test_training_equals_that_of_lerobots_own_loop(train):
     assert_same(weights(stock / "000004"), weights(memory / "000004"))
 
 
-def test_a_resumed_run_equals_an_uninterrupted_one(train):
-    options = ["--policy.tasks_per_batch=2"]
-    whole = train(*options, "--steps=6", name="whole")
-    part = train(*options, "--steps=6", name="part")
-    config = part / "000002" / "pretrained_model" / "train_config.json"
-    for step in ("000004", "000006"):
-        for file in sorted((part / step).rglob("*"), reverse=True):
-            file.unlink() if file.is_file() else file.rmdir()
-        (part / step).rmdir()
-    train(f"--config_path={config}", "--resume=true", name="part")
-    assert_same(weights(whole / "000006"), weights(part / "000006"))
+def without_later_checkpoints(checkpoints, folder, step):
+    """Copies the checkpoints of a run up to a step: what is there if it was killed after that one."""
+    for path in sorted(checkpoints.iterdir()):
+        if path.name.isdecimal() and int(path.name) <= step:
+            shutil.copytree(path, folder / "checkpoints" / path.name)
+    return folder / "checkpoints" / f"{step:06d}" / "pretrained_model" / "train_config.json"
+
+
+@pytest.mark.parametrize("tasks_per_batch", [0, 2])
+def test_a_resumed_run_equals_an_uninterrupted_one(train, tmp_path, tasks_per_batch):
+    # An epoch has 60 frames, which are 6 batches.
+    options = [f"--policy.tasks_per_batch={tasks_per_batch}", "--batch_size=10", "--steps=14"]
+    whole = train(*options, "--save_freq=4", "--log_freq=20", name="whole")
+    for step in (8, 12):  # in the second epoch, and at its end
+        config = without_later_checkpoints(whole, tmp_path / f"part_{step}", step)
+        part = config.parents[2]
+        train(f"--config_path={config}", "--resume=true", f"--output_dir={part.parent}", "--save_freq=14")
+        assert_same(weights(whole / "000014"), weights(part / "000014"))
 
 
 def test_episodes_and_the_split_are_respected(train, monkeypatch):
@@ -216,6 +225,59 @@ def test_too_many_frames_are_refused_before_they_are_read(dataset, monkeypatch):
     monkeypatch.setattr("lerobot_deltaco.training.frames.psutil.virtual_memory", lambda: memory)
     with pytest.raises(MemoryError, match="60 frames take 0.0 GB.*--dataset.episodes"):
         FramesInMemory(LeRobotDataset(REPO_ID, root=dataset.root, return_uint8=True))
+
+
+@pytest.mark.parametrize("option", ["dataset.root", "policy.demo_root"])
+def test_a_mistyped_folder_is_named_and_not_made(train, tmp_path, option):
+    missing = tmp_path / "mistyped" / "data"
+    with pytest.raises(
+        FileNotFoundError, match=rf"--{option} is .*mistyped/data.* the folder does not exist"
+    ):
+        train("--policy.demo_repo_id=test/foreign", f"--{option}={missing}")
+    assert not missing.parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("damage", "cause"),
+    [
+        (lambda batch: batch["action"].fill_(np.inf), "`action` or `observation.state` had numbers"),
+        (lambda batch: None, "lower --policy.optimizer_lr, or limit the gradient"),
+    ],
+)
+def test_a_training_that_diverges_stops_and_leaves_the_last_good_checkpoint(
+    train, tmp_path, monkeypatch, damage, cause
+):
+    imitation_loss = DeltacoPolicy._imitation_loss
+
+    def diverging(self, batch, *arguments):
+        loss, logged = imitation_loss(self, batch, *arguments)
+        if int(self.step) == 2:
+            damage(batch)
+            loss = loss * torch.inf
+        return loss, logged
+
+    monkeypatch.setattr(DeltacoPolicy, "_imitation_loss", diverging)
+    with pytest.raises(TrainingDivergedError, match="loss of training step 3 is not finite") as error:
+        train("--save_freq=2", "--steps=8")
+    assert cause in str(error.value)
+    assert "--resume=true" in str(error.value)
+    saved = tmp_path.rglob("model.safetensors")
+    assert [path.parent.parent.name for path in saved] == ["000002"]
+
+
+def test_a_checkpoint_of_weights_that_are_not_finite_is_not_saved(train, monkeypatch):
+    forward = DeltacoPolicy.forward
+
+    def overflowing(self, batch, **options):
+        result = forward(self, batch, **options)
+        if int(self.step) == 2:
+            with torch.no_grad():
+                self.model.raw_log_std.fill_(torch.nan)
+        return result
+
+    monkeypatch.setattr(DeltacoPolicy, "forward", overflowing)
+    with pytest.raises(TrainingDivergedError, match="After training step 2, the weight model.raw_log_std"):
+        train("--save_freq=2", "--steps=8")
 
 
 def test_what_was_in_lerobots_loop_is_there_again_afterwards(train):

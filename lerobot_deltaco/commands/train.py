@@ -2,16 +2,19 @@
 
 import sys
 
+from draccus.utils import ParsingError
+
 from lerobot_deltaco.lerobot_internals import UnsupportedLeRobotError
-from lerobot_deltaco.training.loop import train
+from lerobot_deltaco.policy.finite_loss import TrainingDivergedError
+from lerobot_deltaco.training.loop import reason_of, train
 
 
 def main() -> None:
     """Trains. The arguments are those of `lerobot-train`."""
     try:
         train()
-    except UnsupportedLeRobotError as error:
-        sys.exit(f"deltaco-train: {error}")
+    except (UnsupportedLeRobotError, TrainingDivergedError, ParsingError) as error:
+        sys.exit(f"deltaco-train: {reason_of(error)}")
 
 
 if __name__ == "__main__":

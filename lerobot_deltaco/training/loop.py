@@ -18,13 +18,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from draccus.utils import ParsingError
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
+from lerobot_deltaco.envs.policy_fit import check_policy_fits
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.sets import run_set
 from lerobot_deltaco.lerobot_internals import (
@@ -34,6 +36,7 @@ from lerobot_deltaco.lerobot_internals import (
     training_loop,
 )
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.dataset_folders import check_dataset_folder
 from lerobot_deltaco.training.frames import FramesInMemory
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
@@ -56,6 +59,17 @@ class FrameIndexDataset(torch.utils.data.Dataset):
         return getattr(self._dataset, name)
 
 
+class ResumableSampler(EpisodeAwareSampler):
+    """LeRobot's sampler, which counts its epochs itself, also where a resumed training has begun.
+
+    accelerate 1.15 counts the epochs of a process from 0, and sets them in the sampler: with LeRobot's own,
+    a resumed training begins with the order of the first epoch, wherever it was interrupted.
+    """
+
+    def set_epoch(self, epoch: int) -> None:
+        """Does nothing: the epoch is that of `load_state_dict`, or follows the last one."""
+
+
 class InMemoryTraining:
     """What stands for LeRobot's functions during one training."""
 
@@ -65,7 +79,6 @@ class InMemoryTraining:
         loop = training_loop()
         self._make_datasets = loop.make_train_eval_datasets
         self._make_policy = loop.make_policy
-        self._make_sampler = loop.EpisodeAwareSampler
         self._cycle = loop.cycle
         self._make_envs = loop._make_eval_envs
         self._evaluate = loop.eval_policy_all
@@ -89,6 +102,7 @@ class InMemoryTraining:
 
         Raises:
             ValueError: The policy is another one, or the data cannot be held in memory.
+            FileNotFoundError: There is no network, and no dataset in a folder.
             MemoryError: The frames do not fit.
         """
         if not isinstance(config.policy, DeltacoConfig):
@@ -97,6 +111,9 @@ class InMemoryTraining:
             )
         if config.dataset.streaming:
             raise ValueError("`deltaco-train` holds all frames in memory: leave out --dataset.streaming.")
+        # Both before hours of decoding.
+        check_dataset_folder("--dataset.root", config.dataset.root)
+        check_dataset_folder("--policy.demo_root", config.policy.demo_root)
         self._config = config
         # The loader has nothing to do: it gives places, and the frames are gathered on the device.
         config.num_workers = 0
@@ -112,6 +129,10 @@ class InMemoryTraining:
         """LeRobot's policy, which draws its demonstrations from the frames in memory."""
         policy = self._make_policy(**arguments)
         config, frames = policy.config, self._frames
+        assert self._config is not None
+        if isinstance(self._config.env, DeltacoEnv):
+            # Now, and not when the first evaluation is due.
+            check_policy_fits(config, self._config.env)
         assert isinstance(policy, DeltacoPolicy)
         assert frames is not None
         if (config.uses_demo or config.locates_goals) and config.demo_episodes is None:
@@ -123,7 +144,7 @@ class InMemoryTraining:
 
     def make_sampler(self, from_indices: Any, to_indices: Any, **options: Any) -> Any:
         """Batches of tasks if they are wanted, else LeRobot's sampler."""
-        stock = self._make_sampler(from_indices, to_indices, **options)
+        stock = ResumableSampler(from_indices, to_indices, **options)
         assert self._config is not None
         assert self._frames is not None
         config: DeltacoConfig = self._config.policy
@@ -189,7 +210,13 @@ class InMemoryTraining:
             policy,
             arguments["preprocessor"],
             arguments["postprocessor"],
-            EvaluationPlan(config.env.task, arguments["n_episodes"], ambiguity=config.env.ambiguity),
+            EvaluationPlan(
+                config.env.task,
+                arguments["n_episodes"],
+                ambiguity=config.env.ambiguity,
+                image_size=config.env.image_size,
+                episode_length=config.env.episode_length,
+            ),
             experiment=config.job_name,
             run_seed=config.seed if config.seed is not None else 0,
             command=shlex.join(["deltaco-train", *sys.argv[1:]]),
@@ -218,3 +245,10 @@ def train() -> None:
     """Trains as the command line says: `lerobot-train`, over frames in memory."""
     with InMemoryTraining().active():
         run_training_loop()
+
+
+def reason_of(error: BaseException) -> str:
+    """What is wrong, where LeRobot's parser says only which class cannot be made."""
+    while type(error) is ParsingError and error.__cause__ is not None:
+        error = error.__cause__
+    return str(error)
