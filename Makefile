@@ -24,7 +24,7 @@ REPORT ?= results/scenario_a
 
 export UV_PYTHON_DOWNLOADS := never
 
-.PHONY: help install demo experiment gpu-scenario-a small-scenario-a test test-slow lint
+.PHONY: help install demo experiment gpu-scenario-a small-scenario-a test test-slow soak lint
 .PHONY: benchmark-env benchmark-policy benchmark-train coverage docs release
 
 help: ## List the targets
@@ -53,8 +53,11 @@ small-scenario-a: $(INSTALLED) ## Scenario A at a small scale, without a GPU: ma
 test: $(INSTALLED) ## Run the default tests: a few minutes, no network, no GPU
 	$(BIN)/python -m pytest $(ARGS)
 
-test-slow: $(INSTALLED) ## Run the slow tests: the expert on all 300 tasks, for example
+test-slow: $(INSTALLED) ## Run the slow tests: the expert on all 300 tasks, the soak of 20 minutes, ...
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+soak: $(INSTALLED) ## Only the soak: kills at random moments, random configurations; DELTACO_SOAK_MINUTES=20
+	$(BIN)/python -m pytest -m slow tests/test_soak.py $(ARGS)
 
 coverage: $(INSTALLED) ## Run the default tests and report which lines they reach: htmlcov/index.html
 	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered --cov-report=html $(ARGS)
