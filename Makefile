@@ -24,7 +24,7 @@ REPORT ?= results/scenario_a
 
 export UV_PYTHON_DOWNLOADS := never
 
-.PHONY: help install demo experiment gpu-scenario-a small-scenario-a test test-slow soak lint
+.PHONY: help install demo play experiment gpu-scenario-a small-scenario-a test test-slow test-browser soak lint
 .PHONY: benchmark-env benchmark-policy benchmark-train coverage docs release
 
 help: ## List the targets
@@ -34,6 +34,9 @@ install: $(INSTALLED) ## Only set up the environment, in .venv
 
 demo: $(INSTALLED) ## Collect, train and evaluate on a few tasks, in a quarter of an hour: outputs/demo
 	$(BIN)/deltaco-demo --out outputs/demo
+
+play: $(INSTALLED) ## Play with the trained policy in the browser: http://127.0.0.1:7860
+	$(BIN)/deltaco-play $(ARGS)
 
 experiment: $(INSTALLED) ## Run an experiment: make experiment EXPERIMENT=scenario_a/deltaco SEED=0
 	$(BIN)/deltaco-experiment $(EXPERIMENT) --seed $(SEED)
@@ -58,6 +61,10 @@ test-slow: $(INSTALLED) ## Run the slow tests: the expert on all 300 tasks, the 
 
 soak: $(INSTALLED) ## Only the soak: kills at random moments, random configurations; DELTACO_SOAK_MINUTES=20
 	$(BIN)/python -m pytest -m slow tests/test_soak.py $(ARGS)
+
+test-browser: $(INSTALLED) ## Test the page of `make play` in the system's Chromium
+	$(BIN)/uv pip install --quiet --python $(BIN)/python -e '.[browser]'
+	$(BIN)/python -m pytest -m browser $(ARGS)
 
 coverage: $(INSTALLED) ## Run the default tests and report which lines they reach: htmlcov/index.html
 	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered --cov-report=html $(ARGS)

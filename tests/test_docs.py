@@ -277,7 +277,7 @@ def test_internal_links_resolve(path):
             assert anchor in slugs(linked), f"{page_name(path)} links to {target}"
 
 
-FOLDERS = "benchmarks|datasets_cards|docs|envhub|envs|experiments|lerobot_deltaco|results|scripts|tests"
+FOLDERS = "benchmarks|datasets_cards|docs|envhub|envs|experiments|lerobot_deltaco|results|scripts|space|tests"
 
 
 @pytest.mark.parametrize("path", PAGES, ids=page_name)

@@ -1,0 +1,401 @@
+"""Scenes, demonstrations and episodes of the page, without the page."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch
+from lerobot.envs.utils import preprocess_observation
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gym_deltaco import ENV_ID, EPISODE_STEPS
+from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.expert import expert_episode
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, Task, get_task
+from lerobot_deltaco.evaluation.evaluate import counterfactual_task
+from lerobot_deltaco.evaluation.explanation import draw_explanation
+from lerobot_deltaco.evaluation.runs import load_policy
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.play.errors import PlayError
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet, kept_frame_indices, resize_images
+from lerobot_deltaco.policy.goal_conditioning import FoundGoals
+from lerobot_deltaco.policy.language import LanguageEncoderError
+
+MAX_SEED = 2**32 - 1
+MAX_SENTENCE = 200  # characters
+RENDER_SIZE = 288  # px, of the images for people
+_CAMERA = "observation.image"
+_SPLIT = "evaluation"
+
+
+class Scene(NamedTuple):
+    """A scene of the benchmark: the seed draws it for the task."""
+
+    task_id: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """A scene as it is before anything moves.
+
+    Attributes:
+        image: What the camera sees, (H, W, 3).
+        objects: Names of the objects that stand there.
+        info: The environment's.
+    """
+
+    image: NDArray[np.uint8]
+    objects: tuple[str, ...]
+    info: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """An episode that shows a task.
+
+    Attributes:
+        title: What is shown, in words.
+        frames: Its kept images, the first and the last among them, (kept, H, W, 3), at the policy's size.
+    """
+
+    title: str
+    frames: NDArray[np.uint8]
+
+    @property
+    def ends(self) -> NDArray[np.uint8]:
+        """First and last image, (2, H, W, 3)."""
+        return self.frames[[0, -1]]
+
+
+class Moment(NamedTuple):
+    """An episode at one of its steps.
+
+    Attributes:
+        image: The scene, for people, (H, W, 3).
+        view: The policy's view of the demonstration and the scene, (H, W, 3); None for the expert.
+        text: What has happened so far.
+    """
+
+    image: NDArray[np.uint8]
+    view: NDArray[np.uint8] | None
+    text: str
+
+
+def checked_scene(task_id: int, seed: Any) -> Scene:
+    """A scene of a task and a seed that a user entered.
+
+    Raises:
+        PlayError: The seed is no integer within its range.
+    """
+    try:
+        number = int(seed)
+        is_valid = number == float(seed) and 0 <= number <= MAX_SEED
+    except (TypeError, ValueError, OverflowError):
+        is_valid = False
+    if not is_valid:
+        raise PlayError(f"The seed must be an integer from 0 to {MAX_SEED}. Got {seed!r}.")
+    return Scene(get_task(task_id).index, number)
+
+
+def checked_sentence(text: Any) -> str:
+    """An instruction that a user entered, without spaces around it.
+
+    Raises:
+        PlayError: It is empty, too long, or has characters that are not printed.
+    """
+    sentence = text.strip() if isinstance(text, str) else ""
+    if not sentence:
+        raise PlayError('The instruction is empty. Write what to do, such as "Put the jar in the red bin."')
+    if len(sentence) > MAX_SENTENCE:
+        raise PlayError(
+            f"An instruction has at most {MAX_SENTENCE} characters. This one has {len(sentence)}."
+        )
+    if not sentence.isprintable():
+        raise PlayError("The instruction has line breaks or characters that are not printed. Remove them.")
+    return sentence
+
+
+def view_scene(scene: Scene) -> SceneView:
+    """Builds a scene and looks at it."""
+    with closing(_environment(scene)) as env:
+        _, info = env.reset(seed=_seed(scene))
+        objects = tuple(OBJECTS[index].name for index in info["objects"])
+        return SceneView(env.unwrapped.render(), objects, info)
+
+
+def other_instruction(view: SceneView, current: str, rng: random.Random) -> str:
+    """The instruction of another task that makes sense in a scene.
+
+    Args:
+        view: The scene.
+        current: The present instruction, which is not drawn again.
+        rng: Source of the draw.
+    """
+    task = _other_task(TASKS, view, current, rng)
+    assert task is not None
+    return task.instruction
+
+
+def _other_task(
+    candidates: Sequence[Task], view: SceneView, current: str | None, rng: random.Random
+) -> Task | None:
+    """Another task than the present one: the scene's own, if that is not it, or one of its other objects."""
+    own = int(view.info["task_id"])
+    if current not in (None, TASKS[own].instruction) and TASKS[own] in candidates:
+        return TASKS[own]
+    others = [task for task in candidates if task.index != own and task.instruction != current]
+    return counterfactual_task(others, view.info, rng) if others else None
+
+
+class Player:
+    """A checkpoint that acts in scenes. One thread may use it at a time.
+
+    Args:
+        folder: Folder of the checkpoint.
+
+    Attributes:
+        policy: The policy.
+
+    Raises:
+        PlayError: It cannot be loaded, or was not trained on the benchmark's observations and actions.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            # `demo_episode` would take precedence over the demonstration that the user chose.
+            loaded = load_policy(folder, ["--device=cpu", "--demo_episode=null", "--compile=false"])
+        # Whatever is wrong with files that come from anywhere: the page says so and goes on.
+        except Exception as error:
+            reason = " ".join(str(error).split())[:300]
+            raise PlayError(f"The checkpoint cannot be loaded ({type(error).__name__}): {reason}") from error
+        self.policy, self._preprocessor, self._postprocessor = loaded
+        config = self.policy.config
+        cameras = config.image_features
+        state, action = config.robot_state_feature, config.action_feature
+        if list(cameras) != [_CAMERA] or (state and state.shape != (10,)) or action.shape != (4,):
+            raise PlayError(
+                "The checkpoint was not trained on this benchmark, which has the camera "
+                f"{_CAMERA!r}, 10 numbers of state and 4 of action. It has {list(cameras)}, "
+                f"{state.shape if state else None} and {action.shape}."
+            )
+        self._camera_size = cameras[_CAMERA].shape[-1]
+
+    @property
+    def demonstrated_tasks(self) -> dict[str, int]:
+        """Task strings of the checkpoint's demonstrations, with how many each has; empty if it has none."""
+        demonstrations = self.policy.eval_demonstrations
+        return (
+            {} if demonstrations is None else {task: len(rows) for task, rows in demonstrations.rows.items()}
+        )
+
+    def demonstration(self, task: str, number: int) -> Demonstration:
+        """A demonstration that comes with the checkpoint.
+
+        Args:
+            task: Task string.
+            number: Which of its demonstrations, from 1.
+
+        Raises:
+            PlayError: There is none.
+        """
+        counts = self.demonstrated_tasks
+        if task not in counts:
+            raise PlayError(f"The checkpoint has no demonstration of {task!r}.")
+        if not isinstance(number, int) or not 1 <= number <= counts[task]:
+            raise PlayError(f"{task!r} has the demonstrations 1 to {counts[task]}. Got {number!r}.")
+        demonstrations = self.policy.eval_demonstrations
+        assert demonstrations is not None
+        frames = demonstrations.frames[demonstrations.rows[task][number - 1]]  # (kept, 3, H, W)
+        return Demonstration(f"{task} ({number} of {counts[task]})", frames.permute(0, 2, 3, 1).cpu().numpy())
+
+    def other_demonstration(
+        self, view: SceneView, current: tuple[str, int] | None, rng: random.Random
+    ) -> tuple[str, int]:
+        """The task and number of another demonstration that makes sense in a scene.
+
+        Args:
+            view: The scene.
+            current: Task string and number of the present demonstration, whose task is not drawn again.
+            rng: Source of the draw.
+
+        Raises:
+            PlayError: The checkpoint has no other demonstration.
+        """
+        counts = self.demonstrated_tasks
+        others = [task for task in TASKS if task.instruction in counts]
+        task = _other_task(others, view, current[0] if current else None, rng)
+        if task is None:
+            raise PlayError("The checkpoint has no demonstration of another task. Let the expert make one.")
+        return task.instruction, rng.randint(1, counts[task.instruction])
+
+    def run(self, scene: Scene, demonstration: Demonstration | None, sentence: str) -> Iterator[Moment]:
+        """Runs an episode of the policy.
+
+        Args:
+            scene: The scene.
+            demonstration: What is demonstrated; None if the policy takes no demonstrations.
+            sentence: The instruction.
+
+        Yields:
+            The episode before the first step, and after each.
+
+        Raises:
+            PlayError: The policy takes demonstrations and there is none, or it cannot read the sentence.
+        """
+        if self.policy.config.uses_demo and demonstration is None:
+            raise PlayError("This policy needs a demonstration. Choose one, or let the expert make one.")
+        with closing(_environment(scene, self._camera_size)) as env:
+            observation, info = env.reset(seed=_seed(scene))
+            with _demonstrated_by(self.policy, demonstration, sentence):
+                goals = self._find_goals(observation, sentence)
+                view = self._explain(observation, demonstration, goals)
+                self.policy.reset()
+                action = self._act(observation, sentence)
+            yield Moment(env.unwrapped.render(), view, f"0 of {EPISODE_STEPS} steps")
+            reached = -1
+            for step in range(1, EPISODE_STEPS + 1):
+                if reached < 0 and action[3] <= 0:
+                    reached = _nearest_object(env.unwrapped)
+                observation, _, _, _, info = env.step(action)
+                text = f"{step} of {EPISODE_STEPS} steps"
+                if step == EPISODE_STEPS:
+                    text = outcome(info, reached)
+                yield Moment(env.unwrapped.render(), view, text)
+                if step < EPISODE_STEPS:
+                    action = self._act(observation, sentence)
+
+    def expert_demonstration(self, scene: Scene) -> Iterator[Moment | Demonstration]:
+        """Runs an episode of the scripted expert.
+
+        Args:
+            scene: The scene.
+
+        Yields:
+            The episode after each step, and at the end the demonstration that it makes.
+        """
+        task = get_task(scene.task_id)
+        with closing(_environment(scene, self._camera_size)) as env:
+            frames = []
+            for number, step in enumerate(expert_episode(env.unwrapped, task.index, _seed(scene)), start=1):
+                frames.append(step.observation["pixels"])
+                text = f"Expert, {number} of {EPISODE_STEPS} steps: {step.stage.value}"
+                if number == EPISODE_STEPS:
+                    text = f"Expert. {outcome(step.info, -1)}"
+                yield Moment(env.unwrapped.render(), None, text)
+        kept = kept_frame_indices(0, len(frames) - 1, self.policy.config.n_demo_frames).tolist()
+        images = torch.from_numpy(np.stack([frames[index] for index in kept])).permute(0, 3, 1, 2)
+        images = resize_images(images, self.policy.config.image_size)
+        title = f"{task.instruction} (by the expert, seed {scene.seed})"
+        yield Demonstration(title, images.permute(0, 2, 3, 1).numpy())
+
+    def _batch(self, observation: dict[str, NDArray[Any]], sentence: str) -> dict[str, Any]:
+        batch = preprocess_observation({name: value[None] for name, value in observation.items()})
+        return self._preprocessor({**batch, "task": [sentence]})
+
+    def _act(self, observation: dict[str, NDArray[Any]], sentence: str) -> NDArray[np.float32]:
+        action: Tensor = self._postprocessor(self.policy.select_action(self._batch(observation, sentence)))
+        return action[0].cpu().numpy()
+
+    def _explain(
+        self,
+        observation: dict[str, NDArray[Any]],
+        demonstration: Demonstration | None,
+        goals: FoundGoals | None,
+    ) -> NDArray[np.uint8]:
+        """Draws what the policy receives and, if it has goals, what led to them."""
+        ends = None
+        if demonstration is not None and self.policy.config.uses_demo:
+            ends = demonstration.ends
+        from_demonstration = (True, True)
+        if self.policy.goals is not None:
+            locator = self.policy.goals.locator
+            from_demonstration = (locator.grasp_source == "demo", locator.release_source == "demo")
+        return draw_explanation(observation["pixels"], ends, goals, from_demonstration)
+
+    @torch.no_grad()
+    def _find_goals(self, observation: dict[str, NDArray[Any]], sentence: str) -> FoundGoals | None:
+        """The goals that the policy will have in the episode; None if it finds none."""
+        image = self._batch(observation, sentence)[_CAMERA]
+        size = self.policy.config.image_size
+        if image.shape[-1] != size:
+            image = resize_images(image, size).float() / 255
+        self.policy.begin_evaluation()
+        try:
+            goals = self.policy.encode_task((sentence,), image[:, None]).goals
+        except (ValueError, LanguageEncoderError) as error:
+            raise PlayError(str(error)) from error
+        self.policy.begin_evaluation()
+        return goals
+
+
+def outcome(info: dict[str, Any], reached: int) -> str:
+    """What happened in an episode, in a sentence or two.
+
+    Args:
+        info: The environment's, after the last step.
+        reached: Number of the object beside which the gripper closed first; -1 if it never closed.
+    """
+
+    def name(index: int) -> str:
+        return OBJECTS[info["objects"][index]].name
+
+    parts = ["Success." if info["is_success"] else "No success."]
+    if info["grasped_object"] >= 0:
+        parts.append(f"It grasped the {name(info['grasped_object'])}.")
+    elif reached >= 0:
+        parts.append(f"It went for the {name(reached)} and did not get hold of it.")
+    else:
+        parts.append("It grasped nothing.")
+    for number, container in enumerate(info["object_containers"]):
+        if container >= 0:
+            parts.append(f"The {name(number)} lies in the {CONTAINER_COLORS[container]} bin.")
+    target = f"{name(info['target_object'])} in the {CONTAINER_COLORS[info['target_container']]} bin"
+    parts.append(f"The scene's own task is the {target}.")
+    return " ".join(parts)
+
+
+@contextmanager
+def _demonstrated_by(
+    policy: DeltacoPolicy, demonstration: Demonstration | None, sentence: str
+) -> Iterator[None]:
+    """Gives a policy one demonstration alone, of the task that a sentence names."""
+    own = policy.eval_demonstrations
+    if demonstration is not None:
+        frames = torch.from_numpy(demonstration.frames).permute(0, 3, 1, 2)[None]
+        policy.eval_demonstrations = DemonstrationSet(frames, [sentence], [0])
+    try:
+        yield
+    finally:
+        policy.eval_demonstrations = own
+
+
+def _environment(scene: Scene, image_size: int = 48) -> gym.Env:
+    return gym.make(
+        ENV_ID,
+        disable_env_checker=True,
+        task_id=scene.task_id,
+        image_size=image_size,
+        render_mode="rgb_array",
+        render_size=RENDER_SIZE,
+    )
+
+
+def _seed(scene: Scene) -> int:
+    return episode_seed(scene.seed, _SPLIT, scene.task_id, 0)
+
+
+def _nearest_object(env: PickPlaceEnv) -> int:
+    """Number of the object that is nearest to the gripper, seen from above."""
+    scene = env.scene
+    positions = np.array([scene.object_pose(index).position[:2] for index in range(len(scene.bodies))])
+    return int(np.linalg.norm(positions - scene.arm.position[:2], axis=1).argmin())
