@@ -61,9 +61,7 @@ def save_policy(folder, **options):
     return folder
 
 
-@pytest.fixture(autouse=True)
-def _language(monkeypatch):
-    use_fake_encoder(monkeypatch)
+pytestmark = pytest.mark.usefixtures("fake_language")
 
 
 @pytest.fixture(scope="module")

@@ -176,8 +176,8 @@ def test_a_broken_checkpoint_gets_a_message_and_the_page_goes_on(user, folder):
     user.page.click("text=Another checkpoint")
     for name, message in (
         (str(folder / "broken"), "cannot be loaded"),
-        ("/etc", "may load"),
-        ("USER/NAME", "may load"),
+        ("/etc", "'/etc' that this page may load"),
+        ("USER/NAME", "'USER/NAME' that this page may load"),
     ):
         user.write("checkpoint", name)
         user.press("load")

@@ -23,7 +23,7 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, Task, get_task
 from lerobot_deltaco.evaluation.evaluate import counterfactual_task
 from lerobot_deltaco.evaluation.explanation import draw_explanation
-from lerobot_deltaco.evaluation.runs import load_policy
+from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, kept_frame_indices, resize_images
