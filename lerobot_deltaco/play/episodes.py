@@ -21,9 +21,9 @@ from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, Task, get_task
+from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.evaluation.evaluate import counterfactual_task
 from lerobot_deltaco.evaluation.explanation import draw_explanation
-from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, kept_frame_indices, resize_images
@@ -176,7 +176,8 @@ class Player:
             loaded = load_policy(folder, ["--device=cpu", "--demo_episode=null", "--compile=false"])
         # Whatever is wrong with files that come from anywhere: the page says so and goes on.
         except Exception as error:
-            reason = " ".join(str(error).split())[:300]
+            cause = error.__cause__ or error.__context__
+            reason = " ".join(f"{error} {cause or ''}".split())[:300]
             raise PlayError(f"The checkpoint cannot be loaded ({type(error).__name__}): {reason}") from error
         self.policy, self._preprocessor, self._postprocessor = loaded
         config = self.policy.config
