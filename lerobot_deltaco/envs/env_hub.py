@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Any
 
 from gymnasium.vector import VectorEnv
 from lerobot.envs import EnvConfig
@@ -37,6 +38,6 @@ def make_env_of_tasks(
         names: tuple[str, ...] = tuple(field.name for field in fields(DeltacoEnv) if field.init)
     else:
         names = _SHARED_OPTIONS
-    options = {name: getattr(cfg, name, None) for name in names}
+    options: dict[str, Any] = {name: getattr(cfg, name, None) for name in names}
     options = {name: value for name, value in options.items() if value is not None}
     return DeltacoEnv(**{"task": tasks, **options}).create_envs(n_envs, use_async_envs)
