@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, TASK_SETS, TASKS
+from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, TASK_SETS, TASKS, get_task
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = "PickPlaceEnv"
@@ -222,7 +222,7 @@ def tasks_table() -> str:
 def scenarios_table() -> str:
     """The task sets: which rows of the task table each has, and how many tasks."""
     rows_of: Mapping[str, tuple[int, ...]] = {
-        name: tuple(sorted({TASKS[index].row for index in indices})) for name, indices in TASK_SETS.items()
+        name: tuple(sorted({get_task(index).row for index in indices})) for name, indices in TASK_SETS.items()
     }
     rows = [(f"`{name}`", spans(rows_of[name]), str(len(indices))) for name, indices in TASK_SETS.items()]
     return table(("task set", "rows of the task table", "tasks"), rows)

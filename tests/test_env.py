@@ -624,7 +624,7 @@ def test_a_policy_that_picks_at_random_succeeds_in_1_of_6():
         ({"image_size": "48"}, r"`image_size` must be .*\. Got '?48'?"),
         ({"render_size": 7}, r"`render_size` must be at least 8\. Got 7"),
         ({"render_size": 100.5}, r"`render_size` must be .*\. Got 100\.5"),
-        ({"objects": "some"}, r"`objects` must be one of all, scenario_a_train\. Got 'some'"),
+        ({"objects": "some"}, r"`objects` must be one of all, scenario_a_train, random:N\. Got 'some'"),
         ({"task_id": 24, "objects": "scenario_a_train"}, r"Task 24 asks for a gray .* bathtub, of which"),
         ({"adversarial_probability": 1.1}, r"`adversarial_probability` must be between 0 and 1\. Got 1\.1"),
         ({"adversarial_probability": -0.1}, r"between 0 and 1\. Got -0\.1"),

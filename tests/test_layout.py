@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gym_deltaco.layout import AMBIGUITIES, sample_layout, twin_word
-from gym_deltaco.object_sets import OBJECT_SETS
-from gym_deltaco.tasks import CONTAINER_COLORS, CONTAINER_WORDS, OBJECTS, TASKS
+from gym_deltaco.object_sets import OBJECT_SETS, select_objects
+from gym_deltaco.tasks import CONTAINER_COLORS, CONTAINER_WORDS, OBJECTS, TASKS, get_task
 from gym_deltaco.workspace import QUADRANTS, container_matches
 
 SEEDS_PER_TASK = 3
@@ -244,6 +244,18 @@ def test_scenes_can_be_drawn_without_the_test_objects(ambiguity):
         ).objects
     }
     assert seen == set(range(24))
+
+
+def test_scenes_can_be_drawn_from_random_objects():
+    objects = select_objects("random:400")
+    task = get_task(1005)  # black and white cup
+    matching = {label.index for label in objects if task.describes(label)}
+    layouts = [sample_layout(task, "container", np.random.default_rng(seed), objects) for seed in range(100)]
+    for layout in layouts:
+        indices = [item.label.index for item in layout.objects]
+        assert matching & set(indices) == {indices[layout.target_object]}
+        assert not set(indices) & set(range(24, 32))
+    assert {layout.objects[layout.target_object].label.index for layout in layouts} == matching
 
 
 def test_the_target_is_alone_in_its_quadrant_as_often_as_any_object():

@@ -1,4 +1,4 @@
-"""The 32 objects: closed, colored as they are called, of a size for the gripper, and stable on a table."""
+"""The paper's objects and random ones: closed, colored as called, of a size for the gripper, and stable."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import pybullet
 import pytest
 
 from gym_deltaco import objects
+from gym_deltaco.object_sets import MAX_OBJECTS, OBJECT_SETS, find_label, find_model, select_objects
 from gym_deltaco.objects import ObjectModel, object_model
+from gym_deltaco.random_objects import FIRST_INDEX, random_label, random_model
 from gym_deltaco.solids import Loft, merged, polygon
-from gym_deltaco.tasks import OBJECTS
+from gym_deltaco.tasks import COLOR_SHAPE_PAIRS, OBJECTS, SCENARIOS
 
 GRIPPER_OPENING = 0.074
 GRASP_ERROR = 0.01
@@ -32,9 +34,14 @@ HSV_RANGES = {
 }
 
 
-@pytest.fixture(params=range(len(OBJECTS)), ids=[label.name for label in OBJECTS])
+# A third of the random objects that have each a pair of shape and color of their own.
+SOME_RANDOM = range(FIRST_INDEX, FIRST_INDEX + len(COLOR_SHAPE_PAIRS), 3)
+MODELS = [*range(len(OBJECTS)), *SOME_RANDOM]
+
+
+@pytest.fixture(params=MODELS, ids=[find_label(index).name for index in MODELS])
 def model(request: pytest.FixtureRequest) -> ObjectModel:
-    return object_model(request.param)
+    return find_model(request.param)
 
 
 def test_every_label_has_a_model_and_every_model_a_label():
@@ -96,6 +103,10 @@ def _visible_areas(model: ObjectModel) -> np.ndarray:
 
 def test_color_is_the_one_it_is_called_by(model):
     areas = _visible_areas(model)
+    if model.label.index >= FIRST_INDEX:
+        share = areas[_has_color(model)].sum() / areas.sum()
+        assert share > 0.5  # less the inside and, in another color, bands or a label
+        return
     if model.label.color == "black and white":
         brightness = model.mesh.colors.mean(axis=1)
         assert areas[brightness < 0.2].sum() > 0.3 * areas.sum()
@@ -106,6 +117,30 @@ def test_color_is_the_one_it_is_called_by(model):
     signed_hue = (360 * hue + 60) % 360 - 60  # red lies about zero
     for number, (low, high) in zip((signed_hue, saturation, value), ranges, strict=True):
         assert low <= number <= high + 1e-9
+
+
+def _has_color(model: ObjectModel) -> np.ndarray:
+    """Which faces have the color that an object is called by, or a shade of it; shape (F,)."""
+    word = model.label.color
+    if word == "black and white":
+        return np.ptp(model.mesh.colors, axis=1) < 0.01
+    (low_hue, high_hue), saturations, values = HSV_RANGES[word]
+    margins = (
+        (low_hue - 4, high_hue + 4),
+        (saturations[0] - 0.1, saturations[1] + 0.1),
+        (values[0] - 0.35, 1.0),
+    )
+    found = []
+    for rgb in model.mesh.colors:
+        hue, saturation, value = colorsys.rgb_to_hsv(*rgb)
+        signed_hue = (360 * hue + 60) % 360 - 60
+        found.append(
+            all(
+                low <= number <= high
+                for number, (low, high) in zip((signed_hue, saturation, value), margins, strict=True)
+            )
+        )
+    return np.array(found)
 
 
 def test_origin_and_size(model):
@@ -213,7 +248,7 @@ def tilts(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
     pybullet.createMultiBody(0, plane, physicsClientId=client)
     bodies = []
-    for row, model in enumerate(object_model(index) for index in range(len(OBJECTS))):
+    for row, model in enumerate(map(find_model, MODELS)):
         path = tmp_path_factory.mktemp("parts") / "parts.obj"
         path.write_text(_obj_text(model.parts))
         shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client)
@@ -226,7 +261,7 @@ def tilts(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     turns = [pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[1] for body in bodies]
     upright = np.array([pybullet.getMatrixFromQuaternion(turn)[8] for turn in turns])
     pybullet.disconnect(client)
-    return np.degrees(np.arccos(np.clip(upright, -1, 1))).reshape(len(OBJECTS), -1)
+    return np.degrees(np.arccos(np.clip(upright, -1, 1))).reshape(len(MODELS), -1)
 
 
 def _obj_text(parts: tuple[np.ndarray, ...]) -> str:
@@ -240,7 +275,62 @@ def _obj_text(parts: tuple[np.ndarray, ...]) -> str:
 
 
 def test_stands_after_a_drop(model, tilts):
-    assert tilts[model.label.index].max() < 5
+    assert tilts[MODELS.index(model.label.index)].max() < 5
+
+
+# Random objects
+
+
+def test_a_random_object_is_a_function_of_its_index():
+    random_model.cache_clear()
+    first = random_model(100)
+    random_model.cache_clear()
+    random_model(101)
+    again = random_model(100)
+    assert again is not first
+    assert again.label == first.label
+    np.testing.assert_array_equal(again.mesh.vertices, first.mesh.vertices)
+    np.testing.assert_array_equal(again.mesh.colors, first.mesh.colors)
+    assert again.grasp_height == first.grasp_height
+
+
+def test_random_objects_take_every_pair_but_those_of_test_objects_in_turn():
+    labels = [random_label(index) for index in range(FIRST_INDEX, FIRST_INDEX + 144)]
+    first, second = ([(label.color, label.shape) for label in part] for part in (labels[:72], labels[72:]))
+    assert set(first) == set(second) == set(COLOR_SHAPE_PAIRS)
+    assert first != second
+    test_objects = [label for label in OBJECTS if label.index in SCENARIOS["a"].test_rows]
+    assert len(test_objects) == 8
+    assert not {(label.color, label.shape) for label in test_objects} & set(first)
+
+
+def test_objects_of_the_same_pair_differ():
+    pairs = [(random_label(index).color, random_label(index).shape) for index in range(FIRST_INDEX, 400)]
+    red_cups = [FIRST_INDEX + number for number, pair in enumerate(pairs) if pair == ("red", "cup")]
+    meshes = {find_model(index).mesh.vertices.tobytes() for index in red_cups}
+    assert len(red_cups) == len(meshes) == 5
+
+
+@pytest.mark.parametrize("index", [31, -1, 32.5, "32"])
+def test_other_indices_have_no_random_object(index):
+    with pytest.raises(ValueError, match="integer of at least 32"):
+        random_label(index)
+
+
+def test_sets_of_random_objects_hold_the_training_objects_and_smaller_sets():
+    fewer, more = select_objects("random:100"), select_objects("random:400")
+    assert (len(set(fewer)), len(set(more))) == (100, 400)
+    assert more[:100] == fewer
+    assert fewer[:24] == OBJECT_SETS["scenario_a_train"] == select_objects("random:24")
+    assert [find_label(label.index) for label in more] == list(more)
+
+
+@pytest.mark.parametrize(
+    "name", ["random:23", f"random:{MAX_OBJECTS + 1}", "random:", "random:-1", "some", 24]
+)
+def test_unknown_sets_are_an_error_that_names_the_valid_ones(name):
+    with pytest.raises(ValueError, match="`objects` must be .*random:N"):
+        select_objects(name)
 
 
 def test_loft_of_a_square_is_a_box():

@@ -203,6 +203,29 @@ def test_clean_training_tasks_have_no_test_object_as_a_target():
     assert targets == set(range(24))
 
 
+# Tasks by color and shape
+
+
+def test_tasks_by_color_and_shape_say_both():
+    for column, (color, shape) in itertools.product(range(6), itertools.product(PAPER_COLORS, PAPER_SHAPES)):
+        index = 1000 + 80 * column + 10 * PAPER_COLORS.index(color) + PAPER_SHAPES.index(shape)
+        task = get_task(index)
+        assert task.instruction == f"Put {color} colored, {shape} shaped object in {CONTAINERS[column]} bin."
+        assert (task.kind, task.column) == ("color_shape", column)
+        expected = [label.index for label in OBJECTS if (label.color, label.shape) == (color, shape)]
+        assert list(task.targets) == expected
+
+
+def test_random_training_tasks_ask_for_no_pair_of_a_test_object():
+    tasks = [get_task(index) for index in TASK_SETS["random_train"]]
+    assert len(tasks) == 198 + 6 * 72
+    assert [task.index for task in tasks[:198]] == list(SCENARIOS["a"].train_tasks)
+    assert len({task.instruction for task in tasks}) == len(tasks)
+    for task in tasks[198:]:
+        assert task.kind == "color_shape"
+        assert not set(task.targets) & set(range(24, 32))
+
+
 # Selections
 
 
@@ -260,7 +283,9 @@ def test_a_range_that_ends_before_its_start_is_an_error():
         select_tasks("4,73-50")
 
 
-@pytest.mark.parametrize(("selection", "culprit"), [("300", "300"), ("0-300", "300"), ("1000-1001", "1000")])
+@pytest.mark.parametrize(
+    ("selection", "culprit"), [("300", "300"), ("0-300", "300"), ("2000-2001", "2000"), ("290-1000", "300")]
+)
 def test_a_selected_index_out_of_range_is_an_error(selection, culprit):
     with pytest.raises(ValueError, match=rf"integer from 0 to 299\. Got {culprit}"):
         select_tasks(selection)

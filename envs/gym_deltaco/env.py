@@ -64,8 +64,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     | key                   | what                                                                         |
     |-----------------------|------------------------------------------------------------------------------|
     | `is_success`          | whether the task has succeeded in this episode                               |
-    | `task_id`             | 0..299                                                                       |
-    | `objects`             | (3,) int64: which of the 32 objects stand in the scene                       |
+    | `task_id`             | index of the task, 0..299                                                    |
+    | `objects`             | (3,) int64: indices of the objects in the scene; 0..31 are the paper's       |
     | `object_containers`   | (3,) int64: the container in which each of them lies: 0 green, 1 red         |
     | `container_quadrants` | (2, 2) int64: i (0 right, 1 left) and j (0 back, 1 front) of both            |
     | `target_object`       | number of the object that the task asks for                                  |
@@ -80,8 +80,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         image_size: Height and width of `pixels`, at least 8.
         render_mode: "rgb_array" or None.
         render_size: Height and width of what `render` returns, for people to look at.
-        objects: Name of the set of objects that scenes are made of: "all", as in the paper, or
-            "scenario_a_train", without the 8 test objects (`gym_deltaco.object_sets`).
+        objects: Name of the set of objects that scenes are made of: "all", as in the paper;
+            "scenario_a_train", without the 8 test objects; or "random:N" (`gym_deltaco.object_sets`).
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1; 0.6 as in the paper's data, 0 for uniform draws.
         instructions: Sentences of each task, as `gym_deltaco.instructions.read_instructions` gives them. The

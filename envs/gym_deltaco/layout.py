@@ -8,7 +8,8 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.objects import ObjectModel, object_model
+from gym_deltaco.object_sets import find_label, find_model
+from gym_deltaco.objects import ObjectModel
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, ContainerColor, ContainerWord, ObjectLabel, Task
 from gym_deltaco.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
 
@@ -81,9 +82,7 @@ def sample_layout(
     """
     target = int(rng.choice([label.index for label in objects if task.describes(label)]))
     if ambiguity == "container":
-        distractors = _sample_distractors(
-            task, object_model(target).label, rng, objects, adversarial_probability
-        )
+        distractors = _sample_distractors(task, find_label(target), rng, objects, adversarial_probability)
         containers, object_quadrants = _sample_quadrants(task, rng)
     else:
         distractors = (
@@ -91,7 +90,7 @@ def sample_layout(
             int(rng.choice([label.index for label in objects if not task.describes(label)])),
         )
         containers, object_quadrants = _sample_twin_quadrants(task, rng)
-    models = [object_model(index) for index in (target, *distractors)]
+    models = [find_model(index) for index in (target, *distractors)]
     placed = _place_objects(models, object_quadrants, containers, ambiguity, rng)
     order = rng.permutation(N_OBJECTS)
     return Layout(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from functools import cache
 from types import MappingProxyType
 
+from gym_deltaco.objects import ObjectModel, object_model
+from gym_deltaco.random_objects import FIRST_INDEX, random_label, random_model
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel, Task
 
 OBJECT_SETS = MappingProxyType(
@@ -15,22 +19,52 @@ OBJECT_SETS = MappingProxyType(
         "scenario_a_train": tuple(label for label in OBJECTS if label.index in SCENARIOS["a"].train_rows),
     }
 )
+MAX_OBJECTS = 10_000
 # Task sets whose scenes are made of other objects than all, unless something else is asked for.
 _OBJECTS_OF_TASK_SETS = MappingProxyType({"scenario_a_clean_train": "scenario_a_train"})
 
 
+@cache
 def select_objects(name: str) -> tuple[ObjectLabel, ...]:
     """The objects of a set.
 
     Args:
-        name: One of `OBJECT_SETS`.
+        name: One of `OBJECT_SETS`; or "random:N": N objects, 24..10000, of which 24 are scenario A's training
+            objects and the others random ones. A greater set holds a smaller one.
 
     Raises:
         ValueError: There is no such set.
     """
-    if name not in OBJECT_SETS:
-        raise ValueError(f"`objects` must be one of {', '.join(OBJECT_SETS)}. Got {name!r}.")
-    return OBJECT_SETS[name]
+    count = re.fullmatch(r"random:(\d+)", name) if isinstance(name, str) else None
+    if count is None and name not in OBJECT_SETS:
+        raise ValueError(f"`objects` must be one of {', '.join(OBJECT_SETS)}, random:N. Got {name!r}.")
+    if count is None:
+        return OBJECT_SETS[name]
+    paper = OBJECT_SETS["scenario_a_train"]
+    n_random = int(count[1]) - len(paper)
+    if not 0 <= n_random <= MAX_OBJECTS - len(paper):
+        raise ValueError(
+            f"`objects` must be random:N with N from {len(paper)} to {MAX_OBJECTS}. Got {name!r}."
+        )
+    return (*paper, *(random_label(FIRST_INDEX + number) for number in range(n_random)))
+
+
+def find_label(index: int) -> ObjectLabel:
+    """What an object is called, one of the paper's or a random one.
+
+    Raises:
+        ValueError: There is no such object.
+    """
+    return OBJECTS[index] if 0 <= index < len(OBJECTS) else random_label(index)
+
+
+def find_model(index: int) -> ObjectModel:
+    """The model of an object, one of the paper's or a random one.
+
+    Raises:
+        ValueError: There is no such object.
+    """
+    return object_model(index) if index < FIRST_INDEX else random_model(index)
 
 
 def default_objects(tasks: str) -> str:
@@ -43,7 +77,7 @@ def check_task(task: Task, name: str) -> None:
 
     Args:
         task: The task.
-        name: One of `OBJECT_SETS`.
+        name: Name of the set, as `select_objects` takes it.
 
     Raises:
         ValueError: There is no such set, or it has no such object.

@@ -3,6 +3,9 @@
 Rows of the task table are what is asked for: 32 objects by name (rows 0..31), 8 colors (32..39) and 10
 shapes (40..49). Columns are the container: green, red, front, back, left, right. The index of a task is
 `50 * column + row` (paper, appendix A). Nothing here depends on a simulator.
+
+Beyond the paper's table, 80 rows ask for an object by its color and its shape together, since random objects
+have no names: rows 50..129, `50 + 10 * color + shape`. Their tasks are `1000 + 80 * column + row - 50`.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
 
-TaskKind = Literal["name", "color", "shape"]
+TaskKind = Literal["name", "color", "shape", "color_shape"]
 ContainerColor = Literal["green", "red"]
 ContainerWord = Literal["green", "red", "front", "back", "left", "right"]
 
@@ -97,26 +100,32 @@ N_COLUMNS = len(CONTAINER_WORDS)
 N_TASKS = N_ROWS * N_COLUMNS
 _FIRST_COLOR_ROW = len(OBJECTS)
 _FIRST_SHAPE_ROW = _FIRST_COLOR_ROW + len(COLORS)
+_N_PAIRS = len(COLORS) * len(SHAPES)
+_PAIR_TASKS = range(1000, 1000 + N_COLUMNS * _N_PAIRS)
 
 
 @dataclass(frozen=True)
 class Task:
-    """One of the 300 tasks: an object, asked for by name, color or shape, and a container.
+    """A task: an object, asked for by name, color, shape, or color and shape, and a container.
 
     Attributes:
-        index: 0..299, `50 * column + row`.
+        index: 0..299, `50 * column + row`; or 1000..1479, by color and shape.
     """
 
     index: int
 
     @property
     def row(self) -> int:
-        """0..49: 32 names, 8 colors, 10 shapes."""
+        """0..49: 32 names, 8 colors, 10 shapes; 50..129: pairs of a color and a shape."""
+        if self.index in _PAIR_TASKS:
+            return N_ROWS + (self.index - _PAIR_TASKS.start) % _N_PAIRS
         return self.index % N_ROWS
 
     @property
     def column(self) -> int:
         """0..5, an index into `CONTAINER_WORDS`."""
+        if self.index in _PAIR_TASKS:
+            return (self.index - _PAIR_TASKS.start) // _N_PAIRS
         return self.index // N_ROWS
 
     @property
@@ -124,6 +133,8 @@ class Task:
         """How the object is asked for."""
         if self.row < _FIRST_COLOR_ROW:
             return "name"
+        if self.row >= N_ROWS:
+            return "color_shape"
         return "color" if self.row < _FIRST_SHAPE_ROW else "shape"
 
     @property
@@ -138,7 +149,7 @@ class Task:
 
     @cached_property
     def targets(self) -> tuple[int, ...]:
-        """Indices of the objects that the instruction describes: one for a name, all that match otherwise."""
+        """Indices of those of the paper's 32 objects that the instruction describes."""
         return tuple(label.index for label in OBJECTS if self.describes(label))
 
     def describes(self, label: ObjectLabel) -> bool:
@@ -146,8 +157,24 @@ class Task:
         if self.kind == "name":
             return label.index == self.row
         if self.kind == "color":
-            return label.color == COLORS[self.row - _FIRST_COLOR_ROW]
-        return label.shape == SHAPES[self.row - _FIRST_SHAPE_ROW]
+            return label.color == self._color
+        if self.kind == "shape":
+            return label.shape == self._shape
+        return (label.color, label.shape) == (self._color, self._shape)
+
+    @property
+    def _color(self) -> str:
+        """The color that a task by color, or by color and shape, asks for."""
+        return COLORS[
+            self.row - _FIRST_COLOR_ROW if self.kind == "color" else (self.row - N_ROWS) // len(SHAPES)
+        ]
+
+    @property
+    def _shape(self) -> str:
+        """The shape that a task by shape, or by color and shape, asks for."""
+        return SHAPES[
+            self.row - _FIRST_SHAPE_ROW if self.kind == "shape" else (self.row - N_ROWS) % len(SHAPES)
+        ]
 
     @property
     def object_phrase(self) -> str:
@@ -156,8 +183,10 @@ class Task:
             label = OBJECTS[self.row]
             return f"{label.color} colored, {label.shape} shaped {label.name}"
         if self.kind == "color":
-            return f"{COLORS[self.row - _FIRST_COLOR_ROW]} colored object"
-        return f"{SHAPES[self.row - _FIRST_SHAPE_ROW]} shaped object"
+            return f"{self._color} colored object"
+        if self.kind == "shape":
+            return f"{self._shape} shaped object"
+        return f"{self._color} colored, {self._shape} shaped object"
 
     @property
     def instruction(self) -> str:
@@ -247,6 +276,17 @@ CLEAN = Scenario(
     test_rows=SCENARIOS["a"].test_rows,
 )
 
+# What random objects may be: they share shape and color with no test object of scenario A.
+_TEST_PAIRS = {(label.color, label.shape) for label in OBJECTS if label.index in SCENARIOS["a"].test_rows}
+COLOR_SHAPE_PAIRS = tuple(
+    (color, shape) for color in COLORS for shape in SHAPES if (color, shape) not in _TEST_PAIRS
+)
+_COLOR_SHAPE_TASKS = tuple(
+    _PAIR_TASKS.start + _N_PAIRS * column + len(SHAPES) * COLORS.index(color) + SHAPES.index(shape)
+    for column in range(N_COLUMNS)
+    for color, shape in COLOR_SHAPE_PAIRS
+)
+
 TASK_SETS = MappingProxyType(
     {
         "all": tuple(range(N_TASKS)),
@@ -256,6 +296,8 @@ TASK_SETS = MappingProxyType(
         "scenario_a_validation": VALIDATION.test_tasks,
         "scenario_a_clean_train": CLEAN.train_tasks,
         "scenario_a_clean_test": CLEAN.test_tasks,
+        # With the objects "random:N": scenario A's training tasks, and those by color and shape.
+        "random_train": (*SCENARIOS["a"].train_tasks, *_COLOR_SHAPE_TASKS),
     }
 )
 
@@ -263,16 +305,23 @@ TASK_SETS = MappingProxyType(
 def get_task(index: int) -> Task:
     """The task of an index.
 
+    Args:
+        index: 0..299 for the paper's tasks, 1000..1479 for those by color and shape.
+
     Raises:
-        ValueError: The index is not an integer in 0..299.
+        ValueError: There is no task of that index.
     """
     try:
-        is_valid = int(index) == index and 0 <= index < N_TASKS
+        number = int(index)
+        is_valid = number == index and (0 <= number < N_TASKS or number in _PAIR_TASKS)
     except (TypeError, ValueError, OverflowError):
         is_valid = False
     if not is_valid:
-        raise ValueError(f"`task_id` must be an integer from 0 to {N_TASKS - 1}. Got {index!r}.")
-    return TASKS[int(index)]
+        raise ValueError(
+            f"`task_id` must be an integer from 0 to {N_TASKS - 1}. Got {index!r}. Tasks by color and shape "
+            f"are {_PAIR_TASKS.start} to {_PAIR_TASKS.stop - 1}."
+        )
+    return TASKS[number] if number < N_TASKS else Task(number)
 
 
 def select_tasks(selection: str) -> tuple[int, ...]:
@@ -283,7 +332,7 @@ def select_tasks(selection: str) -> tuple[int, ...]:
             "scenario_a_test", "4", "4,50-73", "scenario_b_test,0-9".
 
     Returns:
-        Indices of tasks, 0..299, at least one.
+        Indices of tasks, at least one.
 
     Raises:
         ValueError: Something in the selection is not a task set, an index or a range; an index is out of
@@ -303,7 +352,8 @@ def select_tasks(selection: str) -> tuple[int, ...]:
             first, last = int(span[1]), int(span[2] or span[1])
             if last < first:
                 raise ValueError(f"The range {term!r} is empty: its end lies before its start.")
-            selected.extend(range(get_task(first).index, get_task(last).index + 1))
+            get_task(first), get_task(last)
+            selected.extend(get_task(index).index for index in range(first, last + 1))
     if not selected:
         raise ValueError(
             f"The task selection {selection!r} is empty. Name a task set ({', '.join(TASK_SETS)}) or indices "
