@@ -30,6 +30,7 @@ from lerobot_deltaco.policy.demonstration_choice import (
     choose_training_demonstrations,
 )
 from lerobot_deltaco.policy.demonstrations import (
+    Demonstrated,
     DemonstrationSet,
     RobotData,
     kept_frame_indices,
@@ -477,6 +478,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         """Starts an evaluation: the demonstrations of each task begin with the first again."""
         self._episode_tasks.begin_evaluation()
 
+    def demonstrated(self, sample: int) -> list[Demonstrated]:
+        """The demonstrations of a sample in this thread's episode; none before its first action."""
+        return self._episode_tasks.demonstrated(sample)
+
     @contextmanager
     def demonstrated_as(self, tasks: Mapping[str, str]) -> Iterator[None]:
         """Uses other tasks' demonstrations with some instructions, while the context is open.
@@ -567,9 +572,13 @@ class DeltacoPolicy(PreTrainedPolicy):
         self, tasks: Sequence[str], trials: Sequence[int]
     ) -> tuple[DemonstrationSet, Tensor]:
         if self.config.demo_episode is not None and self.eval_demonstrations is not None:
-            return choose_episode(self.eval_demonstrations, self.config.demo_episode, len(tasks))
-        candidates = (self.eval_demonstrations, self.train_demonstrations)
-        return choose_eval_demonstrations(candidates, tasks, trials, self._demonstrated_as)
+            chosen, rows = choose_episode(self.eval_demonstrations, self.config.demo_episode, len(tasks))
+        else:
+            candidates = (self.eval_demonstrations, self.train_demonstrations)
+            chosen, rows = choose_eval_demonstrations(candidates, tasks, trials, self._demonstrated_as)
+        if not self.training:
+            self._episode_tasks.note_demonstrations(chosen.describe(rows))
+        return chosen, rows
 
     def _acting_model(self) -> nn.Module:
         """The network that acts: in evaluation mode, a copy that is faster for small batches."""
@@ -711,7 +720,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         contents = self.instructions.contents()
         if self.eval_demonstrations is not None and self.config.uses_demo:
             frames, episodes = self.eval_demonstrations.frames.cpu(), self.eval_demonstrations.episodes.cpu()
-            stored = StoredDemonstrations(frames, episodes, self.eval_demonstrations.tasks)
+            known = self.eval_demonstrations
+            stored = StoredDemonstrations(frames, episodes, known.tasks, known.target_objects)
             contents = contents._replace(demonstrations=stored)
         write_task_file(save_directory / TASK_FILE, contents)
 
@@ -796,8 +806,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         check_demonstrations(path, contents.demonstrations, self.config.image_size, n_kept)
         # Demonstrations named on the command line come before those of the checkpoint.
         if self.eval_demonstrations is None:
-            frames, episodes, tasks = contents.demonstrations
-            self.eval_demonstrations = DemonstrationSet(frames, tasks, episodes).to(self.config.device)
+            frames, episodes, tasks, target_objects = contents.demonstrations
+            known = DemonstrationSet(frames, tasks, episodes, target_objects)
+            self.eval_demonstrations = known.to(self.config.device)
 
 
 def _process_rank() -> int:

@@ -30,8 +30,10 @@ from PIL import Image
 from gym_deltaco import EPISODE_STEPS, EXPERT_NOISE
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
+from gym_deltaco.object_sets import find_label
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASKS
+from lerobot_deltaco.cards.dataset_card import write_card
 from lerobot_deltaco.commands.collect import main
 from lerobot_deltaco.data import collection, collection_plan
 from lerobot_deltaco.data import dataset_files as files
@@ -276,6 +278,7 @@ def test_data_sets_for_choosing_settings_split_the_training_tasks():
     [
         ("scenario_a_test", "validation"),
         ("scenario_b_test", "validation"),
+        ("scenario_a_clean_test", "validation"),
         ("scenario_a_validation", "validation"),
         ("scenario_a_selection_train", "train"),
         ("0,scenario_a_validation", "train"),
@@ -295,6 +298,34 @@ def test_training_and_validation_never_show_the_same_scene(finished, tmp_path, i
     training, validation = (set(read_frames(root)["benchmark.seed"]) for root in (finished, tmp_path))
     assert not training & validation
     assert all(episode_seed(0, "validation", 90, number) in validation for number in range(3))
+
+
+# Objects and distractors
+
+
+@pytest.mark.parametrize(
+    ("tasks", "objects"),
+    [("T198", "all"), ("scenario_a_clean_train", "scenario_a_train"), ("scenario_a_clean_test", "all")],
+)
+def test_scenes_are_made_of_the_objects_of_the_task_set(tasks, objects):
+    assert CollectionPlan(tasks, 1).objects == objects
+    assert CollectionPlan("4", 1, objects="scenario_a_train").objects == "scenario_a_train"
+
+
+def test_a_dataset_says_of_what_its_scenes_are_made_where_that_is_not_the_papers(tmp_path):
+    usual = CollectionPlan("4", 1)
+    assert set(usual.features["observation.image"]["info"]) == {"renderer", "benchmark", "ambiguity"}
+    changed = replace(usual, tasks="1000", objects="random:100", adversarial_probability=0.0)
+    collect(tmp_path, changed)
+    info = json.loads((tmp_path / "meta/info.json").read_text())["features"]["observation.image"]["info"]
+    assert (info["objects"], info["adversarial_probability"]) == ("random:100", 0.0)
+    (target,) = set(read_frames(tmp_path)["benchmark.target_object"])
+    assert find_label(target).color == "black and white"
+    assert find_label(target).shape == "vase"
+    write_card(tmp_path)
+    card = (tmp_path / "README.md").read_text()
+    assert "--env.objects=random:100 --env.adversarial_probability=0.0" in card
+    assert "Put black and white colored, vase shaped object in green bin." in card
 
 
 # Adding to a dataset
@@ -368,7 +399,7 @@ def test_an_interrupted_addition_leaves_the_old_dataset_readable(copy, tmp_path,
     assert contents(copy) == contents(expected)
 
 
-@pytest.mark.parametrize("change", [{"image_size": 32}, {"ambiguity": "object"}])
+@pytest.mark.parametrize("change", [{"image_size": 32}, {"ambiguity": "object"}, {"objects": "random:100"}])
 def test_other_images_are_not_added(copy, change, in_process):
     with pytest.raises(CollectionError, match="images differ in size, ambiguity, renderer"):
         collect(copy, replace(PLAN, **change), append=True)
@@ -690,6 +721,8 @@ def test_the_same_arguments_again_have_nothing_to_do(copy, capsys, in_process):
         {"noise": 0.2},
         {"ambiguity": "object"},
         {"image_size": 32},
+        {"objects": "scenario_a_train"},
+        {"adversarial_probability": 0.0},
     ],
     ids=str,
 )
@@ -951,6 +984,9 @@ def test_a_missing_data_file_is_reported(copy, in_process):
         (["--episodes-per-task", "0"], "`episodes_per_task` must be at least 1. Got 0."),
         (["--episodes-per-task", "many"], "invalid int value: 'many'"),
         (["--seed", "-1"], "`seed` must be at least 0. Got -1."),
+        (["--objects", "none"], "`objects` must be one of all, scenario_a_train, random:N. Got 'none'"),
+        (["--tasks", "1000"], "Task 1000 asks for a black and white colored, vase shaped object, of which"),
+        (["--adversarial-probability", "1.5"], "`adversarial_probability` must be between 0 and 1. Got 1.5"),
         (["--noise", "-0.1"], "`noise` must be at least 0. Got -0.1."),
         (["--noise", "nan"], "`noise` must be a finite number. Got nan."),
         (["--noise", "inf"], "`noise` must be a finite number. Got inf."),

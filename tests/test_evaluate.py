@@ -91,6 +91,26 @@ def test_an_evaluation_set_is_a_function_of_the_seed_and_the_set(run, loaded):
     assert {episode.seed for episode in other}.isdisjoint(episode.seed for episode in episodes)
 
 
+def test_the_demonstrations_of_a_task_take_turns_and_are_recorded(loaded):
+    episodes = evaluate(*loaded, EvaluationPlan("4,14", trials=3), set_number=0)
+    # Two episodes of each of the tasks 4, 14 and 55 were collected, one task after the other.
+    assert [episode.demonstration_episodes for episode in episodes] == [[0], [1], [0], [2], [3], [2]]
+    assert [episode.demonstrated_objects for episode in episodes] == [[4]] * 3 + [[14]] * 3
+
+
+def test_distractors_are_drawn_as_the_plan_says(loaded):
+    def distractors(**settings):
+        episodes = evaluate(*loaded, EvaluationPlan("4", trials=12, **settings), set_number=0)
+        return [index for item in episodes for index in item.objects if index != 4]
+
+    # Alike to the smushed dumbbell in shape or color are the objects 0, 2 and 7.
+    assert set(distractors(adversarial_probability=1.0)) <= {0, 2, 7}
+    uniform = distractors(adversarial_probability=0.0)
+    assert sum(index in {0, 2, 7} for index in uniform) < 12
+    assert max(uniform) >= 24
+    assert max(distractors(adversarial_probability=0.0, objects="scenario_a_train")) < 24
+
+
 def test_the_outcome_is_that_of_the_scene_at_the_end(loaded, monkeypatch):
     # The policy's place is taken by the expert, which succeeds.
     acting = {}
@@ -154,6 +174,7 @@ def test_the_command_writes_a_record_of_each_checkpoint_once(run, capsys, monkey
     assert (record.step, record.tasks, record.trials, len(record.episodes)) == (2, "4,14", 1, 2)
     assert record.versions["benchmark"] == "gym_deltaco/PickPlace-v0"
     assert record.command == f"deltaco-evaluate {run} --tasks 4,14 --trials 1"
+    assert (record.objects, record.adversarial_probability) == ("all", 0.6)
     assert capsys.readouterr().out.count("succeeded") == 2
 
     def must_not_run(*arguments):
@@ -168,6 +189,10 @@ def test_records_of_other_evaluations_are_not_taken_for_this_one(run, capsys):
     evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "1", "--steps", "last"])
     with pytest.raises(SystemExit):
         evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "2", "--steps", "last"])
+    assert "belongs to another evaluation" in capsys.readouterr().err
+    uniform = ["--adversarial-probability", "0"]
+    with pytest.raises(SystemExit):
+        evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "1", "--steps", "last", *uniform])
     assert "belongs to another evaluation" in capsys.readouterr().err
 
 
@@ -196,6 +221,9 @@ def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder
         (["another_run", "--out", "out"], "the records of a single run. Got 2 runs"),
         (["--tasks", "301"], "301"),
         (["--trials", "0"], "`trials` must be at least 1"),
+        (["--objects", "none"], "`objects` must be one of all, scenario_a_train, random:N"),
+        (["--tasks", "24", "--objects", "scenario_a_train"], "Task 24 asks for a gray colored"),
+        (["--adversarial-probability", "2"], "`adversarial_probability` must be between 0 and 1"),
         (["--steps", "5"], "no checkpoint of step 5. It has those of 1, 2"),
         (["--steps", "first"], "must be 'all', 'last' or steps"),
     ],

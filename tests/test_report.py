@@ -54,6 +54,8 @@ def episode(task_id, trial=0, success=False, **changes):
         seed=task_id,
         instruction=task.instruction,
         demonstration=task.instruction,
+        demonstration_episodes=[task_id],
+        demonstrated_objects=[task.targets[0]],
         success=success,
         objects=[task.targets[0], *[index for index in range(32) if index not in task.targets][:2]],
         object_containers=[container if success else -1, -1, -1],
@@ -78,6 +80,8 @@ def record(experiment="scenario_a/deltaco", seed=0, step=10_000, n_successes=3, 
         evaluation_seed=0,
         counterfactual="none",
         ambiguity="container",
+        objects="all",
+        adversarial_probability=0.6,
         tasks=",".join(map(str, TASK_IDS)),
         trials=trials,
         episodes=[episode(*cell, success=number < n_successes) for number, cell in enumerate(cells)],
@@ -381,7 +385,7 @@ def with_value(name, value, in_episode=True):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (without("format"), "in format 2: its format is None.*deltaco-evaluate"),
+        (without("format"), "in format 1 to 2: its format is None.*deltaco-evaluate"),
         (without("trials"), r"lacks \['trials'\]"),
         (without("image_size"), r"lacks \['image_size'\]"),
         (with_value("format", 3, False), "its format is 3"),
@@ -395,7 +399,7 @@ def with_value(name, value, in_episode=True):
         (with_value("success", 1), "`success` must be true or false. Got 1"),
         (with_value("objects", [0, None, 1]), "`objects` must be a list whose items are each an integer"),
         (with_value("demonstration", 4), "`demonstration` must be a string or None. Got 4"),
-        (with_value("task_id", 300), r"`task_id` must be in 0..299. Got \[300\]"),
+        (with_value("task_id", 300), r"`task_id` must be an integer from 0 to 299. Got 300"),
         (with_value("grasped_object", 3), r"`grasped_object` must be in -1..2"),
         (with_value("container_quadrants", [[0, 1]]), r"the shape \(2, 2\)"),
         (with_value("container_quadrants", [[0, 1], [0, 2]]), "must be in 0..1"),
@@ -415,18 +419,23 @@ def test_a_damaged_record_is_refused(tmp_path, damage, message):
 
 def test_a_record_of_the_first_format_says_what_was_so_then(tmp_path):
     content = asdict(record())
-    for name in ("image_size", "episode_length"):
+    for name in ("image_size", "episode_length", "objects", "adversarial_probability"):
         del content[name]
+    for result in content["episodes"]:
+        del result["demonstration_episodes"], result["demonstrated_objects"]
     path = tmp_path / "0010000.json"
     path.write_text(json.dumps({"format": 1, **content}))
-    assert read_record(path) == record()
+    unknown = [
+        replace(item, demonstration_episodes=None, demonstrated_objects=None) for item in record().episodes
+    ]
+    assert read_record(path) == record(episodes=unknown, objects="all", adversarial_probability=0.6)
     assert (record().image_size, record().episode_length) == (48, 30)
     path.write_text(json.dumps({"format": 1, **content, "image_size": "48"}))
     with pytest.raises(RecordError, match="`image_size` must be an integer"):
         read_record(path)
 
 
-@pytest.mark.parametrize("text", ['{"format": 1, "epis', "[]", ""])
+@pytest.mark.parametrize("text", ['{"format": 2, "epis', "[]", ""])
 def test_a_cut_off_record_is_refused(tmp_path, text):
     path = tmp_path / "0010000.json"
     path.write_text(text)
@@ -508,6 +517,8 @@ def test_options_that_are_newer_than_a_record_were_as_they_are_by_default(tmp_pa
         ({"ambiguity": "object"}, "ambiguity scheme: 'container' .* 'object'"),
         ({"image_size": 64}, "image size: 48 .* 64"),
         ({"episode_length": 7}, "episode length: 30 .* 7"),
+        ({"objects": "random:100"}, "objects: 'all' .* 'random:100'"),
+        ({"adversarial_probability": 0.0}, "probability of adversarial distractors: 0.6 .* 0.0"),
         ({"trials": 2}, "trials: 1 in .* 2 in"),
         ({"tasks": "24", "episodes": [episode(24)]}, "tasks: '24,32,.*' in .* '24' in"),
     ],

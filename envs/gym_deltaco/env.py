@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from gym_deltaco import CONTROL_FPS, MIN_IMAGE_SIZE
 from gym_deltaco import kinematics as kin
 from gym_deltaco.instructions import check_tasks
-from gym_deltaco.layout import ADVERSARIAL_PROBABILITY, AMBIGUITIES, Ambiguity, sample_layout
-from gym_deltaco.object_sets import check_task, select_objects
+from gym_deltaco.layout import AMBIGUITIES, Ambiguity, sample_layout
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, check_task, select_objects
 from gym_deltaco.scene import Scene
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import Task, get_task
@@ -105,8 +105,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         adversarial_probability: float = ADVERSARIAL_PROBABILITY,
         instructions: Mapping[int, Sequence[str]] | None = None,
     ) -> None:
+        check_scenes([task_id], objects, adversarial_probability)
         self.objects = objects
-        self.task: Task = self._task(task_id)
+        self.task: Task = get_task(task_id)
         if ambiguity not in AMBIGUITIES:
             raise ValueError(
                 f"`ambiguity` must be one of {', '.join(get_args(Ambiguity))}. Got {ambiguity!r}."
@@ -118,10 +119,6 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
                 raise ValueError(f"`{name}` must be at least {MIN_IMAGE_SIZE}. Got {size}.")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"`render_mode` must be 'rgb_array' or None. Got {render_mode!r}.")
-        if not 0 <= adversarial_probability <= 1:
-            raise ValueError(
-                f"`adversarial_probability` must be between 0 and 1. Got {adversarial_probability}."
-            )
         self.ambiguity: Ambiguity = ambiguity
         self.adversarial_probability = adversarial_probability
         self.image_size = image_size
@@ -144,12 +141,6 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._is_closed = False
         self._is_success = False
         self._grasped_object = -1
-
-    def _task(self, index: int) -> Task:
-        """The task of an index, which has to be one that the scenes' objects allow."""
-        task = get_task(index)
-        check_task(task, self.objects)
-        return task
 
     @property
     def task_description(self) -> str:
@@ -191,7 +182,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             raise gym.error.ClosedEnvironmentError(
                 "The environment is closed. Make a new one with `gymnasium.make`."
             )
-        task = self._task((options or {}).get("task_id", self.task.index))
+        task = get_task((options or {}).get("task_id", self.task.index))
+        check_task(task, self.objects)
         if self.instructions is not None:
             check_tasks(self.instructions, [task.index], "The environment")
         super().reset(seed=seed)

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.object_sets import find_label, find_model
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, find_label, find_model
 from gym_deltaco.objects import ObjectModel
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, ContainerColor, ContainerWord, ObjectLabel, Task
 from gym_deltaco.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
@@ -17,7 +17,6 @@ Ambiguity = Literal["container", "object"]
 AMBIGUITIES: tuple[str, ...] = get_args(Ambiguity)
 
 N_OBJECTS = 3
-ADVERSARIAL_PROBABILITY = 0.6
 MIN_OBJECT_DISTANCE = 0.065  # m
 # Half the opened gripper's extents, with the expert's noise: nothing else stands where its fingers come down.
 GRIPPER_CLEARANCE = (0.052, 0.018)  # m, in x and y

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from functools import cache
 from types import MappingProxyType
 
 from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.random_objects import FIRST_INDEX, random_label, random_model
-from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel, Task
+from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel, Task, get_task
 
 OBJECT_SETS = MappingProxyType(
     {
@@ -19,7 +20,11 @@ OBJECT_SETS = MappingProxyType(
         "scenario_a_train": tuple(label for label in OBJECTS if label.index in SCENARIOS["a"].train_rows),
     }
 )
+ADVERSARIAL_PROBABILITY = 0.6  # that a distractor shares the target's color or shape, in the paper's data
 MAX_OBJECTS = 10_000
+N_INDICES = (
+    FIRST_INDEX + MAX_OBJECTS - len(OBJECT_SETS["scenario_a_train"])
+)  # of objects, random ones included
 # Task sets whose scenes are made of other objects than all, unless something else is asked for.
 _OBJECTS_OF_TASK_SETS = MappingProxyType({"scenario_a_clean_train": "scenario_a_train"})
 
@@ -70,6 +75,25 @@ def find_model(index: int) -> ObjectModel:
 def default_objects(tasks: str) -> str:
     """Name of the set of objects for a selection of tasks, unless another one is asked for."""
     return _OBJECTS_OF_TASK_SETS.get(tasks.strip(), "all")
+
+
+def check_scenes(task_ids: Iterable[int], objects: str, adversarial_probability: float) -> None:
+    """Checks that scenes can be drawn for tasks.
+
+    Args:
+        task_ids: Indices of the tasks.
+        objects: Name of the set of objects, as `select_objects` takes it.
+        adversarial_probability: Probability that a distractor is drawn from the objects that share the
+            target's color or shape, 0..1.
+
+    Raises:
+        ValueError: There is no such set, a task asks for none of its objects, or the probability is none.
+    """
+    if not 0 <= adversarial_probability <= 1:
+        raise ValueError(f"`adversarial_probability` must be between 0 and 1. Got {adversarial_probability}.")
+    tasks_by_row = {task.row: task for task in map(get_task, task_ids)}
+    for task in tasks_by_row.values():
+        check_task(task, objects)
 
 
 def check_task(task: Task, name: str) -> None:

@@ -28,7 +28,7 @@ _SEED = 2210_04476  # of all random objects; another one gives other objects
 _MAX_RADIUS = 23.0  # between the fingers
 _PALM_DISTANCE = 35.0  # of an object's top above the height at which it is held, at the most
 _MIN_GRASP = 10.0
-_MIN_FOOT = 0.31  # of the height
+_MIN_FOOT = 0.35  # of the height
 _MAX_FACES = 250
 _FACES_OF_AN_EXTRA = 64  # of a handle, which has the most
 _MAX_PART_POINTS = 24
@@ -328,7 +328,8 @@ def _cup(rng: np.random.Generator) -> _Form:
     foot = _foot(max(_between(rng, 0.68, 0.98) * top, 14), height)
     variant = _pick(rng, ("plain", "plain", "handle", "lid"))
     if variant == "handle":
-        top, foot, height = min(top, 20.5), min(foot, 20.0), min(height, 52.0)
+        top, height = min(top, 20.5), min(height, 48.0)
+        foot = min(max(foot, 0.42 * height), top)  # its handle pulls it over
     outside = [(foot, 0), (top, height - 12), (top, height)]
     band = (height - 12, height)
     inside = [(top - 3, height), (foot - 3, 6)]

@@ -302,6 +302,11 @@ TASK_SETS = MappingProxyType(
 )
 
 
+def is_task(index: int) -> bool:
+    """Whether there is a task of an index."""
+    return 0 <= index < N_TASKS or index in _PAIR_TASKS
+
+
 def get_task(index: int) -> Task:
     """The task of an index.
 
@@ -313,7 +318,7 @@ def get_task(index: int) -> Task:
     """
     try:
         number = int(index)
-        is_valid = number == index and (0 <= number < N_TASKS or number in _PAIR_TASKS)
+        is_valid = number == index and is_task(number)
     except (TypeError, ValueError, OverflowError):
         is_valid = False
     if not is_valid:

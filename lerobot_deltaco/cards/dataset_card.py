@@ -32,8 +32,8 @@ from gym_deltaco.sheets import (
     save_png,
     to_image,
 )
-from gym_deltaco.tasks import SCENARIOS, TASKS, Task
-from lerobot_deltaco.cards.templates import env_options, render
+from gym_deltaco.tasks import SCENARIOS, Task, get_task
+from lerobot_deltaco.cards.templates import env_options, render, scene_settings
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, read_history, read_info
@@ -64,8 +64,8 @@ DESCRIPTIONS = {
     "next.reward": ("1 once the task has succeeded, after the action", "0 or 1"),
     "next.done": ("whether the episode ends with this action", ""),
     "next.success": ("whether the task has succeeded in this episode, after the action", ""),
-    "benchmark.task_id": ("which of the 300 tasks it is", "0..299"),
-    "benchmark.target_object": ("which of the 32 objects is to be picked", "0..31"),
+    "benchmark.task_id": ("index of the task", "0..299; 1000..1479 by color and shape"),
+    "benchmark.target_object": ("index of the object to be picked", "0..31; from 32 on, random objects"),
     "benchmark.target_container": ("which container it is to be placed in", "0 green, 1 red"),
     "benchmark.seed": ("of the environment's `reset`, which draws the same scene again", ""),
     "timestamp": ("time in the episode, at the nominal frame rate", "s"),
@@ -102,9 +102,7 @@ def write_card(root: Path, folder: Path | None = None, repo_id: str | None = Non
     info = read_info(root)
     episodes = list(_first_episodes(root, info))
     image_info = info["features"]["observation.image"]["info"]
-    with closing(
-        PickPlaceEnv(ambiguity=image_info["ambiguity"], image_size=episodes[0].images.shape[1])
-    ) as env:
+    with closing(PickPlaceEnv(**scene_settings(image_info), image_size=episodes[0].images.shape[1])) as env:
         save_png(_tasks_image(episodes, env), folder / TASKS_IMAGE)
         _save_episode(episodes[0], env, folder / EPISODE_IMAGE)
     text = card_text(root, repo_id)
@@ -185,7 +183,7 @@ def _tasks(root: Path) -> list[Task]:
     for path in sorted((root / "data").glob("*/*.parquet")):
         with _named(path):
             ids.update(pq.read_table(path, columns=["benchmark.task_id"])[0].unique().to_pylist())
-    return [TASKS[index] for index in sorted(ids)]
+    return [get_task(index) for index in sorted(ids)]
 
 
 def _kinds(tasks: Sequence[Task]) -> list[dict[str, Any]]:
@@ -251,7 +249,7 @@ def _expert(history: Sequence[Mapping[str, Any]], plans: Sequence[CollectionPlan
     successes: Counter[str] = Counter()
     for entry, plan in zip(history, plans, strict=True):
         for task_id, n_attempts in entry["attempts"].items():
-            kind = TASKS[int(task_id)].kind
+            kind = get_task(int(task_id)).kind
             attempts[kind] += n_attempts
             successes[kind] += plan.episodes_per_task
     return [
@@ -301,7 +299,7 @@ def _first_episodes(root: Path, info: Mapping[str, Any]) -> Iterator[_Episode]:
             frames = pq.read_table(path, filters=[("episode_index", "==", row["episode_index"])])
             frames = frames.sort_by("frame_index").to_pandas()
             episode = _Episode(
-                task=TASKS[frames["benchmark.task_id"].iloc[0]],
+                task=get_task(int(frames["benchmark.task_id"].iloc[0])),
                 seed=int(frames["benchmark.seed"].iloc[0]) if "benchmark.seed" in frames else None,
                 images=np.stack([_decoded(cell) for cell in frames["observation.image"]]),
                 actions=np.stack(list(frames["action"])),

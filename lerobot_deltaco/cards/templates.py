@@ -1,12 +1,15 @@
 """The templates of cards: where they are, and how they are filled in."""
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
 TEMPLATES = "datasets_cards"
+# Settings of the environment that a dataset records; those of the objects only if they are not the paper's.
+SCENE_SETTINGS = ("ambiguity", "objects", "adversarial_probability")
 
 
 def template_folder() -> Path:
@@ -49,6 +52,15 @@ def markdown_code(text: str) -> str:
     return f"{fence}{space}{line}{space}{fence}"
 
 
+def scene_settings(info: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of the environment that a dataset's scenes were drawn with.
+
+    Args:
+        info: What the dataset's feature "observation.image" says of them, as in LeRobot's info.json.
+    """
+    return {name: info[name] for name in SCENE_SETTINGS if name in info}
+
+
 def env_options(image: dict[str, Any]) -> str:
     """Options of `--env.type=deltaco` which make it show what a dataset of the benchmark shows.
 
@@ -58,6 +70,8 @@ def env_options(image: dict[str, Any]) -> str:
     options = []
     if image["shape"][0] != 48:
         options.append(f" --env.image_size={image['shape'][0]}")
-    if image["info"]["ambiguity"] != "container":
-        options.append(f" --env.ambiguity={image['info']['ambiguity']}")
+    defaults = {"ambiguity": "container"}
+    for name, value in scene_settings(image["info"]).items():
+        if value != defaults.get(name):
+            options.append(f" --env.{name}={shlex.quote(str(value))}")
     return "".join(options)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from gym_deltaco import EXPERT_NOISE, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY
 from lerobot_deltaco.commands.command_errors import exit_on_error
 from lerobot_deltaco.data.collection_plan import COLLECTED_SPLITS, DATA_SETS, CollectionPlan
 
@@ -43,6 +44,8 @@ def main(arguments: list[str] | None = None) -> None:
             ambiguity=options.ambiguity,
             noise=options.noise,
             image_size=options.image_size,
+            objects=options.objects,
+            adversarial_probability=options.adversarial_probability,
         )
     except ValueError as error:
         parser.error(str(error))
@@ -158,6 +161,21 @@ def _parser() -> argparse.ArgumentParser:
         default=48,
         metavar="PX",
         help=f"height and width of the images, at least {MIN_IMAGE_SIZE} (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--objects",
+        metavar="SET",
+        help="objects that scenes are made of: all, scenario_a_train (no test objects) or random:N, the 24 "
+        "training objects and N - 24 random ones (by default, those of the task set: all but for "
+        "scenario_a_clean_train)",
+    )
+    parser.add_argument(
+        "--adversarial-probability",
+        type=float,
+        default=ADVERSARIAL_PROBABILITY,
+        metavar="P",
+        help="probability that a distractor is drawn from the objects that share the target's color or shape "
+        "(%(default)s)",
     )
     parser.add_argument(
         "--workers",

@@ -28,7 +28,13 @@ def main(arguments: list[str] | None = None) -> None:
     command = shlex.join([parser.prog, *(sys.argv[1:] if arguments is None else arguments)])
     try:
         plan = EvaluationPlan(
-            options.tasks, options.trials, options.seed, options.counterfactual, options.ambiguity
+            options.tasks,
+            options.trials,
+            options.seed,
+            options.counterfactual,
+            options.ambiguity,
+            objects=options.objects,
+            adversarial_probability=options.adversarial_probability,
         )
         given = {
             name: getattr(options, name)
@@ -100,6 +106,8 @@ def _evaluate(
             record.ambiguity,
             record.image_size,
             record.episode_length,
+            record.objects,
+            record.adversarial_probability,
         )
         if made_for != plan:
             raise RecordError(
@@ -196,6 +204,20 @@ def _parser() -> argparse.ArgumentParser:
         metavar="STEPS",
         help="steps of an episode (by default, of the training's environment, or else the benchmark's "
         f"{plan.episode_length})",
+    )
+    parser.add_argument(
+        "--objects",
+        metavar="SET",
+        help="objects that scenes are made of: all, scenario_a_train (no test objects) or random:N (by "
+        "default, those of the task set: all but for scenario_a_clean_train)",
+    )
+    parser.add_argument(
+        "--adversarial-probability",
+        type=float,
+        default=plan.adversarial_probability,
+        metavar="P",
+        help="probability that a distractor is drawn from the objects that share the target's color or "
+        "shape; 0 for uniform distractors, as in the authors' evaluation in training (%(default)s)",
     )
     parser.add_argument(
         "--steps",

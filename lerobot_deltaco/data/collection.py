@@ -37,7 +37,7 @@ from tqdm import tqdm
 from gym_deltaco import ENV_ID
 from gym_deltaco.atomic_files import json_text, write_json
 from gym_deltaco.env import PickPlaceEnv
-from gym_deltaco.tasks import TASKS
+from gym_deltaco.tasks import get_task
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import (
     EPISODE_LENGTH,
@@ -309,8 +309,8 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
         )
     elif json.loads(json.dumps(plan.features)) != base.features:
         raise CollectionError(
-            f"{root} holds a dataset whose images differ in size, ambiguity, renderer or version of the "
-            "benchmark. Name a new folder."
+            f"{root} holds a dataset whose images differ in size, ambiguity, renderer, objects, probability "
+            "of adversarial distractors or version of the benchmark. Name a new folder."
         )
 
 
@@ -355,14 +355,14 @@ def _locked(staging: Path) -> Iterator[None]:
 
 def _make_job(root: Path, plan: CollectionPlan, base: _Base | None) -> _Job:
     base = base or _Base([], 0, 0, 0, {}, [], {})
-    instructions = dict.fromkeys([*base.tasks, *(TASKS[task_id].instruction for task_id in plan.task_ids)])
+    instructions = dict.fromkeys([*base.tasks, *(get_task(task_id).instruction for task_id in plan.task_ids)])
     order = {instruction: index for index, instruction in enumerate(instructions)}
     taken = first_numbers(plan, base.plans)
     return _Job(
         root=root,
         plan=plan,
         tasks=list(instructions),
-        task_indices={task_id: order[TASKS[task_id].instruction] for task_id in plan.task_ids},
+        task_indices={task_id: order[get_task(task_id).instruction] for task_id in plan.task_ids},
         first_numbers={task_id: taken[task_id] for task_id in plan.task_ids},
         base_episodes=base.n_episodes,
         base_frames=base.n_frames,
@@ -442,7 +442,7 @@ _worker: _Worker | None = None
 def _start_worker(job: _Job) -> None:
     global _worker
     _end_with_main_process(job.staging / WORKERS_LOCK)
-    env = PickPlaceEnv(ambiguity=job.plan.ambiguity, image_size=job.plan.image_size)
+    env = PickPlaceEnv(**job.plan.env_settings)
     _worker = _Worker(job, env, files.data_schema(job.plan.features))
 
 
@@ -512,7 +512,7 @@ def _join(part: int) -> None:
         file_number=number,
         first_episode=job.base_episodes + episodes.start,
         first_index=job.base_frames + episodes.start * EPISODE_LENGTH,
-        tasks=[TASKS[task_id].instruction for task_id in task_ids],
+        tasks=[get_task(task_id).instruction for task_id in task_ids],
         lengths=[EPISODE_LENGTH] * len(episodes),
         statistics=statistics,
     )
@@ -625,7 +625,7 @@ def _summary(root: Path, episodes_per_s: float | None) -> Summary:
     attempts: Counter[str] = Counter()
     successes: Counter[str] = Counter()
     for task_id, n_attempts in last["attempts"].items():
-        kind = TASKS[int(task_id)].kind
+        kind = get_task(int(task_id)).kind
         attempts[kind] += n_attempts
         successes[kind] += per_task
     files_of_it = (path for folder in ("data", "meta") for path in (root / folder).rglob("*"))

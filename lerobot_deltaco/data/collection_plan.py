@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS, EXPERT_NOISE, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, default_objects
 from gym_deltaco.seeding import Split, episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, select_tasks
 from lerobot_deltaco.common.checks import check_choices
@@ -61,6 +62,10 @@ class CollectionPlan:
         ambiguity: "container" or "object", the paper's schemes i and ii.
         noise: Standard deviation of the noise on the expert's motions, at least 0.
         image_size: Height and width of the images, px.
+        objects: Objects that scenes are made of, as the environment takes them; None is "all", but
+            "scenario_a_train" for scenario_a_clean_train.
+        adversarial_probability: Probability that a distractor is drawn from the objects that share the
+            target's color or shape, 0..1.
 
     Raises:
         ValueError: An argument is not valid; the message says what is.
@@ -73,6 +78,8 @@ class CollectionPlan:
     ambiguity: Ambiguity = "container"
     noise: float = EXPERT_NOISE
     image_size: int = 48
+    objects: str | None = None
+    adversarial_probability: float = ADVERSARIAL_PROBABILITY
 
     def __post_init__(self) -> None:
         check_field_types(self)
@@ -87,6 +94,9 @@ class CollectionPlan:
             },
         )
         check_choices(self, ambiguity=AMBIGUITIES)
+        if self.objects is None:
+            object.__setattr__(self, "objects", default_objects(self.tasks))
+        check_scenes(task_ids, self.objects, self.adversarial_probability)
         if self.split is None:
             object.__setattr__(self, "split", _default_split(self.tasks, task_ids))
         check_choices(self, split=COLLECTED_SPLITS)
@@ -107,6 +117,22 @@ class CollectionPlan:
         return len(self.task_ids) * self.episodes_per_task
 
     @property
+    def env_settings(self) -> dict[str, Any]:
+        """Arguments of the environment."""
+        return {
+            "ambiguity": self.ambiguity,
+            "image_size": self.image_size,
+            "objects": self.objects,
+            "adversarial_probability": self.adversarial_probability,
+        }
+
+    @property
+    def _changed_settings(self) -> dict[str, Any]:
+        """Settings of the scenes that are not the paper's. The others are left out, as they always were."""
+        settings = {"objects": "all", "adversarial_probability": ADVERSARIAL_PROBABILITY}
+        return {name: getattr(self, name) for name, own in settings.items() if getattr(self, name) != own}
+
+    @property
     def features(self) -> dict[str, dict[str, Any]]:
         """What a frame of the dataset has, as in LeRobot's info.json."""
         number = {"dtype": "int64", "shape": [1], "names": None}
@@ -116,7 +142,12 @@ class CollectionPlan:
                 "shape": [self.image_size, self.image_size, 3],
                 "names": ["height", "width", "channels"],
                 # Policies do not transfer from one renderer's images to another's.
-                "info": {"renderer": renderer(), "benchmark": ENV_ID, "ambiguity": self.ambiguity},
+                "info": {
+                    "renderer": renderer(),
+                    "benchmark": ENV_ID,
+                    "ambiguity": self.ambiguity,
+                    **self._changed_settings,
+                },
             },
             "observation.state": {"dtype": "float32", "shape": [10], "names": STATE_NAMES},
             "action": {"dtype": "float32", "shape": [4], "names": ACTION_NAMES},

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from PIL import Image
 from tqdm import tqdm
 
-from gym_deltaco.tasks import N_TASKS
+from gym_deltaco.tasks import N_TASKS, is_task
 from lerobot_deltaco.common.typed_fields import in_words, is_a
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import CollectionPlan
@@ -307,7 +307,7 @@ def _read_all(root: Path, info: Mapping[str, Any]) -> None:
             raise damaged(path, error, _REMEDY) from None
         if not np.array_equal(indices, np.arange(first, first + len(table))):
             raise damaged(path, f"its frames must be numbered from {first}", _REMEDY)
-        if not ((task_ids >= 0) & (task_ids < N_TASKS)).all():
+        if not all(map(is_task, np.unique(task_ids).tolist())):
             raise damaged(path, f"`benchmark.task_id` must be in 0..{N_TASKS - 1}", _REMEDY)
         first += len(table)
     for path in sorted((root / "meta/episodes").glob("*/*.parquet")):

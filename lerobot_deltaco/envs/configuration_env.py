@@ -11,7 +11,8 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
 from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS
 from gym_deltaco.layout import AMBIGUITIES
-from gym_deltaco.tasks import TASKS, select_tasks
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, default_objects
+from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.common.checks import check_choices
 from lerobot_deltaco.common.env_ranges import ENV_RANGES
 from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
@@ -26,8 +27,8 @@ class DeltacoEnv(EnvConfig):
     LeRobot's evaluation reports a success rate for each kind of task: "name", "color" and "shape".
 
     Args:
-        task: Which tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_b_test,
-            scenario_b_train, all), or indices and ranges of 0 to 299, such as 4,50-73.
+        task: Which tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_a_validation,
+            scenario_b_test, scenario_b_train, all, ...), or indices and ranges of 0 to 299, such as 4,50-73.
         fps: Frames per second of the videos of episodes. The simulation has no frame rate of its own.
         episode_length: Number of steps after which an episode ends. The benchmark's is 30.
         ambiguity: "container" (the paper's scheme i: the instruction is clear, a demonstration leaves open
@@ -36,6 +37,11 @@ class DeltacoEnv(EnvConfig):
         image_size: Height and width of the policy's image, in pixels. The benchmark's is 48.
         render_size: Height and width of videos, in pixels. LeRobot records up to 10 episodes of every task,
             and a frame of 256 pixels takes several times as long to render as one of 96.
+        objects: Objects that scenes are made of: "all", as in the paper; "scenario_a_train", without the 8
+            test objects; "random:N", the 24 training objects and N - 24 random ones. None: "all", but
+            "scenario_a_train" for the tasks scenario_a_clean_train.
+        adversarial_probability: Probability that a distractor is drawn from the objects that share the
+            target's color or shape: 0.6 in the paper's data, 0 in the authors' evaluation in training.
     """
 
     task: str = "scenario_a_test"
@@ -44,10 +50,15 @@ class DeltacoEnv(EnvConfig):
     ambiguity: str = "container"
     image_size: int = 48
     render_size: int = 96
+    objects: str | None = None
+    adversarial_probability: float = ADVERSARIAL_PROBABILITY
 
     def __post_init__(self) -> None:
         check_field_types(self)
-        select_tasks(self.task)
+        task_ids = select_tasks(self.task)
+        if self.objects is None:
+            self.objects = default_objects(self.task)
+        check_scenes(task_ids, self.objects, self.adversarial_probability)
         check_ranges(self, ENV_RANGES)
         check_choices(self, ambiguity=AMBIGUITIES)
         # The environment's names, and what LeRobot calls them in datasets and policies.
@@ -72,6 +83,8 @@ class DeltacoEnv(EnvConfig):
             "render_mode": "rgb_array",
             "render_size": self.render_size,
             "max_episode_steps": self.episode_length,
+            "objects": self.objects,
+            "adversarial_probability": self.adversarial_probability,
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
@@ -90,5 +103,5 @@ class DeltacoEnv(EnvConfig):
         )
         groups: dict[str, dict[int, VectorEnv]] = defaultdict(dict)
         for task_id, env in zip(task_ids, envs, strict=True):
-            groups[TASKS[task_id].kind][task_id] = env
+            groups[get_task(task_id).kind][task_id] = env
         return dict(groups)

@@ -13,8 +13,9 @@ from lerobot.scripts.lerobot_eval import rollout
 from tqdm import tqdm
 
 from gym_deltaco import ENV_ID
+from gym_deltaco.object_sets import find_label
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, Task, get_task, select_tasks
+from gym_deltaco.tasks import CONTAINER_COLORS, Task, get_task, select_tasks
 from gym_deltaco.workspace import Quadrant, container_matches
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.envs.policy_fit import check_policy_fits
@@ -23,6 +24,7 @@ from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import BENCHMARK, Counterfactual, EpisodeResult
 from lerobot_deltaco.evaluation.recording_env import RecordingVectorEnv
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.demonstrations import Demonstrated
 
 PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
 
@@ -50,7 +52,12 @@ def evaluate(
         ValueError: A task has no demonstration, or the policy is not one for this environment.
     """
     env_config = DeltacoEnv(
-        ambiguity=plan.ambiguity, image_size=plan.image_size, episode_length=plan.episode_length
+        task=plan.tasks,
+        ambiguity=plan.ambiguity,
+        image_size=plan.image_size,
+        episode_length=plan.episode_length,
+        objects=plan.objects,
+        adversarial_probability=plan.adversarial_probability,
     )
     check_policy_fits(policy.config, env_config)
     task_ids = select_tasks(plan.tasks)
@@ -73,7 +80,7 @@ def evaluate(
                 with torch.no_grad(), policy.demonstrated_as(sampler.demonstrated_as):
                     rollout(recorded, policy, identity, identity, preprocessor, postprocessor, seeds)
                 results += [
-                    _result(recorded, index, trial, seed, sampler.demonstration)
+                    _result(recorded, index, trial, seed, sampler.demonstration, policy.demonstrated(index))
                     for index, (trial, seed) in enumerate(zip(trials, seeds, strict=True))
                 ]
             env.close()
@@ -146,7 +153,7 @@ def counterfactual_task(others: Sequence[Task], info: dict[str, Any], rng: rando
             "A counterfactual evaluation needs at least two tasks that the policy can perform. Evaluate more "
             "tasks, and give demonstrations of them."
         )
-    labels = [OBJECTS[index] for index in info["objects"]]
+    labels = [find_label(int(index)) for index in info["objects"]]
 
     def wants(task: Task) -> tuple[bool, bool]:
         objects = [n for n, label in enumerate(labels) if task.describes(label)]
@@ -165,7 +172,12 @@ def counterfactual_task(others: Sequence[Task], info: dict[str, Any], rng: rando
 
 
 def _result(
-    recorded: RecordingVectorEnv, index: int, trial: int, seed: int, demonstration: str | None
+    recorded: RecordingVectorEnv,
+    index: int,
+    trial: int,
+    seed: int,
+    demonstration: str | None,
+    demonstrated: list[Demonstrated],
 ) -> EpisodeResult:
     info = recorded.infos[index]
     return EpisodeResult(
@@ -174,6 +186,8 @@ def _result(
         seed=seed,
         instruction=recorded.instructions[index],
         demonstration=demonstration,
+        demonstration_episodes=[each.episode for each in demonstrated],
+        demonstrated_objects=[each.target_object for each in demonstrated if each.target_object is not None],
         success=bool(info["is_success"]),
         objects=info["objects"].tolist(),
         object_containers=info["object_containers"].tolist(),

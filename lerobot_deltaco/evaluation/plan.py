@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from gym_deltaco import EPISODE_STEPS
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, default_objects
 from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.common.checks import check_choices
 from lerobot_deltaco.common.env_ranges import ENV_RANGES
@@ -28,6 +29,9 @@ class EvaluationPlan:
         ambiguity: "container" or "object", the paper's schemes i and ii.
         image_size: Height and width of the policy's images in the environment, px.
         episode_length: Number of steps of an episode.
+        objects: Objects that scenes are made of, as `--env.objects` takes them; None is the task set's own.
+        adversarial_probability: Probability that a distractor is drawn from the objects that share the
+            target's color or shape, 0..1.
 
     Raises:
         ValueError: An argument is invalid; the message says what is valid.
@@ -40,10 +44,15 @@ class EvaluationPlan:
     ambiguity: Ambiguity = "container"
     image_size: int = 48
     episode_length: int = EPISODE_STEPS
+    objects: str | None = None
+    adversarial_probability: float = ADVERSARIAL_PROBABILITY
 
     def __post_init__(self) -> None:
         check_field_types(self)
-        select_tasks(self.tasks)
+        task_ids = select_tasks(self.tasks)
         ranges = {name: ENV_RANGES[name] for name in ("image_size", "episode_length")}
         check_ranges(self, {"trials": (1, 1_000_000), "seed": (0, 2**63 - 1), **ranges})
+        objects = default_objects(self.tasks) if self.objects is None else self.objects
+        object.__setattr__(self, "objects", objects)
+        check_scenes(task_ids, objects, self.adversarial_probability)
         check_choices(self, counterfactual=COUNTERFACTUALS, ambiguity=AMBIGUITIES)

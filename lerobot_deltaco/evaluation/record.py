@@ -13,7 +13,8 @@ from typing import Any, Literal, get_args
 
 from gym_deltaco import EPISODE_STEPS
 from gym_deltaco.atomic_files import write_json
-from gym_deltaco.tasks import N_TASKS, OBJECTS
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, N_INDICES
+from gym_deltaco.tasks import get_task
 from lerobot_deltaco.common.typed_fields import in_words, is_a, type_hints
 
 # Format 2 has more fields than format 1. Those have defaults, which say what was so in all records before.
@@ -36,13 +37,13 @@ class EpisodeResult:
     """One episode. Objects and containers are numbered as they are in the scene; -1 is none.
 
     Args:
-        task_id: The scene's task, 0..299, which decides success.
+        task_id: The scene's task, which decides success.
         trial: Which episode of its task in this evaluation set, from 0.
         seed: Seed of the environment's reset.
         instruction: Instruction that the policy received.
         demonstration: Task string of the demonstration that the policy received; None without one.
         success: Whether the scene's task succeeded, at any step.
-        objects: Which of the 32 objects stand in the scene, three of them.
+        objects: Indices of the objects that stand in the scene, three of them.
         object_containers: Where each of them lies at the end: 0 green, 1 red.
         container_quadrants: Where the green and the red container stand, (2, 2): i, 0 right and 1 left, and
             j, 0 back and 1 front. It decides what a position word of another task would mean in this scene.
@@ -51,6 +52,10 @@ class EpisodeResult:
         grasped_object: The object that the gripper held last.
         right_object: Whether that is the target.
         right_container: Whether something lies in the target container, and nothing in the other one.
+        demonstration_episodes: Indices of the demonstrations' episodes in their dataset; None in records of
+            format 1, which do not tell.
+        demonstrated_objects: Indices of the objects that the demonstrations move to a container; none if the
+            dataset does not tell, and None in records of format 1.
     """
 
     task_id: int
@@ -67,6 +72,8 @@ class EpisodeResult:
     grasped_object: int
     right_object: bool
     right_container: bool
+    demonstration_episodes: list[int] | None = None
+    demonstrated_objects: list[int] | None = None
 
 
 @dataclass(frozen=True)
@@ -91,6 +98,9 @@ class EvaluationRecord:
         seconds: Duration of the episodes, s.
         image_size: Height and width of the policy's images in the environment, px.
         episode_length: Number of steps of an episode.
+        objects: Name of the set of objects that the scenes are made of.
+        adversarial_probability: Probability that a distractor is drawn from the objects that share the
+            target's color or shape, 0..1.
     """
 
     experiment: str
@@ -109,6 +119,8 @@ class EvaluationRecord:
     seconds: float
     image_size: int = 48
     episode_length: int = EPISODE_STEPS
+    objects: str = "all"
+    adversarial_probability: float = ADVERSARIAL_PROBABILITY
 
     @property
     def success_rate(self) -> float:
@@ -141,8 +153,8 @@ def read_record(path: Path) -> EvaluationRecord:
     found = content.get("format") if isinstance(content, dict) else None
     if type(found) is not int or found not in READABLE_FORMATS:
         raise RecordError(
-            f"{path} is not a record of an evaluation in format {RECORD_FORMAT}: its format is {found!r}. "
-            "Evaluate the checkpoint again with `deltaco-evaluate`."
+            f"{path} is not a record of an evaluation in format 1 to {RECORD_FORMAT}: its format is "
+            f"{found!r}. Evaluate the checkpoint again with `deltaco-evaluate`."
         )
     del content["format"]
     is_older = found < RECORD_FORMAT
@@ -190,10 +202,13 @@ def _check_fields(
 
 def _check_numbers(path: Path, episode: EpisodeResult) -> None:
     """Checks that the numbers of an episode name something that there is."""
+    try:
+        get_task(episode.task_id)
+    except ValueError as error:
+        raise RecordError(f"{path} is damaged: {error}") from None
     n_objects = len(episode.objects)
     in_range = (
-        ("task_id", [episode.task_id], range(N_TASKS)),
-        ("objects", episode.objects, range(len(OBJECTS))),
+        ("objects", episode.objects, range(N_INDICES)),
         ("object_containers", episode.object_containers, range(-1, 2)),
         ("container_quadrants", sum(episode.container_quadrants, []), range(2)),
         ("target_object", [episode.target_object], range(n_objects)),

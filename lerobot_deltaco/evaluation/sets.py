@@ -56,6 +56,8 @@ def run_set(
         evaluation_seed=plan.seed,
         counterfactual=plan.counterfactual,
         ambiguity=plan.ambiguity,
+        objects=plan.objects,
+        adversarial_probability=plan.adversarial_probability,
         tasks=plan.tasks,
         trials=plan.trials,
         episodes=episodes,

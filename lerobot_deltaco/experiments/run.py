@@ -136,6 +136,11 @@ class ExperimentRun:
                 "env.type": "deltaco",
                 "env.task": self.config.evaluation["tasks"],
                 "env.ambiguity": self.config.evaluation.get("ambiguity", "container"),
+                **{
+                    f"env.{name}": self.config.evaluation[name]
+                    for name in ("objects", "adversarial_probability")
+                    if name in self.config.evaluation
+                },
                 "eval.n_episodes": self.config.evaluation["trials"],
             }
             if "image_size" in self.config.data:
@@ -162,7 +167,7 @@ class ExperimentRun:
 
     def _evaluate_command(self) -> Command:
         """The command that evaluates the checkpoints that the training has not evaluated."""
-        options = [f"--{name}={value}" for name, value in self.config.evaluation.items()]
+        options = [f"--{name.replace('_', '-')}={value}" for name, value in self.config.evaluation.items()]
         return Command("evaluate", [str(self.folder), *options, f"--experiment={self.config.name}"])
 
 

@@ -24,6 +24,22 @@ logger = logging.getLogger(__name__)
 N_KEPT_FRAMES = 16
 
 
+# Index of the object that an episode moves, in datasets of the benchmark.
+TARGET_OBJECT = "benchmark.target_object"
+
+
+class Demonstrated(NamedTuple):
+    """The episode that demonstrates a task.
+
+    Attributes:
+        episode: Index of the episode in its dataset.
+        target_object: Index of the object that it moves; None if its dataset does not say.
+    """
+
+    episode: int
+    target_object: int | None
+
+
 class DemonstrationSet(torch.nn.Module):
     """Episodes that demonstrate tasks.
 
@@ -33,6 +49,7 @@ class DemonstrationSet(torch.nn.Module):
         frames: (episodes, kept frames, 3, H, W) uint8; the first and the last frame of each are among them.
         tasks: Instruction of each episode.
         episodes: Index of each episode in its dataset.
+        target_objects: Index of the object that each episode moves; None if the dataset does not say.
     """
 
     frames: Tensor
@@ -42,8 +59,15 @@ class DemonstrationSet(torch.nn.Module):
     _place: Tensor
     _row_of_episode: Tensor
 
-    def __init__(self, frames: Tensor, tasks: Sequence[str], episodes: Sequence[int]) -> None:
+    def __init__(
+        self,
+        frames: Tensor,
+        tasks: Sequence[str],
+        episodes: Sequence[int],
+        target_objects: Sequence[int] | None = None,
+    ) -> None:
         super().__init__()
+        self.target_objects = None if target_objects is None else list(target_objects)
         self.tasks = list(tasks)
         self.rows: dict[str, list[int]] = defaultdict(list)
         for row, task in enumerate(self.tasks):
@@ -158,6 +182,14 @@ class DemonstrationSet(torch.nn.Module):
         which = column * n_each + torch.where(own, (start + 1) % n_distinct, start)
         return drawn.flatten(), which
 
+    def describe(self, rows: Tensor) -> tuple[Demonstrated, ...]:
+        """The episodes of rows, (batch,)."""
+        objects = self.target_objects
+        return tuple(
+            Demonstrated(int(self.episodes[row]), None if objects is None else objects[row])
+            for row in rows.tolist()
+        )
+
     def episode_rows(self, episodes: Tensor) -> Tensor:
         """Rows of episodes, (batch,); -1 of those that are not in the set."""
         place = torch.searchsorted(self._ascending, episodes).clamp(max=len(self._ascending) - 1)
@@ -238,16 +270,19 @@ def load_demonstrations(
     episodes = list(range(total)) if episodes is None else list(episodes)
     if not episodes or not all(0 <= episode < total for episode in episodes):
         raise ValueError(f"{repo_id} has the episodes 0 to {total - 1}. Got {episodes[:5]}.")
-    frames, tasks = [], []
+    frames, tasks, target_objects = [], [], []
     for episode in tqdm(episodes, desc="Reading demonstrations", unit="episode", leave=False):
         row = dataset.meta.episodes[episode]
         indices = kept_frame_indices(
             row["dataset_from_index"], row["dataset_to_index"] - 1, n_demo_frames
         ).tolist()
-        images = torch.stack([dataset[index][camera] for index in indices])  # (kept, 3, h, w)
+        items = [dataset[index] for index in indices]
+        if TARGET_OBJECT in items[0]:
+            target_objects.append(int(items[0][TARGET_OBJECT]))
+        images = torch.stack([item[camera] for item in items])  # (kept, 3, h, w)
         frames.append(resize_images(images, image_size))
         tasks.append(row["tasks"][0])
-    return DemonstrationSet(torch.stack(frames), tasks, episodes)
+    return DemonstrationSet(torch.stack(frames), tasks, episodes, target_objects or None)
 
 
 class RobotData(NamedTuple):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from torch import Tensor, nn
 
+from lerobot_deltaco.policy.demonstrations import Demonstrated
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals
 
 
@@ -30,11 +31,13 @@ class EpisodeTasks:
 
     def __init__(self) -> None:
         self._conditioning: dict[int, TaskConditioning] = {}  # by thread
+        self._demonstrated: dict[int, list[tuple[Demonstrated, ...]]] = {}  # by thread
         self._n_episodes: dict[str, int] = {}  # by task
 
     def begin_episode(self) -> None:
-        """Forgets the conditioning of this thread's last episode."""
+        """Forgets the conditioning and the demonstrations of this thread's last episode."""
         self._conditioning.pop(threading.get_ident(), None)
+        self._demonstrated.pop(threading.get_ident(), None)
 
     def begin_evaluation(self) -> None:
         """Counts the episodes of each task from 0 again."""
@@ -53,6 +56,14 @@ class EpisodeTasks:
         if current is None or current.tasks != tasks:
             current = self._conditioning[threading.get_ident()] = encode(tasks)
         return current
+
+    def note_demonstrations(self, demonstrated: tuple[Demonstrated, ...]) -> None:
+        """Remembers the demonstration of each sample of this thread's episode; of several, one at a time."""
+        self._demonstrated.setdefault(threading.get_ident(), []).append(demonstrated)
+
+    def demonstrated(self, sample: int) -> list[Demonstrated]:
+        """The demonstrations of a sample of this thread's episode."""
+        return [each[sample] for each in self._demonstrated.get(threading.get_ident(), [])]
 
     def count_trials(self, tasks: Sequence[str]) -> list[int]:
         """Number of each sample's episode among those of its task, from 0, whichever thread runs them."""

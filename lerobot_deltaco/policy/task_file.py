@@ -18,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from lerobot_deltaco.common.typed_fields import is_a
 from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
 
 TASK_FILE = "tasks.safetensors"
@@ -38,6 +39,7 @@ class StoredDemonstrations(NamedTuple):
     frames: Tensor  # (demonstrations, kept frames, 3, height, width) uint8
     episodes: Tensor  # (demonstrations,) int64, indices in their dataset
     tasks: list[str]  # of each demonstration
+    target_objects: list[int] | None  # index of the object that each moves; None if it is not known
 
 
 class TaskFile(NamedTuple):
@@ -75,9 +77,10 @@ def write_task_file(path: Path, contents: TaskFile) -> None:
         "instructions": json.dumps(contents.instructions),
     }
     if contents.demonstrations is not None:
-        frames, episodes, tasks = contents.demonstrations
+        frames, episodes, tasks, target_objects = contents.demonstrations
         tensors |= {_FRAMES: frames.cpu().contiguous(), _EPISODES: episodes.cpu().contiguous()}
         known["tasks"] = json.dumps(tasks)
+        known["target_objects"] = json.dumps(target_objects)
     save_file(tensors, path, metadata=known)
 
 
@@ -146,7 +149,20 @@ def _demonstrations(
         shape = tuple(frames.shape)
         raise _error(path, f"`{_FRAMES}` must have the shape (n, 2 or more, 3, h, w), not {shape}")
     _check(path, _FRAMES, frames, torch.uint8, (len(tasks), frames.shape[1], 3, *frames.shape[3:]))
-    return StoredDemonstrations(frames, episodes, tasks)
+    return StoredDemonstrations(frames, episodes, tasks, _target_objects(path, known, len(tasks)))
+
+
+def _target_objects(path: Path, known: Mapping[str, str], n_demonstrations: int) -> list[int] | None:
+    """Index of the object that each demonstration moves; None in files of earlier versions."""
+    try:
+        indices = json.loads(known.get("target_objects", "null"))
+    except ValueError as error:
+        raise _error(path, f"`target_objects` must be a list in JSON: {error!r}") from error
+    if indices is None:
+        return None
+    if not is_a(indices, list[int]) or len(indices) != n_demonstrations or min(indices) < 0:
+        raise _error(path, "`target_objects` must have an integer of at least 0 for each demonstration")
+    return list(indices)
 
 
 def _strings(path: Path, known: Mapping[str, str], name: str) -> list[str]:

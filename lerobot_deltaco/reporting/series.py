@@ -236,6 +236,13 @@ def _check_together(everything: Sequence[Series]) -> None:
         _check_same("ambiguity scheme", records, group, lambda item: item.record.ambiguity)
         _check_same("image size", records, group, lambda item: item.record.image_size)
         _check_same("episode length", records, group, lambda item: item.record.episode_length)
+        _check_same("objects", records, group, lambda item: item.record.objects)
+        _check_same(
+            "probability of adversarial distractors",
+            records,
+            group,
+            lambda item: item.record.adversarial_probability,
+        )
 
 
 def _check_same(

@@ -15,7 +15,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, Task, get_task
+from gym_deltaco.object_sets import find_label
+from gym_deltaco.tasks import CONTAINER_COLORS, TASKS, Task, get_task
 from gym_deltaco.workspace import Quadrant, container_matches
 from lerobot_deltaco.evaluation.record import Counterfactual, EpisodeResult
 
@@ -260,7 +261,7 @@ def _asked_for(
             # In ambiguity scheme (ii), the instruction describes the target's twin as well.
             numbers = [episode.target_object]
         else:
-            numbers = [n for n, index in enumerate(episode.objects) if task.describes(OBJECTS[index])]
+            numbers = [n for n, index in enumerate(episode.objects) if task.describes(find_label(index))]
         n_options = len(episode.objects) if aspect == "object" else len(episode.container_quadrants)
         asked[cue] = frozenset(numbers) if len(numbers) < n_options else frozenset()
     return asked

@@ -216,6 +216,8 @@ class InMemoryTraining:
                 ambiguity=config.env.ambiguity,
                 image_size=config.env.image_size,
                 episode_length=config.env.episode_length,
+                objects=config.env.objects,
+                adversarial_probability=config.env.adversarial_probability,
             ),
             experiment=config.job_name,
             run_seed=config.seed if config.seed is not None else 0,
