@@ -24,6 +24,7 @@ from lerobot_deltaco.evaluation.record import (
     record_path,
     write_record,
 )
+from lerobot_deltaco.reporting.novelty import novelty, scenario_of
 from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS, TITLES, in_order, label_of
 from lerobot_deltaco.reporting.report import FILES, write_report
 from lerobot_deltaco.reporting.series import ReportError, counted, find_records, make_report
@@ -34,6 +35,7 @@ from lerobot_deltaco.reporting.statistics import (
     unknown_sentences,
     wilson_interval,
 )
+from lerobot_deltaco.reporting.task_bootstrap import mean_rate, paired_difference, task_rates
 
 # Names, colors and shapes; a color word and position words.
 TASK_IDS = (24, 32, 45, 124, 132, 145)
@@ -333,7 +335,7 @@ def test_the_authors_numbers():
     assert PAPER_RESULTS["ablations/clip_mlp_1"].rate < PAPER_RESULTS["ablations/clip_mlp_2"].rate
     groups = Counter(name.partition("/")[0] for name in PAPER_RESULTS)
     assert groups == {"scenario_a": 15, "scenario_b": 5, "ambiguity_object": 3, "ablations": 11}
-    assert set(groups) == set(TITLES)
+    assert {*groups, "small_a"} == set(TITLES)
     assert all(0 < item.sd < item.rate < 1 for item in PAPER_RESULTS.values())
     assert label_of("mine/my_method") == "my method"
 
@@ -441,6 +443,66 @@ def test_a_cut_off_record_is_refused(tmp_path, text):
     path.write_text(text)
     with pytest.raises(RecordError, match=re.escape(str(path))):
         read_record(path)
+
+
+# Novelty and intervals
+
+
+@pytest.mark.parametrize(
+    ("row", "target", "tasks", "expected"),
+    [
+        (24, 24, "scenario_a_test", "never_target"),
+        (29, 29, "scenario_a_test", "unnamed_target"),
+        (29, 29, "scenario_a_clean_test", "never_target"),
+        (29, 29, "scenario_b_test", "training_task"),
+        (32, 0, "scenario_a_test", "other_words"),
+        (45, 26, "scenario_a_test", "never_target"),
+        (45, 26, "scenario_b_test", "other_words"),
+        (49, 29, "scenario_a_test", "unnamed_target"),
+        (4, 4, "scenario_a_test", "training_task"),
+        (10, 10, "scenario_a_test", "training_task"),
+        (10, 10, "scenario_a_validation", "never_target"),
+        (36, 10, "scenario_a_validation", "never_target"),
+        (36, 8, "scenario_a_validation", "other_words"),
+    ],
+)
+def test_novelty_is_what_training_asked_for_of_the_target(row, target, tasks, expected):
+    result = episode(row)
+    result = replace(result, objects=[target, *[index for index in (1, 2, 3) if index != target][:2]])
+    assert novelty(result, scenario_of(tasks)) == expected
+
+
+def test_all_trials_and_seeds_of_a_task_are_one_draw_of_the_bootstrap():
+    once = mean_rate({1: 1.0, 2: 0.0, 3: 0.5, 4: 0.0})
+    episodes = [
+        episode(task_id, trial, success=trial < k)
+        for task_id, k in ((24, 2), (32, 0), (45, 1))
+        for trial in (0, 1)
+    ]
+    assert task_rates(episodes) == {24: 1.0, 32: 0.0, 45: 0.5}
+    assert once.value == 0.375
+    assert once.low < 0.375 < once.high
+    # With 400 tasks of these, the interval is a tenth as wide.
+    many = mean_rate({index: (1.0, 0.0, 0.5, 0.0)[index % 4] for index in range(400)})
+    assert (many.high - many.low) == pytest.approx((once.high - once.low) / 10, rel=0.25)
+
+
+def test_a_bootstrap_of_many_tasks_is_the_normal_interval():
+    rates = dict(enumerate(np.random.default_rng(0).random(300)))
+    estimate = mean_rate(rates)
+    half = 1.96 * np.std(list(rates.values())) / np.sqrt(300)
+    assert estimate.low == pytest.approx(estimate.value - half, abs=0.002)
+    assert estimate.high == pytest.approx(estimate.value + half, abs=0.002)
+
+
+def test_a_paired_difference_is_less_uncertain_than_its_parts():
+    rng = np.random.default_rng(1)
+    first = dict(enumerate(rng.random(100)))
+    second = {task_id: rate - 0.1 for task_id, rate in first.items()}
+    assert paired_difference(first, second) == pytest.approx((0.1, 0.1, 0.1))
+    other = dict.fromkeys(range(50, 200), 0.0)
+    shared = np.mean([first[task_id] for task_id in range(50, 100)])
+    assert paired_difference(first, other).value == pytest.approx(shared)
 
 
 # Records that belong together, and those that do not
@@ -576,7 +638,7 @@ def test_many_numbers_are_told_by_their_ends():
 def test_the_files(runs, tmp_path, capsys):
     out = tmp_path / "new/report"
     report_command.main([str(runs), "--out", str(out)])
-    assert "scenario_a/deltaco: 41.7 (2.8); 66.7 [39.1, 86.2] at step 30,000" in capsys.readouterr().out
+    assert "scenario_a/deltaco: 41.7 (2.8); 66.7 [33.3, 100.0] at step 30,000" in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} == set(FILES)
 
     deltaco, one_hot = rows(out / "rates.csv")
@@ -615,7 +677,7 @@ def test_the_text(runs, tmp_path):
     write(runs, record("scenario_b/deltaco"))
     write_report([runs], tmp_path)
     text = (tmp_path / "report.md").read_text()
-    assert "| DeL-TaCo | 0, 1 | 41.7 (2.8) | 3 of 3 sets | 66.7 [39.1, 86.2] | 30,000 | 25.8 (3.4) |" in text
+    assert "| DeL-TaCo | 0, 1 | 41.7 (2.8) | 3 of 3 sets | 66.7 [33.3, 100.0] | 30,000 | 25.8 (3.4) |" in text
     assert "authors, another simulation" in text
     assert ENV_ID in text
     assert "`method=one_hot`, `language_encoder=all-MiniLM-L6-v2`" in text
@@ -627,6 +689,41 @@ def test_the_text(runs, tmp_path):
     for table in re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE):
         assert len({line.count("|") for line in table.splitlines()}) == 1
     assert set(re.findall(r"!\[.+\]\((.+)\)", text)) == {"curves.png"}
+
+
+def test_the_text_says_what_differs_from_the_papers_architecture(tmp_path):
+    paper = {"backbone": "paper", "demo_encoder": "cnn", "optimizer_lr": 3e-4, "seed": 0}
+    write(tmp_path / "paper", record(policy=paper))
+    write_report([tmp_path / "paper"], tmp_path / "out")
+    assert "Not the paper's architecture" not in (tmp_path / "out/report.md").read_text()
+    ours = {**paper, "demo_encoder": "attention", "motion_modes": 5}
+    write(tmp_path / "ours", record("small_a/deltaco", policy=ours))
+    write_report([tmp_path / "ours"], tmp_path / "out")
+    text = (tmp_path / "out/report.md").read_text()
+    assert "`demo_encoder=attention` (paper: `cnn`), `motion_modes=5` (paper: `1`)." in text
+    assert "`backbone" not in text.split("## Learning curves")[0]
+
+
+def test_success_is_reported_by_novelty_and_object_and_as_differences(runs, tmp_path):
+    write_report([runs], tmp_path)
+    deltaco = [row for row in rows(tmp_path / "novelty.csv") if row["experiment"] == "scenario_a/deltaco"]
+    # The targets are the objects 24, 0 (black and white) and 0 (a cup), in two containers each.
+    assert [(row["novelty"], row["count"], row["episodes"]) for row in deltaco] == [
+        ("other_words", "4", "8"),
+        ("never_target", "4", "4"),
+    ]
+    objects = {
+        row["object"]: (row["name"], row["count"], row["episodes"])
+        for row in rows(tmp_path / "objects.csv")
+        if (row["experiment"], row["outcome"]) == ("scenario_a/deltaco", "success")
+    }
+    assert objects == {"0": ("conic cup", "4", "8"), "24": ("bathtub", "4", "4")}
+    (difference,) = rows(tmp_path / "differences.csv")
+    assert (difference["experiment"], difference["less"]) == ("scenario_a/one_hot", "scenario_a/deltaco")
+    # One task of six succeeds in one less four of six.
+    assert float(difference["difference"]) == pytest.approx(-0.5, abs=1e-6)
+    assert float(difference["bootstrap_low"]) == pytest.approx(-5 / 6, abs=1e-6)
+    assert float(difference["bootstrap_high"]) == pytest.approx(-1 / 6, abs=1e-6)
 
 
 def test_one_seed_and_one_step(tmp_path):
@@ -642,12 +739,13 @@ def test_a_new_report_replaces_the_old_one(runs, tmp_path):
     (tmp_path / "out/mine.txt").touch()
     write_report([runs / "scenario_a_one_hot_0"], tmp_path / "out", authors_levels=True)
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {*FILES, "mine.txt"} - {"counterfactual.csv"}
+    assert names == {*FILES, "mine.txt"} - {"counterfactual.csv", "differences.csv"}
     for path in runs.rglob("evaluations/00?0000.json"):
         path.unlink()
     write_report([runs / "scenario_a_deltaco_0"], tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {*FILES, "mine.txt"} - {"rates.csv", "curves.png"}
+    regular = {"rates.csv", "curves.png", "differences.csv", "novelty.csv", "objects.csv"}
+    assert names == {*FILES, "mine.txt"} - regular
 
 
 def test_a_report_is_written_wholly_or_not_at_all(runs, tmp_path, monkeypatch):

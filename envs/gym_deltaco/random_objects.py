@@ -428,13 +428,14 @@ def _round_hole(rng: np.random.Generator) -> _Form:
     sides = int(_pick(rng, (8, 12, 16)))
     outline = polygon(sides, (1.0, 0.92) if sides == 16 and rng.random() < 0.6 else (1.0,))
     if rng.random() < 0.4:  # a tube, or a shade that narrows
-        radius, wall = _between(rng, 18, _MAX_RADIUS), _between(rng, 4, 8)
+        radius, wall = _between(rng, 18, 21), _between(rng, 4, 8)
         height = _between(rng, 24, 44)
         top = radius if rng.random() < 0.5 else _between(rng, 0.6, 0.85) * radius
         outside: list[Row] = [(radius, 0), (radius, 16), (top, height)]
         inside: list[Row] = [(top - wall, height), (radius - wall - 2, 0)]
-        return _Form(outline, _OCTAGON, outside, (0, 16), inside, is_ring=True)
-    x, height = _between(rng, 21, _MAX_RADIUS), _between(rng, 18.5, 24)
+        band = (0.0, height if top == radius else 16.0)
+        return _Form(outline, _OCTAGON, outside, band, inside, is_ring=True)
+    x, height = _between(rng, 20, 22), _between(rng, 18.5, 24)
     y = x if rng.random() < 0.5 else _between(rng, x + 3, 36)
     hole = _between(rng, 0.4, 0.58)
     side, crown = round(height * 0.6, 1), 4.0
@@ -550,10 +551,11 @@ def _palette(color: str, rng: np.random.Generator) -> tuple[Color, Color, Color]
         return _BLACK, _WHITE, (0.4, 0.4, 0.4)
     (hue, saturation, value) = (float(rng.uniform(*limits)) for limits in _HSV[color])
     darker = rng.uniform(0.78, 0.9)
-    return tuple(
+    main, shade, dark = (
         _snapped(colorsys.hsv_to_rgb(hue % 360 / 360, saturation, value * share))
-        for share in (1, darker, 0.68)
+        for share in (1.0, darker, 0.68)
     )
+    return main, shade, dark
 
 
 def _snapped(rgb: Sequence[float]) -> Color:

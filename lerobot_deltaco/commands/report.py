@@ -62,7 +62,7 @@ def _text(report: Report, out: Path) -> str:
     lines = [f"{out / REPORT_FILE}: success in %, as the paper reports it (SD); at the last step [95 %]"]
     for series in report.regular:
         lines.append(
-            f"  {series.experiment}: {rate_text(paper_rate(series.rates))}; {last_text(series.last)} at step "
+            f"  {series.experiment}: {rate_text(paper_rate(series.rates))}; {last_text(series)} at step "
             f"{series.steps[-1]:,}; {counted('seed', series.seeds)}"
         )
     lines += [f"Note: {note}" for note in report.notes]

@@ -94,9 +94,9 @@ class CollectionPlan:
             },
         )
         check_choices(self, ambiguity=AMBIGUITIES)
-        if self.objects is None:
-            object.__setattr__(self, "objects", default_objects(self.tasks))
-        check_scenes(task_ids, self.objects, self.adversarial_probability)
+        objects = default_objects(self.tasks) if self.objects is None else self.objects
+        object.__setattr__(self, "objects", objects)
+        check_scenes(task_ids, objects, self.adversarial_probability)
         if self.split is None:
             object.__setattr__(self, "split", _default_split(self.tasks, task_ids))
         check_choices(self, split=COLLECTED_SPLITS)

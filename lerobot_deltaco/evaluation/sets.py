@@ -8,6 +8,7 @@ from pathlib import Path
 import draccus
 from lerobot.processor import PolicyProcessorPipeline
 
+from gym_deltaco.object_sets import default_objects
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.evaluate import evaluate, versions
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
@@ -56,7 +57,7 @@ def run_set(
         evaluation_seed=plan.seed,
         counterfactual=plan.counterfactual,
         ambiguity=plan.ambiguity,
-        objects=plan.objects,
+        objects=plan.objects or default_objects(plan.tasks),
         adversarial_probability=plan.adversarial_probability,
         tasks=plan.tasks,
         trials=plan.trials,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_deltaco.reporting.paper_results import CHANCE, PAPER_RESULTS, label_of
+from lerobot_deltaco.reporting.paper_results import LEVELS, PAPER_RESULTS, label_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,6 +44,7 @@ _OTHER_COLORS = (
 )
 _OTHER_STYLES = tuple((color, line) for line, color in product(("-", "-.", ":"), _OTHER_COLORS))
 _DASHED, _DOTTED = (0, (6, 4)), (0, (1, 3))
+_SHADES_OF_LEVELS = ("black", "0.35", "0.55")
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def _draw_panel(ax: Axes, curves: Sequence[Curve], authors_levels: bool) -> None
     from matplotlib.lines import Line2D
 
     other_styles = iter(_OTHER_STYLES * (1 + len(curves) // len(_OTHER_STYLES)))
-    highest = CHANCE
+    highest = max(LEVELS.values())
     has_levels = False
     for curve in curves:
         method = curve.experiment.rpartition("/")[2]
@@ -112,9 +113,11 @@ def _draw_panel(ax: Axes, curves: Sequence[Curve], authors_levels: bool) -> None
         if authors_levels and published is not None:
             ax.axhline(published.rate, color=color, linewidth=1, linestyle=_DASHED, alpha=0.8)
             highest, has_levels = max(highest, published.rate), True
-    ax.axhline(CHANCE, color="black", linewidth=1, linestyle=_DOTTED)
     handles, _ = ax.get_legend_handles_labels()
-    handles.append(Line2D([], [], color="black", linewidth=1, linestyle=_DOTTED, label="chance, 1 in 6"))
+    for (label, level), shade in zip(LEVELS.items(), _SHADES_OF_LEVELS, strict=True):
+        ax.axhline(level, color=shade, linewidth=1, linestyle=_DOTTED)
+        name = f"{100 * level:.1f} %: {label}".replace(", ", ",\n")
+        handles.append(Line2D([], [], color=shade, linewidth=1, linestyle=_DOTTED, label=name))
     if has_levels:
         label = "authors' rates\n(another simulation)"
         handles.append(Line2D([], [], color="gray", linewidth=1, linestyle=_DASHED, label=label))

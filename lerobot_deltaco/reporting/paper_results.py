@@ -13,6 +13,28 @@ from typing import NamedTuple
 NOTE = "measured in another simulation, with other objects"
 # A policy that picks an object of three and a container of two at random.
 CHANCE = 1 / 6
+# The success of policies that know a part of what they are asked for, in ambiguity scheme (i).
+LEVELS: Mapping[str, float] = MappingProxyType(
+    {
+        "random object and container": CHANCE,
+        "right container, random object": 1 / 3,
+        "right object, random container": 1 / 2,
+    }
+)
+# The architecture and the training of the paper, as options of the policy.
+PAPER_OPTIONS: Mapping[str, object] = MappingProxyType(
+    {
+        "backbone": "paper",
+        "demo_encoder": "cnn",
+        "motion_modes": 1,
+        "gripper_loss": "squared_error",
+        "crop_padding": 4,
+        "drop_n_last_frames": 0,
+        "optimizer_lr": 3e-4,
+        "optimizer_weight_decay": 0.0,
+        "scheduler_name": "constant",
+    }
+)
 
 
 class PaperResult(NamedTuple):
@@ -75,6 +97,7 @@ TITLES: Mapping[str, str] = MappingProxyType(
         "scenario_b": "Scenario B: novel colors and shapes",
         "ambiguity_object": "Ambiguity scheme (ii): identical objects",
         "ablations": "Ablations, in scenario A",
+        "small_a": "Scenario A at a small scale, not the paper's architecture",
     }
 )
 PAPER_RESULTS: Mapping[str, PaperResult] = MappingProxyType(

@@ -11,8 +11,24 @@ from pathlib import Path
 from typing import Any
 
 from gym_deltaco.atomic_files import atomic_write
+from gym_deltaco.object_sets import find_label
 from lerobot_deltaco.reporting.curves import Curve, draw_curves
-from lerobot_deltaco.reporting.paper_results import CHANCE, NOTE, PAPER_RESULTS, TITLES, label_of
+from lerobot_deltaco.reporting.novelty import (
+    DESCRIPTIONS,
+    NOVELTIES,
+    Novelty,
+    scenario_of,
+    success_by_novelty,
+)
+from lerobot_deltaco.reporting.paper_results import (
+    CHANCE,
+    LEVELS,
+    NOTE,
+    PAPER_OPTIONS,
+    PAPER_RESULTS,
+    TITLES,
+    label_of,
+)
 from lerobot_deltaco.reporting.series import Report, Series, counted, find_records, make_report
 from lerobot_deltaco.reporting.statistics import (
     CUES,
@@ -24,9 +40,11 @@ from lerobot_deltaco.reporting.statistics import (
     PaperRate,
     Proportion,
     breakdown,
+    by_object,
     followed,
     paper_rate,
 )
+from lerobot_deltaco.reporting.task_bootstrap import Estimate, mean_rate, paired_difference
 
 REPORT_FILE = "report.md"
 CURVES_IMAGE = "curves.png"
@@ -35,6 +53,9 @@ FILES = (
     "curves.csv",
     "rates.csv",
     "breakdown.csv",
+    "differences.csv",
+    "novelty.csv",
+    "objects.csv",
     "counterfactual.csv",
     REPORT_FILE,
 )
@@ -53,8 +74,8 @@ def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = Fals
         authors_levels: Draw the authors' rates into the image.
 
     Returns:
-        What was reported. Without ordinary evaluations, there are no rates and no curves; without
-        counterfactual ones, no `counterfactual.csv`.
+        What was reported. Without ordinary evaluations, there are no rates and no curves; with a single
+        experiment, no `differences.csv`; without counterfactual evaluations, no `counterfactual.csv`.
 
     Raises:
         ReportError: A folder has no records, or they do not belong together.
@@ -68,6 +89,11 @@ def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = Fals
     }
     if report.regular:
         contents["rates.csv"] = _csv(_rate_rows(report))
+        contents["novelty.csv"] = _csv(_novelty_rows(report))
+        contents["objects.csv"] = _csv(_object_rows(report))
+        differences = _difference_rows(report)
+        if differences:
+            contents["differences.csv"] = _csv(differences)
         panels = [
             (_title(name), [Curve(series.experiment, series.steps, series.rates) for series in group])
             for name, group in report.comparisons.items()
@@ -99,6 +125,7 @@ def _rate_rows(report: Report) -> list[dict[str, Any]]:
                 "sd": paper.sd,
                 "last_step": series.steps[-1],
                 **_proportion_columns(last, "last_"),
+                **_interval_columns(mean_rate(series.last_task_rates), "last_bootstrap_"),
                 "authors_rate_in_another_simulation": published and published.rate,
                 "authors_sd_in_another_simulation": published and published.sd,
             }
@@ -137,6 +164,66 @@ def _breakdown_rows(report: Report) -> list[dict[str, Any]]:
         for series in report.series
         for row in breakdown(series.last_episodes)
         for outcome, proportion in row.outcomes.items()
+    ]
+
+
+def _difference_rows(report: Report) -> list[dict[str, Any]]:
+    return [
+        {
+            "experiment": series.experiment,
+            "less": reference.experiment,
+            "tasks": len(series.last_task_rates),
+            "difference": estimate.value,
+            **_interval_columns(estimate, "bootstrap_"),
+        }
+        for group in report.comparisons.values()
+        for series, reference, estimate in _differences(group)
+    ]
+
+
+def _novelty_rows(report: Report) -> list[dict[str, Any]]:
+    return [
+        {
+            "experiment": series.experiment,
+            "step": series.steps[-1],
+            "novelty": name,
+            **_proportion_columns(proportion),
+        }
+        for series in report.regular
+        for name, proportion in _by_novelty(series).items()
+    ]
+
+
+def _object_rows(report: Report) -> list[dict[str, Any]]:
+    return [
+        {
+            "experiment": series.experiment,
+            "step": series.steps[-1],
+            "object": index,
+            "name": find_label(index).name,
+            "outcome": outcome,
+            **_proportion_columns(proportion),
+        }
+        for series in report.regular
+        for index, outcomes in by_object(series.last_episodes).items()
+        for outcome, proportion in outcomes.items()
+    ]
+
+
+def _interval_columns(estimate: Estimate, prefix: str) -> dict[str, Any]:
+    return {f"{prefix}low": estimate.low, f"{prefix}high": estimate.high}
+
+
+def _by_novelty(series: Series) -> dict[Novelty, Proportion]:
+    return success_by_novelty(series.last_episodes, scenario_of(series.sets[0].record.tasks))
+
+
+def _differences(group: Sequence[Series]) -> list[tuple[Series, Series, Estimate]]:
+    """The difference of each series of a comparison to the first one, in the order of the tables."""
+    reference, *others = group
+    return [
+        (series, reference, paired_difference(series.last_task_rates, reference.last_task_rates))
+        for series in others
     ]
 
 
@@ -215,8 +302,11 @@ def _introduction(report: Report) -> str:
         "mean over seeds, or all if there are fewer, the mean, and the mean of the standard deviation over "
         "seeds (the population's; – with one seed). It picks its sets by what it then averages, which "
         "flatters.\n"
-        "- **Last** is the rate at the last step, over the episodes of all seeds, with its 95 % Wilson "
-        "interval. The interval is that of these checkpoints; other seeds may differ more.\n"
+        "- **Last** is the rate at the last step, over the episodes of all seeds, with a 95 % interval by "
+        "bootstrap over tasks: the episodes of a task are alike, and seeds share scenes, so that neither are "
+        "independent trials. The interval is that of these checkpoints; other seeds may differ more.\n"
+        "- **Levels**, dotted in the curves, are the success of policies that know a part of what they are "
+        f"asked for: {', '.join(f'{_percent(level)} ({label})' for label, level in LEVELS.items())}.\n"
         "- Only steps count of which all seeds of an experiment have a record.\n"
         f"- **Authors** are the paper's numbers, {NOTE}: compare them with one another, not with ours.\n"
     )
@@ -227,7 +317,8 @@ def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
     header = (
         f"{len(example.task_ids)} tasks (`{example.record.tasks}`), {example.record.trials} trials of each "
         f"in an evaluation set; evaluation seed {example.record.evaluation_seed}; ambiguity scheme "
-        f"`{example.record.ambiguity}`."
+        f"`{example.record.ambiguity}`; scenes of the objects `{example.record.objects}`, with adversarial "
+        f"distractors at a probability of {example.record.adversarial_probability:g}.{_architecture(group)}"
     )
     rates = _table(
         [
@@ -270,7 +361,86 @@ def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
         f"What happened at the last step that counts:\n\n{outcomes}\n"
         "Success there, by how the task asks for its object (name, color, shape) and for its container "
         f"(color word: green, red; position word: front, back, left, right):\n\n{kinds}"
+        f"{_difference_section(group)}{_novelty_section(group)}{_object_section(group)}"
     )
+
+
+def _architecture(group: Sequence[Series]) -> str:
+    """How the policies of a comparison differ from the paper's, as a sentence; empty if they do not."""
+    policies = [series.sets[-1].record.policy for series in group]
+    differing = {
+        name: dict.fromkeys(str(policy[name]) for policy in policies if policy.get(name, own) != own)
+        for name, own in PAPER_OPTIONS.items()
+    }
+    options = [
+        f"`{name}={'`, `'.join(values)}` (paper: `{PAPER_OPTIONS[name]}`)"
+        for name, values in differing.items()
+        if values
+    ]
+    if not options:
+        return ""
+    return (
+        f"\n\n**Not the paper's architecture and training:** {', '.join(options)}. These rates say how "
+        "methods compare under these settings; they do not reproduce the paper's numbers."
+    )
+
+
+def _difference_section(group: Sequence[Series]) -> str:
+    if len(group) < 2:
+        return ""
+    table = _table(
+        ["experiment", f"difference to {label_of(group[0].experiment)}, in points [95 %]"],
+        [
+            [label_of(series.experiment), _estimate_text(estimate)]
+            for series, _, estimate in _differences(group)
+        ],
+    )
+    return (
+        f"\nDifferences of success there, paired by task, with intervals by bootstrap over tasks:\n\n{table}"
+    )
+
+
+def _novelty_section(group: Sequence[Series]) -> str:
+    shares = {series.experiment: _by_novelty(series) for series in group}
+    columns = [name for name in NOVELTIES if any(name in found for found in shares.values())]
+    table = _table(
+        ["experiment", *(DESCRIPTIONS[name] for name in columns)],
+        [
+            [
+                label_of(experiment),
+                *(_share(found[name]) if name in found else "–" for name in columns),
+            ]
+            for experiment, found in shares.items()
+        ],
+    )
+    return (
+        "\nSuccess there, by whether the scenario's training tasks ask for the target (the oracle trains on "
+        f"the test tasks instead):\n\n{table}"
+    )
+
+
+def _object_section(group: Sequence[Series]) -> str:
+    outcomes = [by_object(series.last_episodes) for series in group]
+    indices = sorted({index for found in outcomes for index in found})
+    table = _table(
+        ["target", *(label_of(series.experiment) for series in group)],
+        [
+            [
+                f"{index} {find_label(index).name}",
+                *(_success_and_object(found[index]) if index in found else "–" for found in outcomes),
+            ]
+            for index in indices
+        ],
+    )
+    return (
+        "\nSuccess there for each object that is a target, and in how many episodes it was the one grasped "
+        f"last:\n\n{table}"
+    )
+
+
+def _success_and_object(outcomes: Mapping[str, Proportion]) -> str:
+    success = outcomes["success"]
+    return f"{_percent(success.rate)}, {_percent(outcomes['right_object'].rate)} (of {success.total})"
 
 
 def _rate_cells(series: Series) -> list[str]:
@@ -280,7 +450,7 @@ def _rate_cells(series: Series) -> list[str]:
         ", ".join(map(str, series.seeds)),
         rate_text(paper),
         f"{len(paper.best)} of {len(series.steps)} sets",
-        last_text(series.last),
+        last_text(series),
         f"{series.steps[-1]:,}",
         "–" if published is None else f"{_percent(published.rate)} ({_percent(published.sd)})",
     ]
@@ -291,10 +461,13 @@ def rate_text(paper: PaperRate) -> str:
     return f"{_percent(paper.rate)} ({_percent(paper.sd)})"
 
 
-def last_text(last: Proportion) -> str:
-    """A rate in % with its interval, such as "24.1 [20.9, 27.6]"."""
-    low, high = last.interval or (None, None)
-    return f"{_percent(last.rate)} [{_percent(low)}, {_percent(high)}]"
+def last_text(series: Series) -> str:
+    """The rate at the last step that counts in %, with its interval over tasks: "24.1 [20.9, 27.6]"."""
+    return _estimate_text(mean_rate(series.last_task_rates))
+
+
+def _estimate_text(estimate: Estimate) -> str:
+    return f"{_percent(estimate.value)} [{_percent(estimate.low)}, {_percent(estimate.high)}]"
 
 
 def _group_name(kind: str, word: str) -> str:
@@ -334,7 +507,7 @@ def _counterfactual_section(group: Sequence[Series]) -> str:
         parts.append(
             f"### {series.name}\n\n"
             f"Step {series.steps[-1]:,}, {counted('seed', series.seeds)}; "
-            f"success {last_text(series.last)}.\n\n{table}"
+            f"success {last_text(series)}.\n\n{table}"
         )
     return "\n".join(parts)
 

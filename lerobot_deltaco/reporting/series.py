@@ -23,6 +23,7 @@ from lerobot_deltaco.evaluation.record import (
 )
 from lerobot_deltaco.reporting.paper_results import in_order
 from lerobot_deltaco.reporting.statistics import Proportion, unknown_sentences
+from lerobot_deltaco.reporting.task_bootstrap import task_rates
 
 # Of a policy's configuration: what may differ between the runs of an experiment.
 _OPTIONS_OF_A_RUN = {"seed", "device", "pretrained_path", "demo_root", "repo_id", "push_to_hub"}
@@ -108,6 +109,11 @@ class Series:
             for seed in self.seeds
             for episode in read_record(self.runs[seed][self.steps[-1]].path).episodes
         ]
+
+    @cached_property
+    def last_task_rates(self) -> dict[int, float]:
+        """Success rate of each task at the last step that counts, 0..1, over the episodes of all seeds."""
+        return task_rates(self.last_episodes)
 
     @property
     def sets(self) -> list[EvaluationSet]:

@@ -109,7 +109,7 @@ OUTCOMES = MappingProxyType[str, Callable[[EpisodeResult], bool]](
         "right_object_and_container": lambda episode: episode.right_object and episode.right_container,
     }
 )
-KINDS = ("name", "color", "shape")
+KINDS = ("name", "color", "shape")  # of the paper's tasks
 WORDS = ("color_word", "position_word")
 
 
@@ -144,6 +144,19 @@ def breakdown(episodes: Sequence[EpisodeResult]) -> list[BreakdownRow]:
             }
             rows.append(BreakdownRow(kind, word, outcomes))
     return rows
+
+
+def by_object(episodes: Sequence[EpisodeResult]) -> dict[int, dict[str, Proportion]]:
+    """For each object that was a target, by its index: in how many episodes each of `OUTCOMES` came about."""
+    groups: dict[int, list[EpisodeResult]] = {}
+    for episode in episodes:
+        groups.setdefault(episode.objects[episode.target_object], []).append(episode)
+    return {
+        index: {
+            name: Proportion(sum(map(came_about, group)), len(group)) for name, came_about in OUTCOMES.items()
+        }
+        for index, group in sorted(groups.items())
+    }
 
 
 def _word_kind(episode: EpisodeResult) -> str:
