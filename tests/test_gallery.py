@@ -11,7 +11,8 @@ from PIL import Image
 
 from gym_deltaco import gallery
 from gym_deltaco.atomic_files import atomic_write
-from gym_deltaco.gallery import Episode, object_views
+from gym_deltaco.gallery import Episode, draw_random_objects, object_views
+from gym_deltaco.object_sets import select_objects
 from gym_deltaco.objects import object_model
 from gym_deltaco.sheets import caption, down
 from gym_deltaco.simulation import Simulation
@@ -40,6 +41,31 @@ def folder(tmp_path_factory):
 
 def test_there_are_the_images_and_the_page_and_nothing_half_written(folder):
     assert {path.name for path in folder.iterdir()} == IMAGES | {"index.md"}
+
+
+def test_random_objects_are_drawn_if_asked_for(tmp_path):
+    simulation = Simulation()
+    labels = [label for label in select_objects("random:27") if label.index >= len(OBJECTS)]
+    ticks = []
+    figure = draw_random_objects(tmp_path, labels, simulation, lambda: ticks.append(1))
+    simulation.close()
+    assert len(ticks) == len(labels) == 3
+    assert "3 random objects" in figure.text
+    with Image.open(tmp_path / figure.file) as image:
+        assert len(image.convert("RGB").getcolors(1 << 24)) > 50
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--objects", "random:9"], "random:N with N from 24"), (["--tasks", "1000"], "Task 1000 asks for")],
+)
+def test_objects_that_there_are_not_end_in_one_line(tmp_path, capsys, arguments, message):
+    with pytest.raises(SystemExit):
+        main(["--out", str(tmp_path / "new"), *arguments])
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("name", sorted(IMAGES))

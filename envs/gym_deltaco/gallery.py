@@ -21,6 +21,7 @@ from gym_deltaco.expert import expert_episode
 from gym_deltaco.fixtures import TABLE_BOXES, TRAY_BOXES, table_mesh, tray_mesh
 from gym_deltaco.layout import Ambiguity, Layout, twin_word
 from gym_deltaco.objects import ObjectModel, object_model
+from gym_deltaco.random_objects import random_model
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.sheets import (
     ACCENT,
@@ -39,7 +40,7 @@ from gym_deltaco.sheets import (
     to_image,
 )
 from gym_deltaco.simulation import Simulation, camera_matrices
-from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, Task, get_task
+from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, ObjectLabel, Task, get_task
 from gym_deltaco.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 
 N_EPISODES = 3
@@ -96,7 +97,9 @@ class Figure(NamedTuple):
     text: str
 
 
-def draw_gallery(out: Path, seed: int, task_ids: Sequence[int], max_scenes: int) -> None:
+def draw_gallery(
+    out: Path, seed: int, task_ids: Sequence[int], max_scenes: int, random_objects: Sequence[ObjectLabel] = ()
+) -> None:
     """Draws all images, and the page `index.md`, which links to them, last.
 
     Args:
@@ -104,6 +107,7 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int], max_scenes: int)
         seed: Seed of the scenes.
         task_ids: Tasks whose scenes are shown; of some, an episode of the expert too.
         max_scenes: Greatest number of tasks; so many are drawn at random from more.
+        random_objects: Random objects that are drawn too.
 
     Raises:
         OSError: The folder cannot be made or written to.
@@ -113,7 +117,7 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int], max_scenes: int)
         pass  # so that a folder that cannot be written to is an error before anything is drawn
     shown = _drawn(task_ids, max_scenes, seed)
     recorded = shown[:: max(1, len(shown) // N_EPISODES)][:N_EPISODES]
-    n_updates = len(OBJECTS) + len(shown) + len(recorded) + 2
+    n_updates = len(OBJECTS) + len(random_objects) + len(shown) + len(recorded) + 2
     progress = tqdm(total=n_updates, desc="gallery", unit="image")
     with progress, closing(Simulation()) as simulation:
         cells = []
@@ -128,6 +132,8 @@ def draw_gallery(out: Path, seed: int, task_ids: Sequence[int], max_scenes: int)
             *draw_episodes(out, seed, recorded, progress.update),
             draw_ambiguity(out, seed, progress.update),
         ]
+        if random_objects:
+            figures.append(draw_random_objects(out, random_objects, simulation, progress.update))
     write_text(out / "index.md", page(figures))
 
 
@@ -177,6 +183,33 @@ def draw_objects_by_name(out: Path, cells: Sequence[Image.Image]) -> Figure:
     file = "objects_by_name.png"
     save_png(framed(grid(cells, _N_COLUMNS, gap=GAP), thickness=GAP), out / file)
     return Figure(file, "Objects by name", f"All 32 objects, by number. {_OBJECTS_TEXT}")
+
+
+def draw_random_objects(
+    out: Path, labels: Sequence[ObjectLabel], simulation: Simulation, tick: Callable[[], object]
+) -> Figure:
+    """Random objects, by shape."""
+    groups = []
+    for shape in SHAPES:
+        cells = []
+        for label in labels:
+            if label.shape == shape:
+                close_up, crop = object_views(simulation, random_model(label.index))
+                width = close_up.width + crop.width + 4
+                name = caption(f"{label.index}  {label.color}", width, size=14)
+                cells.append(down([across([close_up, crop], gap=4, align="end"), name], gap=2))
+                tick()
+        if cells:
+            heading = caption(f"{shape} ({len(cells)})", width=cells[0].width, size=20)
+            group = down([heading, grid(cells, _N_COLUMNS, gap=GAP)], gap=4)
+            groups.append((min(len(cells), _N_COLUMNS), group))
+    shelves = [across(shelf, gap=GAP) for shelf in _shelves(groups)]
+    save_png(framed(down(shelves, gap=2 * GAP), thickness=GAP), out / "random_objects.png")
+    text = (
+        f"{len(labels)} random objects, by shape, with the color that instructions call them by. None has "
+        "both the shape and the color of a test object of scenario A."
+    )
+    return Figure("random_objects.png", "Random objects", text)
 
 
 def object_cell(simulation: Simulation, model: ObjectModel) -> Image.Image:

@@ -363,8 +363,8 @@ def _bowl(rng: np.random.Generator) -> _Form:
     if variant == "oblong":
         x, y, height = _between(rng, 18, 22.5), _between(rng, 27, 42), _between(rng, 20, 38)
         foot = _between(rng, 0.65, 0.85)
-        outside = [((x * foot, y * foot), 0), ((x, y), height - 12), ((x, y), height)]
-        inside = [((x - 4, y - 5), height), ((x * 0.5, y * 0.6), 8)]
+        outside: list[Row] = [((x * foot, y * foot), 0), ((x, y), height - 12), ((x, y), height)]
+        inside: list[Row] = [((x - 4, y - 5), height), ((x * 0.5, y * 0.6), 8)]
         yaw = 0.2 if y > 33 else 0.3
         return _Form(_ROUNDED, _ROUNDED, outside, (height - 12, height), inside, yaw=yaw)
     outlines = _round_outlines(rng)

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, select_objects
+from gym_deltaco.random_objects import FIRST_INDEX
 from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.commands.command_errors import exit_on_error
 
@@ -28,15 +30,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         fail(f"--seed must be at least 0. Got {options.seed}.")
     try:
         task_ids = select_tasks(options.tasks)
+        check_scenes(task_ids, "all", ADVERSARIAL_PROBABILITY)
     except ValueError as error:
         fail(f"--tasks: {error}")
+    try:
+        labels = select_objects(options.objects)
+    except ValueError as error:
+        fail(f"--objects: {error}")
+    random_objects = [label for label in labels if label.index >= FIRST_INDEX]
     if options.out.exists() and not options.out.is_dir():
         fail(f"--out must be a folder. {options.out} is a file.")
     with exit_on_error(parser, interrupted="Interrupted."):
         from gym_deltaco.gallery import draw_gallery  # imports the simulator
 
         try:
-            draw_gallery(options.out, options.seed, task_ids, MAX_SCENES)
+            draw_gallery(options.out, options.seed, task_ids, MAX_SCENES, random_objects)
         except OSError as error:
             fail(f"cannot write to {options.out}: {error.strerror or error}.")
     sys.stdout.write(f"The images are in {options.out}. Start with {options.out / 'index.md'}.\n")
@@ -59,6 +67,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="SELECTION",
         help="tasks to show: task set, such as scenario_a_test, or indices and ranges of 0 to 299, such as "
         f"4,50-73; {MAX_SCENES} tasks are drawn at random from a larger selection (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--objects",
+        default="all",
+        metavar="SET",
+        help="set of objects whose random ones are drawn too: random:N, which has N - 24 of them "
+        "(default: %(default)s, which has none)",
     )
     return parser
 
