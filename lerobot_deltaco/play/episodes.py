@@ -9,14 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 import torch
 from lerobot.envs.utils import preprocess_observation
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gym_deltaco import ENV_ID, EPISODE_STEPS
+from gym_deltaco import EPISODE_STEPS
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.seeding import episode_seed
@@ -34,7 +33,6 @@ MAX_SEED = 2**32 - 1
 MAX_SENTENCE = 200  # characters
 RENDER_SIZE = 288  # px, of the images for people
 _CAMERA = "observation.image"
-_SPLIT = "evaluation"
 
 
 class Scene(NamedTuple):
@@ -130,7 +128,7 @@ def view_scene(scene: Scene) -> SceneView:
     with closing(_environment(scene)) as env:
         _, info = env.reset(seed=_seed(scene))
         objects = tuple(OBJECTS[index].name for index in info["objects"])
-        return SceneView(env.unwrapped.render(), objects, info)
+        return SceneView(env.scene.render(RENDER_SIZE), objects, info)
 
 
 def other_instruction(view: SceneView, current: str, rng: random.Random) -> str:
@@ -262,16 +260,16 @@ class Player:
                 view = self._explain(observation, demonstration, goals)
                 self.policy.reset()
                 action = self._act(observation, sentence)
-            yield Moment(env.unwrapped.render(), view, f"0 of {EPISODE_STEPS} steps")
+            yield Moment(env.scene.render(RENDER_SIZE), view, f"0 of {EPISODE_STEPS} steps")
             reached = -1
             for step in range(1, EPISODE_STEPS + 1):
                 if reached < 0 and action[3] <= 0:
-                    reached = _nearest_object(env.unwrapped)
+                    reached = _nearest_object(env)
                 observation, _, _, _, info = env.step(action)
                 text = f"{step} of {EPISODE_STEPS} steps"
                 if step == EPISODE_STEPS:
                     text = outcome(info, reached)
-                yield Moment(env.unwrapped.render(), view, text)
+                yield Moment(env.scene.render(RENDER_SIZE), view, text)
                 if step < EPISODE_STEPS:
                     action = self._act(observation, sentence)
 
@@ -287,12 +285,12 @@ class Player:
         task = get_task(scene.task_id)
         with closing(_environment(scene, self._camera_size)) as env:
             frames = []
-            for number, step in enumerate(expert_episode(env.unwrapped, task.index, _seed(scene)), start=1):
+            for number, step in enumerate(expert_episode(env, task.index, _seed(scene)), start=1):
                 frames.append(step.observation["pixels"])
                 text = f"Expert, {number} of {EPISODE_STEPS} steps: {step.stage.value}"
                 if number == EPISODE_STEPS:
                     text = f"Expert. {outcome(step.info, -1)}"
-                yield Moment(env.unwrapped.render(), None, text)
+                yield Moment(env.scene.render(RENDER_SIZE), None, text)
         kept = kept_frame_indices(0, len(frames) - 1, self.policy.config.n_demo_frames).tolist()
         images = torch.from_numpy(np.stack([frames[index] for index in kept])).permute(0, 3, 1, 2)
         images = resize_images(images, self.policy.config.image_size)
@@ -380,19 +378,12 @@ def _demonstrated_by(
         policy.eval_demonstrations = own
 
 
-def _environment(scene: Scene, image_size: int = 48) -> gym.Env:
-    return gym.make(
-        ENV_ID,
-        disable_env_checker=True,
-        task_id=scene.task_id,
-        image_size=image_size,
-        render_mode="rgb_array",
-        render_size=RENDER_SIZE,
-    )
+def _environment(scene: Scene, image_size: int = 48) -> PickPlaceEnv:
+    return PickPlaceEnv(scene.task_id, image_size=image_size)
 
 
 def _seed(scene: Scene) -> int:
-    return episode_seed(scene.seed, _SPLIT, scene.task_id, 0)
+    return episode_seed(scene.seed, "evaluation", scene.task_id, 0)
 
 
 def _nearest_object(env: PickPlaceEnv) -> int:
