@@ -807,7 +807,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         # Demonstrations named on the command line come before those of the checkpoint.
         if self.eval_demonstrations is None:
             frames, episodes, tasks, target_objects = contents.demonstrations
-            known = DemonstrationSet(frames, tasks, episodes, target_objects)
+            known = DemonstrationSet(frames, tasks, episodes.tolist(), target_objects)
             self.eval_demonstrations = known.to(self.config.device)
 
 

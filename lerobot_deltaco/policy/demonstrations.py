@@ -57,7 +57,8 @@ class DemonstrationSet(torch.nn.Module):
     _order: Tensor
     _start: Tensor
     _place: Tensor
-    _row_of_episode: Tensor
+    _ascending: Tensor
+    _row_of_place: Tensor
 
     def __init__(
         self,

@@ -99,7 +99,7 @@ def read_task_file(path: Path) -> TaskFile:
     if _EMBEDDINGS not in tensors:
         raise _error(path, f"the tensor `{_EMBEDDINGS}` is missing")
     encoder = known.get("language_encoder")
-    if encoder not in LANGUAGE_ENCODERS:
+    if encoder is None or encoder not in LANGUAGE_ENCODERS:
         known_encoders = ", ".join(LANGUAGE_ENCODERS)
         raise _error(path, f"`language_encoder` must be one of {known_encoders}, not {encoder!r}")
     instructions = _strings(path, known, "instructions")
