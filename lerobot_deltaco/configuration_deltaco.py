@@ -10,10 +10,12 @@ from typing import NamedTuple
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
+from gym_deltaco.instructions import INSTRUCTION_SPLITS
 from lerobot_deltaco.common.checks import check_choices
 from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.data.feature_names import ACTION_NAMES
 from lerobot_deltaco.policy.language_encoders import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS, VISION_INPUTS
 from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAdamWConfig
 
 
@@ -65,15 +67,30 @@ BACKBONES = MappingProxyType(
     }
 )
 CORRESPONDENCE = "correspondence"
-DEMO_ENCODERS = ("cnn", "attention", CORRESPONDENCE)
+DEMO_ENCODERS = ("cnn", "attention", CORRESPONDENCE, "pretrained")
 GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
+DEMO_CROPS = ("array", "frame")
+FRAMES_BETWEEN = ("spread", "any")
+INITIAL_WEIGHTS = ("authors", "torch")
 SCHEDULERS = ("constant", "cosine")
 DTYPES = ("float32", "bfloat16")
+# Options that may be files and folders of this machine.
+PATHS = (
+    "demo_root",
+    "instruction_embeddings",
+    "instructions",
+    "vision_encoder",
+    "vision_encoder_weights",
+    "demo_features_dir",
+)
 # The least and the greatest valid value. Beyond them, memory would not do, or arithmetic would overflow.
 RANGES = MappingProxyType(
     {
         "demo_rows": (1, 64),
         "demo_columns": (1, 64),
+        "vision_image_size": (16, 4096),
+        "demo_variants": (1, 1000),
+        "demo_feature_dim": (1, 1_000_000),
         "image_size": (16, 1024),
         "motion_modes": (1, 1000),
         "gripper_weight": (0, 1e6),
@@ -93,6 +110,7 @@ RANGES = MappingProxyType(
         "seed": (0, 2**63 - 1),
         "optimizer_lr": (1e-12, 10),
         "optimizer_weight_decay": (0, 1e3),
+        "optimizer_l2": (0, 1e3),
         "scheduler_warmup_steps": (0, 1_000_000_000),
         "grad_clip_norm": (0, 1e6),
     }
@@ -120,11 +138,37 @@ class DeltacoConfig(PreTrainedConfig):
         instruction_embeddings: A file with embeddings of instructions, which are then not computed: a
             checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
             language model.
+        instructions: CSV file with sentences in people's own words for the benchmark's tasks, as
+            `deltaco-instructions` fetches or checks it. In training, each sample's instruction is drawn from
+            those of its task. In evaluation, each sentence has the demonstrations of its task.
+        instructions_split: Which of the file's sentences are trained on: train, those that are held out for
+            no task; held_out, the last one of each task; or all.
+        instructions_templates: Whether the task string itself is trained on, too, as often as each sentence.
+        language_head: Sizes of the hidden layers of fully connected layers behind the language encoder, whose
+            output has unit length, such as [512]; none by default. MCIL always has such layers; the authors'
+            are [384], its default.
+        normalize_language: Whether instructions' embeddings are scaled to unit length, as in the paper. (The
+            authors' code does so only where an encoder loss compares them with demonstrations.)
         demo_encoder: Encoder of demonstrations. cnn: the paper's. attention (ours): compares the frames at
             each place, and attends to a few places. correspondence (ours): no embedding; what the
             demonstration moved is looked for in the scene, the instruction says where it goes, and the policy
             is given both places as goals. It needs a camera that does not move, a robot state, and a gripper;
             without demonstrations (language_only, one_hot), the method's other input says what to look for.
+            pretrained: a frozen image encoder.
+        vision_encoder: Which one, for `demo_encoder=pretrained`: clip-vit-base-patch32, r3m-resnet18,
+            r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0 (which the extra
+            `offline` brings, without a network), a folder with an image model of transformers, or its name on
+            the Hugging Face Hub.
+        vision_encoder_weights: A file with R3M's weights, which are otherwise downloaded.
+        vision_image_size: Height and width to which the array of a demonstration's frames is scaled for that
+            encoder; by default, that of the images it was trained on.
+        vision_input: published, or authors: R3M gets images in 0..1 instead of 0..255, not scaled to 224, as
+            in the authors' code.
+        demo_variants: With a pretrained encoder, how many variants of a demonstration are encoded before
+            training (random crops, and random frames between the ends), of which each sample gets one.
+        demo_features_dir: Folder where those features are kept for further trainings; none by default.
+        demo_head: Sizes of the hidden layers of fully connected layers behind a pretrained encoder, such as
+            [256]; by default, there are no layers at all.
         demo_rows: m, rows of the array of a demonstration's frames.
         demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
             (For the attention, which has no array, they are m n frames.)
@@ -154,6 +198,10 @@ class DeltacoConfig(PreTrainedConfig):
             not count: their demonstrations are recolored apart from the scene.
         frames_after_release: With `deltaco-train`, the number of frames that are trained on after the gripper
             has last opened in an episode, instead of leaving out the last `drop_n_last_frames`; None for all.
+        demo_crop: What of a demonstration is shifted, where its frames are laid out in an array (`cnn` and
+            `pretrained`): the array, as in the authors' code, or each frame.
+        demo_frames_between: Which frames there are between the first and the last: spread, one of each of as
+            many equal parts of the time between, as in the authors' code; or any, drawn independently.
         demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at
             least 2, so that none gets its own episode; 0 for a new one for every sample. Sharing
             saves most of the demonstration encoder's time.
@@ -161,6 +209,7 @@ class DeltacoConfig(PreTrainedConfig):
         demo_root: Folder of that dataset, if it is not in LeRobot's cache.
         demo_episode: Its one episode that shows the task whatever the instruction; for paraphrases and for
             sentences of one's own.
+        demo_task: Task string whose demonstrations are used whatever the instruction; for the same.
         demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default, those
             that are trained on.
         drop_n_last_frames: How many of the last frames of each episode are not trained on.
@@ -169,11 +218,15 @@ class DeltacoConfig(PreTrainedConfig):
         upsampled_tasks: With `deltaco-train`, a regular expression; the tasks in which it is found get
             `upsampled_share` of each batch.
         upsampled_share: See above; the paper's scenario B has 0.5.
+        initial_weights: authors, those of the authors' code (`policy/initial_weights.py`), or torch, those of
+            PyTorch. By default, the authors' for the paper's backbone.
         seed: Seed of the draws of demonstrations and crops, which also depend on the step.
         dtype: Precision of the networks: float32 or bfloat16; their last layers always use float32.
         compile: Whether to compile the networks, which makes training on a GPU faster.
         optimizer_lr: Learning rate of Adam.
         optimizer_weight_decay: Weight decay, as in AdamW.
+        optimizer_l2: Weight of an L2 penalty in Adam's gradients, instead of that decay. (The authors' code:
+            1e-4; the paper names none.)
         scheduler_name: Schedule of the learning rate: constant, or cosine, which decays to 0.
         scheduler_warmup_steps: Number of steps of the cosine schedule's warmup.
         grad_clip_norm: Maximum norm of the gradient; 0 does not clip.
@@ -185,7 +238,19 @@ class DeltacoConfig(PreTrainedConfig):
     encoder_loss: str | None = None
     language_encoder: str = DEFAULT_LANGUAGE_ENCODER
     instruction_embeddings: str | None = None
+    instructions: str | None = None
+    instructions_split: str = "train"
+    instructions_templates: bool = False
+    language_head: list[int] | None = None
+    normalize_language: bool = True
     demo_encoder: str = "cnn"
+    vision_encoder: str = "clip-vit-base-patch32"
+    vision_encoder_weights: str | None = None
+    vision_image_size: int | None = None
+    vision_input: str = "published"
+    demo_variants: int = 8
+    demo_features_dir: str | None = None
+    demo_head: list[int] | None = None
     demo_rows: int = 1
     demo_columns: int = 2
     image_size: int = 48
@@ -205,20 +270,25 @@ class DeltacoConfig(PreTrainedConfig):
     recolor_share: float = 0.0
     color_blind_tasks: str | None = None
     frames_after_release: int | None = None
+    demo_crop: str = "array"
+    demo_frames_between: str = "spread"
     demos_per_task: int = 0
     demo_repo_id: str | None = None
     demo_root: str | None = None
     demo_episode: int | None = None
+    demo_task: str | None = None
     demo_episodes: list[int] | None = None
     drop_n_last_frames: int = 0
     tasks_per_batch: int = 0
     upsampled_tasks: str | None = None
     upsampled_share: float = 0.5
+    initial_weights: str | None = None
     seed: int = 0
     dtype: str = "float32"
     compile: bool = False
     optimizer_lr: float = 3e-4
     optimizer_weight_decay: float = 0.0
+    optimizer_l2: float = 0.0
     scheduler_name: str = "constant"
     scheduler_warmup_steps: int = 0
     grad_clip_norm: float = 0.0
@@ -230,20 +300,28 @@ class DeltacoConfig(PreTrainedConfig):
             "ACTION": NormalizationMode.MIN_MAX,
         }
     )
-    # Found out from the datasets, and saved with the checkpoint.
+    # Found out from the datasets and the pretrained encoder, and saved with the checkpoint.
     one_hot_tasks: list[str] = field(default_factory=list)
+    demo_feature_dim: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("demo_root", "instruction_embeddings"):
+        for name in PATHS:
             if isinstance(getattr(self, name), Path):
                 setattr(self, name, str(getattr(self, name)))
         check_field_types(self)
+        if self.initial_weights is None:
+            self.initial_weights = "authors" if self.backbone == "paper" else "torch"
         check_choices(
             self,
             method=METHODS,
             language_encoder=LANGUAGE_ENCODERS,
+            instructions_split=INSTRUCTION_SPLITS,
             demo_encoder=DEMO_ENCODERS,
+            vision_input=VISION_INPUTS,
+            demo_crop=DEMO_CROPS,
+            demo_frames_between=FRAMES_BETWEEN,
+            initial_weights=INITIAL_WEIGHTS,
             backbone=BACKBONES,
             gripper_loss=GRIPPER_LOSSES,
             scheduler_name=SCHEDULERS,
@@ -258,6 +336,10 @@ class DeltacoConfig(PreTrainedConfig):
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
             raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
         check_ranges(self, RANGES)
+        if self.optimizer_l2 and self.optimizer_weight_decay:
+            raise ValueError(
+                "`optimizer_l2` and `optimizer_weight_decay` exclude each other. Set one of them to 0."
+            )
         if self.demos_per_task == 1:
             raise ValueError(
                 "`demos_per_task` cannot be 1: samples of that episode would be demonstrated by themselves. "
@@ -270,6 +352,7 @@ class DeltacoConfig(PreTrainedConfig):
             )
         self._check_upsampling()
         self._check_conditioning()
+        self._check_pretrained()
 
     def _check_upsampling(self) -> None:
         for name in ("upsampled_tasks", "color_blind_tasks"):
@@ -287,6 +370,32 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 "`upsampled_tasks` get a share of the tasks of a batch: `tasks_per_batch` must be at least "
                 f"2. Got {self.tasks_per_batch}."
+            )
+
+    def _check_pretrained(self) -> None:
+        if self.demo_head is not None and self.demo_encoder != "pretrained":
+            raise ValueError(
+                "`demo_head` are layers behind a pretrained encoder. Leave it out, or set `demo_encoder` to "
+                f"'pretrained'. Got {self.demo_encoder!r}."
+            )
+        if self.demo_encoder == "pretrained" and self.demo_feature_dim is None:
+            spec = VISION_ENCODERS.get(self.vision_encoder)
+            self.demo_feature_dim = None if spec is None else spec.feature_dim
+        self.check_demo_dim()
+
+    def check_demo_dim(self) -> None:
+        """Checks that embeddings of demonstrations have the size that the method needs.
+
+        Raises:
+            ValueError: They are compared with embeddings of instructions, which have another size.
+        """
+        if not self.uses_demo or self.demo_dim in (None, self.embedding_dim):
+            return
+        if self.conditioning.encoder_loss != "none" or self.method == "mcil":
+            raise ValueError(
+                f"The demonstrations' embeddings, of {self.vision_encoder!r}, have {self.demo_dim} numbers, "
+                f"and the instructions' have {self.embedding_dim}. To compare them, give `demo_head` layers, "
+                "such as [256]; or set `encoder_loss` to 'none'."
             )
 
     def _check_conditioning(self) -> None:
@@ -370,6 +479,18 @@ class DeltacoConfig(PreTrainedConfig):
     def embedding_dim(self) -> int:
         """Size of a task embedding: the language encoder's."""
         return LANGUAGE_ENCODERS[self.language_encoder].embedding_dim
+
+    @property
+    def demo_dim(self) -> int | None:
+        """Size of a demonstration's embedding; None until a pretrained encoder has been loaded."""
+        if self.demo_encoder == "pretrained" and self.demo_head is None:
+            return self.demo_feature_dim
+        return self.embedding_dim
+
+    @property
+    def has_unit_language(self) -> bool:
+        """Whether instructions' embeddings are scaled to unit length: always, where a loss compares them."""
+        return self.normalize_language or self.conditioning.encoder_loss != "none"
 
     @property
     def gripper_index(self) -> int | None:
@@ -467,6 +588,7 @@ class DeltacoConfig(PreTrainedConfig):
         return FusedAdamWConfig(
             lr=self.optimizer_lr,
             weight_decay=self.optimizer_weight_decay,
+            l2=self.optimizer_l2,
             grad_clip_norm=self.grad_clip_norm,
         )
 

@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,8 +23,9 @@ from torch import Tensor, nn
 
 from lerobot_deltaco.cards.policy_card import policy_card
 from lerobot_deltaco.configuration_deltaco import BACKBONES, GOAL_SOURCES, DeltacoConfig
+from lerobot_deltaco.data.paraphrases import read_paraphrases
 from lerobot_deltaco.policy.correspondence import GoalLocator, goal_loss
-from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
+from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder, crop_array
 from lerobot_deltaco.policy.demonstration_choice import (
     choose_episode,
     choose_eval_demonstrations,
@@ -38,8 +40,11 @@ from lerobot_deltaco.policy.demonstrations import (
     load_robot_data,
 )
 from lerobot_deltaco.policy.finite_loss import FiniteLoss, check_weights_to_save, non_finite_weight
+from lerobot_deltaco.policy.frozen_features import FrozenFeatures, Variants
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals, GoalConditioning
+from lerobot_deltaco.policy.heads import UnitHead
 from lerobot_deltaco.policy.inference import FoldedPolicy
+from lerobot_deltaco.policy.initial_weights import initialize_demo_encoder, initialize_policy
 from lerobot_deltaco.policy.language import InstructionTable
 from lerobot_deltaco.policy.losses import (
     contrastive_logits,
@@ -50,6 +55,7 @@ from lerobot_deltaco.policy.losses import (
 )
 from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop, random_shifts, shift_images
+from lerobot_deltaco.policy.paraphrases import Paraphrases
 from lerobot_deltaco.policy.processor_files import check_processor_files
 from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
 from lerobot_deltaco.policy.scalars import LoggedScalars
@@ -60,6 +66,7 @@ from lerobot_deltaco.policy.task_file import (
     StoredDemonstrations,
     TaskFile,
     check_demonstrations,
+    check_features,
     find_task_file,
     hub_options,
     read_task_file,
@@ -67,6 +74,7 @@ from lerobot_deltaco.policy.task_file import (
 )
 from lerobot_deltaco.policy.training_episodes import training_episodes
 from lerobot_deltaco.policy.training_goals import TrainingGoals, find_training_goals
+from lerobot_deltaco.policy.vision import load_vision_encoder
 
 logger = logging.getLogger(__name__)
 
@@ -115,6 +123,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         self.eval_demonstrations: DemonstrationSet | None = None
         self.train_demonstrations: DemonstrationSet | None = None
         self.train_goals: TrainingGoals | None = None
+        self.paraphrases = _read_paraphrases(config)
         self._train_demonstrations_are_complete = False  # whether they surely include every training episode
         self._demonstrated_as: Mapping[str, str] = {}
         self._episode_tasks = EpisodeTasks()
@@ -123,12 +132,14 @@ class DeltacoPolicy(PreTrainedPolicy):
         if config.method == "one_hot" and not config.one_hot_tasks:
             config.one_hot_tasks = self._one_hot_vocabulary()
 
+        self._frozen = self._make_frozen_encoder()
         film, concat, encoder_loss = config.conditioning
+        demo_dim = config.demo_dim or 0
         dims = {
             "none": 0,
-            "demo": config.embedding_dim,
+            "demo": demo_dim,
             "language": config.embedding_dim,
-            "demo+language": 2 * config.embedding_dim,
+            "demo+language": demo_dim + config.embedding_dim,
             "language_or_demo": config.embedding_dim,
             "one_hot": len(config.one_hot_tasks),
         }
@@ -151,10 +162,11 @@ class DeltacoPolicy(PreTrainedPolicy):
             self._make_demo_encoder() if config.uses_demo and not config.locates_goals else None
         )
         self.goals = self._make_goal_conditioning(state_dim) if config.locates_goals else None
-        # MCIL brings both modalities into one space.
-        self.project_language = (
-            nn.Linear(config.embedding_dim, config.embedding_dim) if config.method == "mcil" else None
-        )
+        self.language_head = self._make_language_head()
+        if config.initial_weights == "authors":
+            initialize_policy(self.model)
+            if isinstance(self.demo_encoder, ArrayEncoder):
+                initialize_demo_encoder(self.demo_encoder)
         # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
         if config.compile:
@@ -166,6 +178,10 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     def _make_demo_encoder(self) -> nn.Module:
         config = self.config
+        if config.demo_encoder == "pretrained":
+            assert config.demo_feature_dim is not None
+            assert config.demo_dim is not None
+            return UnitHead(config.demo_feature_dim, config.demo_head, config.demo_dim)
         if config.demo_encoder == "attention":
             return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
         size, stride = config.image_size, BACKBONES[config.backbone].demo_stride
@@ -177,6 +193,43 @@ class DeltacoPolicy(PreTrainedPolicy):
         if config.uses_language:
             condition_dim = config.embedding_dim
         return GoalConditioning(GoalLocator(*GOAL_SOURCES[config.method], condition_dim), state_dim)
+
+    def _make_frozen_encoder(self) -> FrozenFeatures | None:
+        config = self.config
+        if not config.uses_demo or config.demo_encoder != "pretrained":
+            return None
+        load = partial(
+            load_vision_encoder,
+            config.vision_encoder,
+            config.vision_encoder_weights,
+            config.vision_image_size,
+            config.vision_input,
+        )
+        variants = Variants(
+            config.n_demo_frames,
+            config.demo_rows,
+            config.demo_variants,
+            config.demo_crop_padding,
+            config.demo_crop == "array",
+            config.demo_frames_between == "spread",
+            config.seed,
+        )
+        folder = None if config.demo_features_dir is None else Path(config.demo_features_dir)
+        frozen = FrozenFeatures(load, variants, folder)
+        if config.demo_feature_dim is None:
+            config.demo_feature_dim = frozen.encoder.feature_dim
+            config.check_demo_dim()
+        return frozen
+
+    def _make_language_head(self) -> UnitHead | None:
+        """Layers behind the language encoder; MCIL brings both modalities into one space by them."""
+        config = self.config
+        hidden_dims = config.language_head
+        if config.method == "mcil" and hidden_dims is None:
+            hidden_dims = [config.embedding_dim]
+        if hidden_dims is None or not config.uses_language:
+            return None
+        return UnitHead(config.embedding_dim, hidden_dims, config.embedding_dim)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """All weights. The language encoder is frozen, and not among them."""
@@ -218,15 +271,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         if self.config.uses_demo:
             demo = self._train_demo_embeddings(batch["episode_index"], tasks, column, generator)
         if self.config.uses_language:
-            known = self.instructions(list(distinct), device)  # (distinct, embedding)
-            language = known[column]  # (batch, embedding)
+            known, language = self._language_embeddings(list(distinct), tasks, column, generator)
 
-        if self.project_language is not None:
-            # MCIL: the mean of the losses with the instruction's embedding and with the demonstration's.
-            parts = [
-                self._imitation_loss(batch, images, film, None)
-                for film in (self.project_language(language), demo)
-            ]
+        if self.config.method == "mcil":
+            # The mean of the losses with the instruction's embedding and with the demonstration's.
+            parts = [self._imitation_loss(batch, images, film, None) for film in (language, demo)]
             loss = torch.stack([part[0] for part in parts]).mean(dim=0)
             logged = {name: torch.stack([part[1][name] for part in parts]).mean() for name in parts[0][1]}
         else:
@@ -249,6 +298,32 @@ class DeltacoPolicy(PreTrainedPolicy):
             self._finite_loss.remember(loss, self._numbers_of(batch), self.step)
         return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
 
+    def _language_embeddings(
+        self, distinct: list[str], tasks: list[str], column: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Embeddings of the batch's tasks, (distinct, embedding), and of the samples', (batch, embedding).
+
+        With sentences in people's own words, each sample and each task has one drawn for it.
+        """
+        if self.paraphrases is None or not self.paraphrases.drawn:
+            known = self._embed_instructions(distinct, column.device)
+            return known, known[column]
+        known = self._embed_instructions(self._draw_instructions(distinct, generator), column.device)
+        return known, self._embed_instructions(self._draw_instructions(tasks, generator), column.device)
+
+    def _draw_instructions(self, tasks: Sequence[str], generator: torch.Generator) -> list[str]:
+        """The instruction of each sample: its task string, or a sentence in people's own words."""
+        if self.paraphrases is None or not self.paraphrases.drawn or not self.config.uses_language:
+            return list(tasks)
+        # All at once, the first time.
+        self.instructions.add(self.paraphrases.drawn_sentences)
+        return self.paraphrases.draw(tasks, generator)
+
+    def _embed_instructions(self, instructions: Sequence[str], device: torch.device) -> Tensor:
+        """Embeddings of instructions, (instructions, embedding)."""
+        embeddings = self.instructions(instructions, device, unit=self.config.has_unit_language)
+        return embeddings if self.language_head is None else self.language_head(embeddings)
+
     def _goal_forward(
         self, batch: dict[str, Any], tasks: Sequence[str], generator: torch.Generator, reduction: str
     ) -> tuple[Tensor, LoggedScalars]:
@@ -259,7 +334,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         """
         images = self._images(batch)
         n_samples, device = len(images), images.device
-        language = self.instructions(tasks, device) if self.config.uses_language else None
+        instructions = self._draw_instructions(tasks, generator)
+        language = self._embed_instructions(instructions, device) if self.config.uses_language else None
         demonstrations = self._training_demonstrations(device)
         assert self.train_goals is not None
         rows = demonstrations.episode_rows(batch["episode_index"])
@@ -272,7 +348,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             recolorings = random_recolorings(n_samples, self.config.recolor_share, generator)
             n_located = max(1, round(self.config.locator_share * n_samples))
             some = torch.arange(n_located) * n_samples // n_located
-            locator_loss = self._locator_loss(batch, tasks, rows, some, recolorings, generator)
+            locator_loss = self._locator_loss(batch, tasks, instructions, rows, some, recolorings, generator)
             places = places + self.config.goal_noise * torch.randn(places.shape, generator=generator).to(
                 device
             )
@@ -301,6 +377,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         self,
         batch: dict[str, Any],
         tasks: Sequence[str],
+        instructions: Sequence[str],
         rows: Tensor,
         some: Tensor,
         recolorings: Tensor,
@@ -310,7 +387,8 @@ class DeltacoPolicy(PreTrainedPolicy):
 
         Args:
             batch: As in `forward`.
-            tasks: Instruction of each sample.
+            tasks: Task string of each sample.
+            instructions: Instruction of each sample, in whatever words.
             rows: Rows of the samples' episodes among the demonstrations, (batch,).
             some: Which samples, on the CPU.
             recolorings: Changes of the samples' colors, (batch, 3, 3), on the CPU.
@@ -342,7 +420,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         with self._autocast(device):
             if config.uses_demo:
                 description = self.goals.locator.describe(frames)
-            logits = self.goals.locator(scenes, plain, description, self._goal_condition(some_tasks))
+            some_instructions = [instructions[sample] for sample in some.tolist()]
+            condition = self._goal_condition(some_instructions)
+            logits = self.goals.locator(scenes, plain, description, condition)
         loss = goal_loss(logits, places)
         return torch.where(self.train_goals.found[own][:, None], loss, 0.0)
 
@@ -350,7 +430,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         """The locator's condition for tasks, (tasks, condition)."""
         if self.config.method == "one_hot":
             return self._one_hot(tasks)
-        return self.instructions(tasks, self.step.device) if self.config.uses_language else None
+        return self._embed_instructions(tasks, self.step.device) if self.config.uses_language else None
 
     def _find_goals(self, scenes: Tensor, tasks: Sequence[str], trials: Sequence[int]) -> FoundGoals:
         """Finds the goals of tasks in scenes (batch, 3, H, W), by the demonstrations of these trials."""
@@ -558,12 +638,13 @@ class DeltacoPolicy(PreTrainedPolicy):
             generator = torch.Generator().manual_seed(self.config.seed)
             demo = self._encode_demo(demonstrations, rows, generator)
         if self.config.uses_language:
-            language = self.instructions(tasks, images.device)
-        if self.project_language is not None:
+            language = self._embed_instructions(tasks, images.device)
+        if self.config.method == "mcil":
+            assert language is not None
             assert demo is not None
-            # MCIL: the trials of a task use the instruction and the demonstration in turn.
+            # The trials of a task use the instruction and the demonstration in turn.
             by_language = torch.tensor(trials, device=images.device) % 2 == 0
-            either = torch.where(by_language[:, None], self.project_language(language), demo)
+            either = torch.where(by_language[:, None], language, demo)
             return TaskConditioning(tasks, either, None, self._acting_model())
         film, concat = self.conditioning_inputs(tasks, demo, language)
         return TaskConditioning(tasks, film, concat, self._acting_model(), goals)
@@ -575,7 +656,13 @@ class DeltacoPolicy(PreTrainedPolicy):
             chosen, rows = choose_episode(self.eval_demonstrations, self.config.demo_episode, len(tasks))
         else:
             candidates = (self.eval_demonstrations, self.train_demonstrations)
-            chosen, rows = choose_eval_demonstrations(candidates, tasks, trials, self._demonstrated_as)
+            demonstrated_as = dict(self._demonstrated_as)
+            if self.config.demo_task is not None:
+                demonstrated_as |= dict.fromkeys(tasks, self.config.demo_task)
+            if self.paraphrases is not None:
+                known = {name for candidate in candidates if candidate is not None for name in candidate.rows}
+                demonstrated_as = self.paraphrases.tasks_of(tasks, known) | demonstrated_as
+            chosen, rows = choose_eval_demonstrations(candidates, tasks, trials, demonstrated_as)
         if not self.training:
             self._episode_tasks.note_demonstrations(chosen.describe(rows))
         return chosen, rows
@@ -657,9 +744,19 @@ class DeltacoPolicy(PreTrainedPolicy):
     ) -> Tensor:
         """Unit embeddings of demonstrations, (batch, embedding)."""
         assert self.demo_encoder is not None
-        frames = demonstrations.sample_frames(rows, self.config.n_demo_frames, generator)
-        if self.training and self.config.demo_crop_padding:
-            frames = random_crop(frames, self.config.demo_crop_padding, generator)
+        if self._frozen is not None:
+            if self.training:
+                return self.demo_encoder(self._frozen.drawn(demonstrations, rows, generator))
+            return self.demo_encoder(self._frozen.plain(demonstrations, rows))
+        config = self.config
+        frames = demonstrations.sample_frames(
+            rows, config.n_demo_frames, generator, config.demo_frames_between == "spread"
+        )
+        if self.training and config.demo_crop_padding:
+            if config.demo_encoder == "cnn" and config.demo_crop == "array":
+                frames = crop_array(frames, config.demo_rows, config.demo_crop_padding, generator)
+            else:
+                frames = random_crop(frames, config.demo_crop_padding, generator)
         return self.demo_encoder(frames)
 
     def _split_action(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -706,7 +803,14 @@ class DeltacoPolicy(PreTrainedPolicy):
         check_weights_to_save(self, int(self.step))
         # LeRobot 0.6.1 may pass a `state_dict`, later versions do not; it is handed on as it comes.
         # What was read from these files is saved with the policy, whose next user has other files.
-        sources = ("demo_repo_id", "demo_root", "instruction_embeddings")
+        sources = (
+            "demo_repo_id",
+            "demo_root",
+            "instruction_embeddings",
+            "instructions",
+            "vision_encoder_weights",
+            "demo_features_dir",
+        )
         given = {name: getattr(self.config, name) for name in sources}
         try:
             for name in sources:
@@ -718,10 +822,14 @@ class DeltacoPolicy(PreTrainedPolicy):
         if not _is_main_process():
             return  # versions after 0.6.1 call this on every process
         contents = self.instructions.contents()
-        if self.eval_demonstrations is not None and self.config.uses_demo:
-            frames, episodes = self.eval_demonstrations.frames.cpu(), self.eval_demonstrations.episodes.cpu()
-            known = self.eval_demonstrations
-            stored = StoredDemonstrations(frames, episodes, known.tasks, known.target_objects)
+        if self.paraphrases is not None:
+            contents = contents._replace(paraphrases=self.paraphrases.known)
+        known = self.eval_demonstrations
+        if known is not None and self.config.uses_demo:
+            # With their features, the frozen encoder is not needed for them.
+            features = None if self._frozen is None else self._frozen.plain(known)
+            frames, episodes = known.frames.cpu(), known.episodes.cpu()
+            stored = StoredDemonstrations(frames, episodes, known.tasks, known.target_objects, features)
             contents = contents._replace(demonstrations=stored)
         write_task_file(save_directory / TASK_FILE, contents)
 
@@ -800,15 +908,28 @@ class DeltacoPolicy(PreTrainedPolicy):
     def _take_tasks(self, contents: TaskFile, path: Path) -> None:
         """Takes what the checkpoint knows of tasks."""
         self.instructions.take(contents, path)
+        if self.paraphrases is None and contents.paraphrases:
+            self.paraphrases = Paraphrases(contents.paraphrases)
         if contents.demonstrations is None:
             return
         n_kept = len(kept_frame_indices(0, 0, self.config.n_demo_frames))
         check_demonstrations(path, contents.demonstrations, self.config.image_size, n_kept)
         # Demonstrations named on the command line come before those of the checkpoint.
         if self.eval_demonstrations is None:
-            frames, episodes, tasks, target_objects = contents.demonstrations
+            frames, episodes, tasks, target_objects, features = contents.demonstrations
             known = DemonstrationSet(frames, tasks, episodes.tolist(), target_objects)
+            if features is not None and self._frozen is not None:
+                check_features(path, contents.demonstrations, self.config.demo_feature_dim)
+                known.features = features[:, None].half()
             self.eval_demonstrations = known.to(self.config.device)
+
+
+def _read_paraphrases(config: DeltacoConfig) -> Paraphrases | None:
+    if config.instructions is None:
+        return None
+    known = read_paraphrases(config.instructions)
+    drawn = read_paraphrases(config.instructions, config.instructions_split)
+    return Paraphrases(known, drawn, config.instructions_templates)
 
 
 def _process_rank() -> int:

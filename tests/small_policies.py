@@ -8,7 +8,9 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 from torch.utils.data import default_collate
 
+from lerobot_deltaco import modeling_deltaco
 from lerobot_deltaco.policy import language
+from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS
 
 REPO_ID = "test/foreign"
 TASKS = ["stack the cups", "pour the tea", "wave"]
@@ -35,6 +37,22 @@ def use_fake_encoder(monkeypatch):
     fake_encoder.calls = []
     monkeypatch.setattr(language, "load_language_encoder", fake_encoder)
     torch.manual_seed(0)
+
+
+class FakeVisionEncoder:
+    """As many features as the image encoder has, which are weights of the means of an image's colors."""
+
+    def __init__(self, name, *_):
+        self.feature_dim = VISION_ENCODERS[name].feature_dim
+        self.weights = torch.randn(3, self.feature_dim, generator=torch.Generator().manual_seed(0))
+
+    def __call__(self, images):
+        return images.mean(dim=(2, 3)) @ self.weights
+
+
+def use_fake_vision_encoder(monkeypatch):
+    """Puts it in the place of all frozen image encoders."""
+    monkeypatch.setattr(modeling_deltaco, "load_vision_encoder", FakeVisionEncoder)
 
 
 def write_dataset(root, episodes):

@@ -318,6 +318,7 @@ def test_every_policy_option_is_documented():
         "push_to_hub",
         "normalization_mapping",
         "one_hot_tasks",
+        "demo_feature_dim",
     }
     text = generated_pages.options(generated_pages.POLICY_OPTIONS, "--policy.")
     assert "`--policy.motion_modes` (int, default `1`)" in text

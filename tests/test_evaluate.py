@@ -213,9 +213,61 @@ def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder
     assert "belongs to another run: 'small/deltaco' with seed 7" in capsys.readouterr().err
 
 
+@pytest.fixture
+def sentences(tmp_path):
+    """A file with two sentences for each of two tasks."""
+    file = tmp_path / "sentences.csv"
+    rows = [f"{task},sentence {n} of {task}" for task in TASKS[:2] for n in range(2)]
+    file.write_text("\n".join(["task_id,instruction", *rows]))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("split", "expected"),
+    [("all", [0, 1, 0]), ("held_out", [1, 1, 1]), ("train", [0, 0, 0])],
+)
+def test_the_policy_receives_a_files_sentences_in_turn(loaded, sentences, monkeypatch, split, expected):
+    use_fake_encoder(monkeypatch)
+    plan = EvaluationPlan("4,14", 3, instructions=str(sentences), instructions_split=split)
+    episodes = evaluate(*loaded, plan, 0)
+    assert [episode.instruction for episode in episodes] == [
+        f"sentence {n} of {task}" for task in (4, 14) for n in expected
+    ]
+    # The demonstrations and the scenes are those of the tasks.
+    plain = evaluate(*loaded, EvaluationPlan("4,14", 3), 0)
+    assert [(episode.demonstration, episode.objects) for episode in episodes] == [
+        (episode.demonstration, episode.objects) for episode in plain
+    ]
+
+
+def test_a_typed_sentence_is_evaluated_in_one_call(loaded, monkeypatch):
+    use_fake_encoder(monkeypatch)
+    sentence = "putt the speckeld hourglas  in teh green one"
+    (episode,) = evaluate(*loaded, EvaluationPlan("4", 1, instruction=sentence), 0)
+    assert episode.instruction == " ".join(sentence.split())
+    assert episode.demonstration == get_task(4).instruction
+
+
+def test_records_say_whose_words_the_instructions_are(run, sentences, tmp_path, capsys, monkeypatch):
+    use_fake_encoder(monkeypatch)
+    arguments = [str(run), "--tasks", "4", "--trials", "1", "--steps", "last", "--out", str(tmp_path / "out")]
+    evaluate_command.main([*arguments, "--instructions", str(sentences), "--instructions-split", "held_out"])
+    record = read_record(record_path(tmp_path / "out", 2))
+    assert record.wording.startswith("sentences.csv (held_out), SHA-256 ")
+    with pytest.raises(SystemExit):
+        evaluate_command.main([*arguments, "--instructions", str(sentences)])
+    assert "belongs to another evaluation" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        evaluate_command.main(arguments)
+    assert "'wording': 'templates'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--instruction", "put it there"], "folder for its records with --out"),
+        (["--instruction", " ", "--out", "out"], "`instruction` must be a sentence"),
+        (["--instructions", "missing.csv", "--out", "out"], "missing.csv cannot be read"),
         (["--policy.demo_root", "data", "--out", "out"], "Give both"),
         (["--policy.demo_repo_id", "USER/NAME"], "folder for its records with --out"),
         (["another_run", "--out", "out"], "the records of a single run. Got 2 runs"),

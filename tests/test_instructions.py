@@ -17,7 +17,7 @@ from gym_deltaco.instructions import (
     read_instructions,
     split_instructions,
 )
-from gym_deltaco.tasks import N_TASKS
+from gym_deltaco.tasks import N_TASKS, get_task
 from lerobot_deltaco.commands.instructions import main
 from lerobot_deltaco.data import authors_instructions
 
@@ -178,6 +178,16 @@ def test_the_authors_file_is_fetched_and_checked(serve, tmp_path, capsys):
     assert "already exists" in capsys.readouterr().err
     main(["--check", str(file)])
     assert "all: 1500 of 300 tasks" in capsys.readouterr().out
+
+
+def test_bare_names_are_written_for_ambiguity_scheme_ii(tmp_path, capsys):
+    file = tmp_path / "bare.csv"
+    main(["--bare-names", "--out", str(file)])
+    assert "all: 300 of 300 tasks" in capsys.readouterr().out
+    sentences = read_instructions(file)
+    assert sentences[4] == ("Put smushed dumbbell in green bin.",)
+    assert sentences[132] == (get_task(132).instruction,)
+    assert len(set(sentences.values())) == N_TASKS
 
 
 @pytest.mark.parametrize(

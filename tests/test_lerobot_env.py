@@ -89,6 +89,9 @@ def test_features_agree_with_the_spaces(make_envs):
         ({"episode_length": 0}, r"`episode_length` must be at least 1\. Got 0\."),
         ({"max_parallel_tasks": 0}, r"`max_parallel_tasks` must be at least 1\. Got 0\."),
         ({"ambiguity": "none"}, r"`ambiguity` must be one of container, object\. Got 'none'\."),
+        ({"instructions_split": "test"}, "must be one of all, train, held_out. Got 'test'"),
+        ({"instruction": ""}, "must be a sentence"),
+        ({"instruction": "put it there", "instructions": "a.csv"}, "exclude each other"),
     ],
 )
 def test_bad_configurations_say_what_is_valid(arguments, message):
@@ -277,6 +280,30 @@ def test_an_evaluation_reports_each_kind(tmp_path, use_async_envs, max_parallel_
     assert policy.instructions == {TASKS[i].instruction for i in select_tasks(ONE_OF_EACH_KIND)}
     # Each task was closed when it was done, and the last one stopped the simulators.
     assert connected_clients() == before
+
+
+@pytest.mark.parametrize("use_async_envs", [False, True], ids=["sync", "async"])
+def test_any_policy_can_be_evaluated_on_sentences_of_a_file(tmp_path, use_async_envs):
+    from lerobot.scripts.lerobot_eval import eval_policy_all
+
+    file = tmp_path / "sentences.csv"
+    file.write_text("task_id,instruction\n4,one of 4\n4,another of 4\n4,held out of 4\n14,one of 14\n")
+    policy = StillPolicy()
+
+    def run(**options):
+        policy.instructions.clear()
+        envs = make_env(DeltacoEnv(task="4", episode_length=2, **options), 2, use_async_envs=use_async_envs)
+        eval_policy_all(envs, policy, *[lambda data: data] * 4, n_episodes=8, start_seed=0)
+        return policy.instructions.copy()
+
+    assert run(instructions=str(file), instructions_split="train") == {"one of 4", "another of 4"}
+    assert run(instruction="putt it  in teh box") == {"putt it in teh box"}
+    for options, message in (
+        ({"instructions": str(file)}, "no instruction for task 5"),
+        ({"instructions": "missing.csv"}, "missing.csv cannot be read"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_env(DeltacoEnv(task="4,5", **options), 1)
 
 
 @pytest.mark.slow

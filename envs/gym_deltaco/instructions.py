@@ -11,12 +11,11 @@ import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, get_args
 
-from gym_deltaco.tasks import N_TASKS, get_task
+from gym_deltaco.atomic_files import atomic_write
+from gym_deltaco.tasks import N_TASKS, OBJECTS, TASKS, get_task
 
-InstructionSplit = Literal["all", "train", "held_out"]
-INSTRUCTION_SPLITS: tuple[InstructionSplit, ...] = get_args(InstructionSplit)
+INSTRUCTION_SPLITS = ("all", "train", "held_out")
 
 # A file's columns: ours, and those of the authors' file, which also numbers its rows.
 COLUMNS = ("task_id", "instruction")
@@ -28,7 +27,7 @@ class InstructionsError(ValueError):
     """A file of instructions cannot be used; the message says what is wrong with it."""
 
 
-def read_instructions(path: str | Path, split: InstructionSplit = "all") -> dict[int, tuple[str, ...]]:
+def read_instructions(path: str | Path, split: str = "all") -> dict[int, tuple[str, ...]]:
     """Reads the sentences of tasks from a CSV file.
 
     Args:
@@ -47,6 +46,53 @@ def read_instructions(path: str | Path, split: InstructionSplit = "all") -> dict
     except (OSError, UnicodeDecodeError) as error:
         raise InstructionsError(f"The instructions {path} cannot be read: {error}.") from error
     return split_instructions(by_task(parse_instructions(text, str(path))), split)
+
+
+def choose_instructions(
+    task_ids: Sequence[int],
+    path: str | Path | None = None,
+    split: str = "all",
+    sentence: str | None = None,
+) -> dict[int, tuple[str, ...]] | None:
+    """The sentences that tasks are run with, from a file or one that a person typed.
+
+    Args:
+        task_ids: Indices of the tasks.
+        path: A CSV file, as `read_instructions` takes it.
+        split: Which of the file's sentences.
+        sentence: A sentence for all of the tasks, in whatever words.
+
+    Returns:
+        At least one sentence for each task; None if there is neither a file nor a sentence.
+
+    Raises:
+        InstructionsError: The file has no sentence for a task, or cannot be used.
+        ValueError: There are both a file and a sentence, or the sentence is empty.
+    """
+    check_wording(path, split, sentence)
+    if sentence is not None:
+        return dict.fromkeys(task_ids, (" ".join(sentence.split()),))
+    if path is None:
+        return None
+    found = read_instructions(path, split)
+    check_tasks(found, task_ids, f"The split {split!r} of {path}" if split != "all" else str(path))
+    return {task_id: found[task_id] for task_id in task_ids}
+
+
+def check_wording(path: str | Path | None, split: str, sentence: str | None) -> None:
+    """Checks the arguments of `choose_instructions`, without reading the file.
+
+    Raises:
+        ValueError: There is no such split, or there are both a file and a sentence, or it is empty.
+    """
+    if split not in INSTRUCTION_SPLITS:
+        raise ValueError(
+            f"`instructions_split` must be one of {', '.join(INSTRUCTION_SPLITS)}. Got {split!r}."
+        )
+    if sentence is not None and path is not None:
+        raise ValueError("`instructions` (a file) and `instruction` (a sentence) exclude each other.")
+    if sentence is not None and not sentence.strip():
+        raise ValueError("`instruction` must be a sentence. It is empty.")
 
 
 def parse_instructions(text: str, source: str) -> list[tuple[int, str]]:
@@ -108,9 +154,7 @@ def by_task(rows: Iterable[tuple[int, str]]) -> dict[int, tuple[str, ...]]:
     return {task_id: tuple(found[task_id].values()) for task_id in sorted(found)}
 
 
-def split_instructions(
-    instructions: Mapping[int, tuple[str, ...]], split: InstructionSplit
-) -> dict[int, tuple[str, ...]]:
+def split_instructions(instructions: Mapping[int, tuple[str, ...]], split: str) -> dict[int, tuple[str, ...]]:
     """Chooses sentences for training, or those that are held out of it.
 
     Args:
@@ -125,10 +169,7 @@ def split_instructions(
     Raises:
         ValueError: There is no such split.
     """
-    if split not in INSTRUCTION_SPLITS:
-        raise ValueError(
-            f"`instructions_split` must be one of {', '.join(INSTRUCTION_SPLITS)}. Got {split!r}."
-        )
+    check_wording(None, split, None)
     if split == "all":
         return dict(instructions)
     if split == "held_out":
@@ -139,6 +180,33 @@ def split_instructions(
         for task_id, sentences in instructions.items()
     }
     return {task_id: sentences for task_id, sentences in kept.items() if sentences}
+
+
+def bare_name_instructions() -> dict[int, str]:
+    """Instructions that give an object's bare name, as the authors' code does in ambiguity scheme (ii).
+
+    Returns:
+        By index of the task, such as "Put smushed dumbbell in green bin."; tasks of colors and shapes have no
+        other name, and keep their template.
+    """
+    found = {}
+    for task in TASKS:
+        phrase = OBJECTS[task.row].name if task.kind == "name" else task.object_phrase
+        found[task.index] = f"Put {phrase} in {task.container} bin."
+    return found
+
+
+def write_instructions(path: Path, instructions: Mapping[int, str]) -> None:
+    """Writes a CSV file with one instruction for each task.
+
+    Args:
+        path: The file to write.
+        instructions: Instruction of each task.
+    """
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows(instructions.items())
 
 
 def check_tasks(instructions: Mapping[int, Sequence[str]], task_ids: Iterable[int], source: str) -> None:

@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Sequence
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import lerobot
@@ -17,6 +18,7 @@ from lerobot_deltaco.cards.templates import env_options, render
 from lerobot_deltaco.configuration_deltaco import Conditioning, DeltacoConfig
 from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
 from lerobot_deltaco.policy.training_episodes import kept_episodes
+from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS
 
 TAGS = ("robotics", "lerobot", "deltaco", "imitation-learning")
 MAX_TASKS_LISTED = 10
@@ -66,6 +68,7 @@ _DEMO_ENCODER_TEXTS = {
     "cnn": "the paper's convolutional network, on the array of frames",
     "attention": "a convolutional network with attention, on the frames laid upon each other (ours)",
     "correspondence": "none: what the demonstration moved is looked for in the scene (ours)",
+    "pretrained": "the frozen image encoder {encoder}, on the array of frames",
 }
 
 
@@ -134,7 +137,7 @@ def policy_card(
         config=config,
         language_repo_id=LANGUAGE_ENCODERS[config.language_encoder].repo_id,
         demo_frames="the first and the last" + (", and random ones between" * (config.n_demo_frames > 2)),
-        demo_encoder=_DEMO_ENCODER_TEXTS[config.demo_encoder],
+        demo_encoder=_DEMO_ENCODER_TEXTS[config.demo_encoder].format(encoder=_encoder_name(config)),
         shown_tasks=[_one_line(task) for task in shown_tasks],
         max_listed=MAX_TASKS_LISTED,
         n_instructions=n_instructions,
@@ -264,3 +267,9 @@ def _example_task(config: DeltacoConfig, tasks: Sequence[str]) -> str:
 
 def _one_line(text: str) -> str:
     return " ".join(text.split())
+
+
+def _encoder_name(config: DeltacoConfig) -> str:
+    """The frozen image encoder; of a folder, no more than its own name."""
+    known = config.vision_encoder in VISION_ENCODERS or not Path(config.vision_encoder).exists()
+    return config.vision_encoder if known else Path(config.vision_encoder).name

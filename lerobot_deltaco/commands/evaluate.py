@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
+from gym_deltaco.instructions import INSTRUCTION_SPLITS
 from gym_deltaco.layout import AMBIGUITIES
 from lerobot_deltaco.commands.command_errors import exit_on_error
 from lerobot_deltaco.common.run_folder import Checkpoint, RunDescription, RunError, checkpoints, describe
@@ -35,6 +36,9 @@ def main(arguments: list[str] | None = None) -> None:
             options.ambiguity,
             objects=options.objects,
             adversarial_probability=options.adversarial_probability,
+            instructions=options.instructions,
+            instructions_split=options.instructions_split,
+            instruction=options.instruction,
         )
         given = {
             name: getattr(options, name)
@@ -50,6 +54,11 @@ def main(arguments: list[str] | None = None) -> None:
             parser.error(
                 "An evaluation with other demonstrations must not be mixed with the run's own. Name another "
                 "folder for its records with --out."
+            )
+        if plan.sentences is not None and options.out is None:
+            parser.error(
+                "With instructions in other words, an evaluation is not to be taken for the run's own. Name "
+                "another folder for its records with --out."
             )
         todo = [(run, checkpoint) for run in options.runs for checkpoint in _chosen(run, options.steps)]
     except (ValueError, OSError) as error:
@@ -98,7 +107,7 @@ def _evaluate(
                 f"{path} belongs to another run: {record.experiment!r} with seed {record.run_seed}. Expected "
                 f"{experiment!r} with seed {description.seed}. Name another folder with --out."
             )
-        made_for = EvaluationPlan(
+        made_for = _settings(
             record.tasks,
             record.trials,
             record.evaluation_seed,
@@ -108,11 +117,24 @@ def _evaluate(
             record.episode_length,
             record.objects,
             record.adversarial_probability,
+            record.wording,
         )
-        if made_for != plan:
+        asked_for = _settings(
+            plan.tasks,
+            plan.trials,
+            plan.seed,
+            plan.counterfactual,
+            plan.ambiguity,
+            plan.image_size,
+            plan.episode_length,
+            plan.objects,
+            plan.adversarial_probability,
+            plan.wording,
+        )
+        if made_for != asked_for:
             raise RecordError(
-                f"{path} belongs to another evaluation: {asdict(made_for)}. Expected {asdict(plan)}. Use the "
-                "same arguments, or name another folder for the records with --out."
+                f"{path} belongs to another evaluation: {made_for}. Expected {asked_for}. Use the same "
+                "arguments, or name another folder for the records with --out."
             )
         sys.stdout.write(_text(run, record, "already evaluated"))
         return
@@ -135,6 +157,33 @@ def _evaluate(
         command=command,
     )
     sys.stdout.write(_text(run, record, f"{record.seconds:.0f} s"))
+
+
+def _settings(
+    tasks: str,
+    trials: int,
+    seed: int,
+    counterfactual: str,
+    ambiguity: str,
+    image_size: int,
+    episode_length: int,
+    objects: str | None,
+    adversarial_probability: float,
+    wording: str,
+) -> dict[str, object]:
+    """The arguments of an evaluation, for comparison and for errors."""
+    return {
+        "tasks": tasks,
+        "trials": trials,
+        "seed": seed,
+        "counterfactual": counterfactual,
+        "ambiguity": ambiguity,
+        "image_size": image_size,
+        "episode_length": episode_length,
+        "objects": objects,
+        "adversarial_probability": adversarial_probability,
+        "wording": wording,
+    }
 
 
 def _text(run: Path, record: EvaluationRecord, remark: str) -> str:
@@ -218,6 +267,24 @@ def _parser() -> argparse.ArgumentParser:
         metavar="P",
         help="probability that a distractor is drawn from the objects that share the target's color or "
         "shape; 0 for uniform distractors, as in the authors' evaluation in training (%(default)s)",
+    )
+    parser.add_argument(
+        "--instructions",
+        metavar="FILE",
+        help="CSV file with sentences for the tasks, such as the one that deltaco-instructions fetches; "
+        "needs --out (by default, the benchmark's templates)",
+    )
+    parser.add_argument(
+        "--instructions-split",
+        choices=INSTRUCTION_SPLITS,
+        default=plan.instructions_split,
+        help="which of them: held_out, the last one of each task; train, those that are held out for no task "
+        "(%(default)s)",
+    )
+    parser.add_argument(
+        "--instruction",
+        metavar="SENTENCE",
+        help="a sentence of your own, in whatever words, for every task; needs --out",
     )
     parser.add_argument(
         "--steps",

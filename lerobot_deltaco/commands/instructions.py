@@ -9,8 +9,10 @@ from pathlib import Path
 from gym_deltaco.instructions import (
     INSTRUCTION_SPLITS,
     InstructionsError,
+    bare_name_instructions,
     read_instructions,
     split_instructions,
+    write_instructions,
 )
 from lerobot_deltaco.commands.command_errors import exit_on_error
 from lerobot_deltaco.data.authors_instructions import AUTHORS_URL, fetch_instructions
@@ -24,7 +26,10 @@ def main(arguments: list[str] | None = None) -> None:
         if options.check is None:
             if options.out.exists():
                 parser.error(f"{options.out} already exists. Check it with --check {options.out}.")
-            fetch_instructions(options.out, options.url)
+            if options.bare_names:
+                write_instructions(options.out, bare_name_instructions())
+            else:
+                fetch_instructions(options.out, options.url)
         path = options.check or options.out
         instructions = read_instructions(path)
     lines = [f"{path}: distinct instructions of {len(instructions)} tasks"]
@@ -50,6 +55,12 @@ def _parser() -> argparse.ArgumentParser:
         help="where to write them (%(default)s)",
     )
     parser.add_argument("--url", default=AUTHORS_URL, help="where they are (%(default)s)")
+    parser.add_argument(
+        "--bare-names",
+        action="store_true",
+        help="write instructions that give objects their bare names, as the authors' code does in ambiguity "
+        "scheme (ii), instead of downloading any; use them with the split all",
+    )
     parser.add_argument("--check", type=Path, metavar="FILE", help="only check this file")
     return parser
 

@@ -10,6 +10,7 @@ from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
 from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS
+from gym_deltaco.instructions import check_wording, choose_instructions
 from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, default_objects
 from gym_deltaco.tasks import get_task, select_tasks
@@ -42,6 +43,12 @@ class DeltacoEnv(EnvConfig):
             "scenario_a_train" for the tasks scenario_a_clean_train.
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape: 0.6 in the paper's data, 0 in the authors' evaluation in training.
+        instructions: CSV file with sentences for the tasks, as `deltaco-instructions` fetches or checks it.
+            The instruction of an episode is then one of its task's, drawn by the episode's seed. By default,
+            it is the benchmark's template.
+        instructions_split: Which of the file's sentences: all; held_out, the last one of each task; or train,
+            those that are held out for no task.
+        instruction: A sentence of your own, in whatever words, that replaces the instruction of every task.
     """
 
     task: str = "scenario_a_test"
@@ -52,6 +59,9 @@ class DeltacoEnv(EnvConfig):
     render_size: int = 96
     objects: str | None = None
     adversarial_probability: float = ADVERSARIAL_PROBABILITY
+    instructions: str | None = None
+    instructions_split: str = "all"
+    instruction: str | None = None
 
     def __post_init__(self) -> None:
         check_field_types(self)
@@ -61,6 +71,8 @@ class DeltacoEnv(EnvConfig):
         check_scenes(task_ids, self.objects, self.adversarial_probability)
         check_ranges(self, ENV_RANGES)
         check_choices(self, ambiguity=AMBIGUITIES)
+        # The file is read when environments are made.
+        check_wording(self.instructions, self.instructions_split, self.instruction)
         # The environment's names, and what LeRobot calls them in datasets and policies.
         self.features_map = {"pixels": OBS_IMAGE, "agent_pos": OBS_STATE, ACTION: ACTION}
         self.features = {
@@ -85,7 +97,14 @@ class DeltacoEnv(EnvConfig):
             "max_episode_steps": self.episode_length,
             "objects": self.objects,
             "adversarial_probability": self.adversarial_probability,
+            "instructions": self._sentences(),
         }
+
+    def _sentences(self) -> dict[int, tuple[str, ...]] | None:
+        """The sentences of the tasks; None for the benchmark's templates."""
+        return choose_instructions(
+            select_tasks(self.task), self.instructions, self.instructions_split, self.instruction
+        )
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
         """Makes a vector environment for each task. None has a simulator until it is first reset.

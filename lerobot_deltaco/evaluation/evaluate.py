@@ -61,6 +61,7 @@ def evaluate(
     )
     check_policy_fits(policy.config, env_config)
     task_ids = select_tasks(plan.tasks)
+    sentences = plan.sentences
     # What another task's instruction or demonstration asks for depends on the scene, so that each episode of
     # a counterfactual evaluation has its own demonstration or instruction.
     n_envs = 1 if plan.counterfactual != "none" else plan.trials
@@ -73,8 +74,15 @@ def evaluate(
         for env in tqdm(envs, desc=f"Evaluating step {set_number}", unit="task"):
             for trials in _chunks(range(plan.trials), n_envs):
                 seeds = [episode_seed(plan.seed, "evaluation", env.task_id, set_number, t) for t in trials]
-                sampler = CounterfactualSampler(
-                    policy, get_task(env.task_id), task_ids, plan.counterfactual, seeds[0]
+                task = get_task(env.task_id)
+                own = (task.instruction,) if sentences is None else sentences[env.task_id]
+                sampler = InstructionSampler(
+                    policy,
+                    task,
+                    [own[trial % len(own)] for trial in trials],
+                    task_ids,
+                    plan.counterfactual,
+                    seeds[0],
                 )
                 recorded = RecordingVectorEnv(env, seeds, sampler.sample_instructions)
                 with torch.no_grad(), policy.demonstrated_as(sampler.demonstrated_as):
@@ -96,20 +104,32 @@ def versions(policy: DeltacoPolicy) -> dict[str, str]:
     return {BENCHMARK: ENV_ID, **packages, "language_encoder": policy.config.language_encoder}
 
 
-class CounterfactualSampler:
-    """Chooses the demonstration and the instruction of an episode: the task's own, or one of another task."""
+class InstructionSampler:
+    """Chooses the demonstration and the instruction of episodes: the task's own, or one of another task.
+
+    Args:
+        policy: The policy.
+        task: The scenes' task.
+        own: The instructions of the task itself, one for each episode, in whatever words.
+        task_ids: Tasks of which a counterfactual one is chosen.
+        counterfactual: Which of both is another task's.
+        seed: Of the choice.
+    """
 
     def __init__(
         self,
         policy: DeltacoPolicy,
         task: Task,
+        own: Sequence[str],
         task_ids: Sequence[int],
         counterfactual: Counterfactual,
         seed: int,
     ) -> None:
         self.demonstration = task.instruction if policy.config.uses_demo else None
-        self.demonstrated_as: dict[str, str] = {}  # the task that demonstrates an instruction
+        # The task that demonstrates an instruction.
+        self.demonstrated_as = dict.fromkeys(own, task.instruction)
         self._task = task
+        self._own = list(own)
         self._counterfactual = counterfactual
         self._others = [get_task(index) for index in task_ids if index != task.index]
         if counterfactual == "demo" and policy.eval_demonstrations is not None:
@@ -120,18 +140,17 @@ class CounterfactualSampler:
 
     def sample_instructions(self, infos: list[dict[str, Any]]) -> list[str]:
         """The instructions for scenes, once they are drawn."""
-        own = self._task.instruction
         if self._counterfactual == "none":
-            return [own] * len(infos)
+            return self._own
         (info,) = infos
         other = counterfactual_task(self._others, info, self._random).instruction
         if self._counterfactual == "instruction":
-            self.demonstrated_as[other] = own
+            self.demonstrated_as[other] = self._task.instruction
             return [other]
-        self.demonstrated_as[own] = other
+        self.demonstrated_as |= dict.fromkeys(self._own, other)
         if self.demonstration is not None:
             self.demonstration = other
-        return [own]
+        return self._own
 
 
 def counterfactual_task(others: Sequence[Task], info: dict[str, Any], rng: random.Random) -> Task:

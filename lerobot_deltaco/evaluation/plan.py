@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 
 from gym_deltaco import EPISODE_STEPS
+from gym_deltaco.instructions import choose_instructions
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
 from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, default_objects
 from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.common.checks import check_choices
 from lerobot_deltaco.common.env_ranges import ENV_RANGES
 from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
-from lerobot_deltaco.evaluation.record import COUNTERFACTUALS, Counterfactual
+from lerobot_deltaco.evaluation.record import COUNTERFACTUALS, TEMPLATES, Counterfactual
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,11 @@ class EvaluationPlan:
         objects: Objects that scenes are made of, as `--env.objects` takes them; None is the task set's own.
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1.
+        instructions: CSV file with sentences for the tasks, as `deltaco-instructions` downloads or checks it;
+            the trials of a task use its sentences in turn. By default, the benchmark's templates.
+        instructions_split: Split of that file: "all"; "held_out", the last sentence of each task; or "train",
+            the sentences that are held out for no task.
+        instruction: Sentence, in any words, that replaces the instruction of every task.
 
     Raises:
         ValueError: An argument is invalid; the message says what is valid.
@@ -46,8 +54,13 @@ class EvaluationPlan:
     episode_length: int = EPISODE_STEPS
     objects: str | None = None
     adversarial_probability: float = ADVERSARIAL_PROBABILITY
+    instructions: str | None = None
+    instructions_split: str = "all"
+    instruction: str | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.instructions, Path):
+            object.__setattr__(self, "instructions", str(self.instructions))
         check_field_types(self)
         task_ids = select_tasks(self.tasks)
         ranges = {name: ENV_RANGES[name] for name in ("image_size", "episode_length")}
@@ -56,3 +69,25 @@ class EvaluationPlan:
         object.__setattr__(self, "objects", objects)
         check_scenes(task_ids, objects, self.adversarial_probability)
         check_choices(self, counterfactual=COUNTERFACTUALS, ambiguity=AMBIGUITIES)
+        if self.sentences is not None and self.counterfactual == "instruction":
+            raise ValueError(
+                "A counterfactual instruction is another task's template: leave out `instructions` and "
+                "`instruction`, or set `counterfactual` to 'none' or 'demo'."
+            )
+
+    @property
+    def sentences(self) -> dict[int, tuple[str, ...]] | None:
+        """The sentences of each task, which its trials use in turn; None for the benchmark's templates."""
+        return choose_instructions(
+            select_tasks(self.tasks), self.instructions, self.instructions_split, self.instruction
+        )
+
+    @property
+    def wording(self) -> str:
+        """Source of the instructions, for the record: the sentence itself, or a file with its SHA-256."""
+        if self.instruction is not None:
+            return self.instruction
+        if self.instructions is None:
+            return TEMPLATES
+        digest = hashlib.sha256(Path(self.instructions).read_bytes()).hexdigest()
+        return f"{Path(self.instructions).name} ({self.instructions_split}), SHA-256 {digest}"

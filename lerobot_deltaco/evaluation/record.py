@@ -26,6 +26,8 @@ Counterfactual = Literal["none", "demo", "instruction"]
 COUNTERFACTUALS: tuple[Counterfactual, ...] = get_args(Counterfactual)
 # The key of an evaluation's `versions` under which the environment's id is, the benchmark's version.
 BENCHMARK = "benchmark"
+# The `wording` of an evaluation with the benchmark's own instructions.
+TEMPLATES = "templates"
 
 
 class RecordError(ValueError):
@@ -101,6 +103,8 @@ class EvaluationRecord:
         objects: Name of the set of objects that the scenes are made of.
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1.
+        wording: In whose words the instructions were: "templates", the benchmark's own; a file of sentences
+            with its split and SHA-256; or the one sentence that all tasks had.
     """
 
     experiment: str
@@ -121,6 +125,7 @@ class EvaluationRecord:
     episode_length: int = EPISODE_STEPS
     objects: str = "all"
     adversarial_probability: float = ADVERSARIAL_PROBABILITY
+    wording: str = TEMPLATES
 
     @property
     def success_rate(self) -> float:
@@ -158,6 +163,7 @@ def read_record(path: Path) -> EvaluationRecord:
         )
     del content["format"]
     is_older = found < RECORD_FORMAT
+    content.setdefault("wording", TEMPLATES)  # which the first records of format 2 do not have
     content = _check_fields(path, content, EvaluationRecord, but="episodes", is_older=is_older)
     if BENCHMARK not in content["versions"]:
         raise RecordError(f"{path} does not say of which version of the benchmark it is (`versions`).")

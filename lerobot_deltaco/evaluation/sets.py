@@ -68,6 +68,7 @@ def run_set(
         seconds=time.monotonic() - start,
         image_size=plan.image_size,
         episode_length=plan.episode_length,
+        wording=plan.wording,
     )
     write_record(record, record_path(folder, step, plan.counterfactual))
     return record
@@ -76,5 +77,6 @@ def run_set(
 def _plain(config: DeltacoConfig) -> dict[str, object]:
     """The policy's configuration as JSON knows it, less what comes from the data, and where they were."""
     left_out = {"input_features", "output_features", "one_hot_tasks", "demo_episodes"}
-    left_out |= {"demo_repo_id", "demo_root", "instruction_embeddings"}
+    left_out |= {"demo_repo_id", "demo_root", "instruction_embeddings", "instructions"}
+    left_out |= {"vision_encoder_weights", "demo_features_dir", "demo_feature_dim"}
     return {name: value for name, value in draccus.encode(config).items() if name not in left_out}

@@ -10,7 +10,12 @@ import torch.nn.functional as F  # noqa: N812
 from einops import rearrange
 from torch import Tensor, nn
 
-from lerobot_deltaco.policy.networks import mean_position, multilayer_perceptron, spatial_weights
+from lerobot_deltaco.policy.networks import (
+    mean_position,
+    multilayer_perceptron,
+    random_crop,
+    spatial_weights,
+)
 
 
 class ArrayEncoder(nn.Module):
@@ -131,3 +136,20 @@ def frame_array(frames: Tensor, rows: int) -> Tensor:
         (batch, 3, rows * H, columns * W).
     """
     return rearrange(frames, "b (r c) d h w -> b d (r h) (c w)", r=rows)
+
+
+def crop_array(frames: Tensor, rows: int, padding: int, generator: torch.Generator) -> Tensor:
+    """Shifts each array of frames at random, as a whole: what leaves a frame comes into its neighbor.
+
+    Args:
+        frames: (batch, rows * columns, 3, H, W).
+        rows: Number of rows of the array.
+        padding: Greatest shift in either direction, px. What comes in at the array's edges is black.
+        generator: Source of the shifts, on the CPU.
+
+    Returns:
+        The same shape.
+    """
+    height, width = frames.shape[-2:]
+    array = random_crop(frame_array(frames, rows), padding, generator)
+    return rearrange(array, "b d (r h) (c w) -> b (r c) d h w", r=rows, h=height, w=width)

@@ -50,6 +50,10 @@ class DemonstrationSet(torch.nn.Module):
         tasks: Instruction of each episode.
         episodes: Index of each episode in its dataset.
         target_objects: Index of the object that each episode moves; None if the dataset does not say.
+
+    Attributes:
+        features: Features of each by a frozen image encoder, (episodes, variants, features) float16; None
+            unless they were asked for (`policy/frozen_features.py`).
     """
 
     frames: Tensor
@@ -59,6 +63,7 @@ class DemonstrationSet(torch.nn.Module):
     _place: Tensor
     _ascending: Tensor
     _row_of_place: Tensor
+    features: Tensor | None
 
     def __init__(
         self,
@@ -75,6 +80,7 @@ class DemonstrationSet(torch.nn.Module):
             self.rows[task].append(row)
         self.register_buffer("frames", frames, persistent=False)
         self.register_buffer("episodes", torch.as_tensor(episodes), persistent=False)
+        self.register_buffer("features", None, persistent=False)
         # By row: where the rows of its task begin in `order`, how many they are, and which of them it is.
         order = [row for rows in self.rows.values() for row in rows]
         place = {row: (n, len(rows)) for rows in self.rows.values() for n, row in enumerate(rows)}
@@ -220,19 +226,25 @@ class DemonstrationSet(torch.nn.Module):
             rows[sample] = self.rows[tasks[sample]][0]
         return torch.tensor(rows, device=wanted.device)
 
-    def sample_frames(self, rows: Tensor, n_frames: int, generator: torch.Generator) -> Tensor:
+    def sample_frames(
+        self, rows: Tensor, n_frames: int, generator: torch.Generator, spread: bool = False
+    ) -> Tensor:
         """Frames of demonstrations in the order of time: the first, random ones between, and the last.
 
         Args:
             rows: (batch,).
             n_frames: Number of frames per demonstration, at least 2.
             generator: Source of the draws, on the CPU.
+            spread: Whether each frame between the ends is drawn from its own of as many equal parts of the
+                time, so that none is drawn twice if there are enough; else, all of them are independent.
 
         Returns:
             (batch, n_frames, 3, H, W) in 0..1.
         """
         last = self.frames.shape[1] - 1
         draws = torch.rand(len(rows), n_frames - 2, generator=generator)
+        if spread and n_frames > 2:
+            draws = (torch.arange(n_frames - 2) + draws) / (n_frames - 2)
         between = 1 + (draws * max(last - 1, 1)).long().clamp(max=max(last - 2, 0))
         ends = torch.tensor([[0, last]]).expand(len(rows), 2)
         columns = torch.cat([ends, between], dim=1).sort(dim=1).values.to(self.frames.device)

@@ -1,7 +1,7 @@
 """Loads frozen sentence encoders, and keeps the embeddings of instructions.
 
-A new kind of encoder (CLIP's, for example) needs an entry of `LANGUAGE_ENCODERS` and, if
-sentence-transformers does not support it, a branch of `load_language_encoder`.
+A new kind of encoder needs an entry of `LANGUAGE_ENCODERS` and, if sentence-transformers does not support it,
+a branch of `load_language_encoder`.
 """
 
 from __future__ import annotations
@@ -14,18 +14,23 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6
+from lerobot_deltaco.policy.language_encoders import CLIP, LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6
 from lerobot_deltaco.policy.packaged_encoders import LanguageEncoderError, packaged_l3, packaged_l6
 from lerobot_deltaco.policy.task_file import TaskFile, read_task_file
 
 BATCH_SIZE = 64
+# Of the length of a vector that counts as a unit vector, and is left as it is.
+UNIT_TOLERANCE = 1e-6
 
-# From sentences to unit embeddings, (sentences, embedding), on the CPU.
+# From sentences to embeddings, (sentences, embedding), on the CPU.
 LanguageEncoder = Callable[[Sequence[str]], Tensor]
 
 
 def load_language_encoder(name: str) -> LanguageEncoder:
-    """Loads a frozen encoder: the mean of the token embeddings, scaled to unit length.
+    """Loads a frozen encoder of sentences.
+
+    It gives the mean of the token embeddings; CLIP's, its own summary of a sentence. all-MiniLM-L6-v2 and
+    all-distilroberta-v1 scale it to unit length, the others do not.
 
     Args:
         name: One of `LANGUAGE_ENCODERS`.
@@ -33,9 +38,24 @@ def load_language_encoder(name: str) -> LanguageEncoder:
     Raises:
         LanguageEncoderError: A package is missing, or the model can be neither found nor downloaded.
     """
-    encode_packaged = packaged_l3(BATCH_SIZE) if name == MINILM_L3 else None
-    if encode_packaged is not None:
-        return lambda sentences: F.normalize(encode_packaged(sentences), dim=-1).clone()
+    encode = packaged_l3(BATCH_SIZE) if name == MINILM_L3 else None
+    if encode is None:
+        try:
+            encode = _clip_encoder() if name == CLIP else _sentence_transformer(name)
+        except OSError as error:
+            raise LanguageEncoderError(
+                f"The language encoder {name} cannot be loaded: {str(error).splitlines()[0]} Without a "
+                f"network, install this project's extra `offline`, which brings {MINILM_L3} and {MINILM_L6}, "
+                "and set `language_encoder` to one of them."
+            ) from error
+
+    def encode_outside_inference_mode(sentences: Sequence[str]) -> Tensor:
+        return encode(sentences).float().clone()
+
+    return encode_outside_inference_mode
+
+
+def _sentence_transformer(name: str) -> LanguageEncoder:
     try:
         from sentence_transformers import SentenceTransformer
     except ImportError as error:
@@ -44,23 +64,45 @@ def load_language_encoder(name: str) -> LanguageEncoder:
             "says."
         ) from error
     source = (packaged_l6() if name == MINILM_L6 else None) or LANGUAGE_ENCODERS[name].repo_id
-    try:
-        # A model without a pooling layer of its own, such as DistilBERT, gets mean pooling.
-        model = SentenceTransformer(str(source), device="cpu")
-    except OSError as error:
-        raise LanguageEncoderError(
-            f"The language encoder {name} cannot be loaded: {str(error).splitlines()[0]} Without a network, "
-            f"install this project's extra `offline`, which brings {MINILM_L3} and {MINILM_L6}, and set "
-            "`language_encoder` to one of them."
-        ) from error
+    # A model without a pooling layer of its own, such as DistilBERT, gets mean pooling.
+    model = SentenceTransformer(str(source), device="cpu")
     model.eval().requires_grad_(False)
 
+    @torch.inference_mode()
     def encode(sentences: Sequence[str]) -> Tensor:
-        with torch.inference_mode():
-            embeddings = model.encode(
-                list(sentences), batch_size=BATCH_SIZE, convert_to_tensor=True, show_progress_bar=False
+        return model.encode(
+            list(sentences), batch_size=BATCH_SIZE, convert_to_tensor=True, show_progress_bar=False
+        )
+
+    return encode
+
+
+def _clip_encoder() -> LanguageEncoder:
+    from transformers import AutoTokenizer, CLIPModel
+
+    source = LANGUAGE_ENCODERS[CLIP].repo_id
+    model = CLIPModel.from_pretrained(source).eval().requires_grad_(False)
+    del model.vision_model
+    tokenizer = AutoTokenizer.from_pretrained(source)
+    n_tokens = model.config.text_config.max_position_embeddings
+
+    @torch.inference_mode()
+    def encode(sentences: Sequence[str]) -> Tensor:
+        found = []
+        for start in range(0, len(sentences), BATCH_SIZE):
+            tokens = tokenizer(
+                list(sentences[start : start + BATCH_SIZE]),
+                padding=True,
+                truncation=True,
+                max_length=n_tokens,
+                return_tensors="pt",
             )
-        return F.normalize(embeddings.float(), dim=-1).clone()
+            features = model.get_text_features(
+                input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
+            )
+            # Versions of transformers from 5 on return more than the features.
+            found.append(features if isinstance(features, Tensor) else features.pooler_output)
+        return torch.cat(found)
 
     return encode
 
@@ -74,12 +116,21 @@ class InstructionTable:
 
     Args:
         encoder_name: One of `LANGUAGE_ENCODERS`.
+
+    Attributes:
+        rows: Place of each known instruction among the embeddings.
+        embeddings: Unit vectors of the known instructions, (instructions, embedding).
+        lengths: Lengths of the embeddings as the encoder gives them, (instructions,).
+        only_unit: Whether some of those lengths are not known, since a file of version 0.1 has only unit
+            vectors; then all embeddings are used with unit length.
     """
 
     def __init__(self, encoder_name: str) -> None:
         self.encoder_name = encoder_name
         self.rows: dict[str, int] = {}
         self.embeddings = torch.empty(0, LANGUAGE_ENCODERS[encoder_name].embedding_dim)
+        self.lengths = torch.empty(0)
+        self.only_unit = False
         self._encode: LanguageEncoder | None = None
 
     def add(self, instructions: Sequence[str]) -> None:
@@ -96,17 +147,30 @@ class InstructionTable:
                 self._encode = load_language_encoder(self.encoder_name)
             self.put(new, self._encode(new))
 
-    def put(self, instructions: Sequence[str], embeddings: Tensor) -> None:
-        """Adds instructions whose embeddings, (instructions, embedding), are known."""
+    def put(self, instructions: Sequence[str], embeddings: Tensor, lengths: Tensor | None = None) -> None:
+        """Adds instructions whose embeddings are known.
+
+        Args:
+            instructions: Instructions that are not in the table.
+            embeddings: Their embeddings, (instructions, embedding).
+            lengths: The lengths that the encoder gave them, (instructions,), if the embeddings are unit
+                vectors.
+        """
+        if lengths is None:
+            lengths = embeddings.norm(dim=1)
+            is_unit = (lengths - 1).abs() < UNIT_TOLERANCE
+            embeddings = torch.where(is_unit[:, None], embeddings, F.normalize(embeddings, dim=1))
         with _LOCK:
             n_known = len(self.embeddings)
             self.embeddings = torch.cat([self.embeddings, embeddings.to(self.embeddings)])
+            self.lengths = torch.cat([self.lengths, lengths.to(self.lengths)])
             self.rows |= {text: n_known + i for i, text in enumerate(instructions)}
 
     def contents(self) -> TaskFile:
         """What is known, as the contents of a file, without demonstrations."""
         with _LOCK:
-            return TaskFile(self.encoder_name, list(self.rows), self.embeddings.cpu(), None)
+            lengths = None if self.only_unit else self.lengths.cpu()
+            return TaskFile(self.encoder_name, list(self.rows), self.embeddings.cpu(), None, lengths)
 
     def read(self, path: Path) -> None:
         """Adds the embeddings of a file.
@@ -128,13 +192,29 @@ class InstructionTable:
                 f"{path} was made with the language encoder {contents.language_encoder}. `language_encoder` "
                 f"cannot be {self.encoder_name}."
             )
+        lengths = contents.lengths
+        if lengths is None:
+            self.only_unit |= bool(contents.instructions)
+            lengths = torch.ones(len(contents.instructions))
         new = [n for n, text in enumerate(contents.instructions) if text not in self.rows]
-        self.put([contents.instructions[n] for n in new], contents.embeddings[new])
+        self.put([contents.instructions[n] for n in new], contents.embeddings[new], lengths[new])
 
-    def __call__(self, instructions: Sequence[str], device: torch.device | str) -> Tensor:
-        """Embeddings of instructions, (instructions, embedding)."""
+    def __call__(self, instructions: Sequence[str], device: torch.device | str, unit: bool = True) -> Tensor:
+        """Embeddings of instructions.
+
+        Args:
+            instructions: Instructions, in any words.
+            device: Device of the result.
+            unit: Whether they are unit vectors, or have the lengths that the encoder gives them.
+
+        Returns:
+            Embeddings, (instructions, embedding).
+        """
         with _LOCK:
             self.add(instructions)
             if self.embeddings.device != torch.device(device):
-                self.embeddings = self.embeddings.to(device)
-            return self.embeddings[[self.rows[text] for text in instructions]]
+                self.embeddings, self.lengths = self.embeddings.to(device), self.lengths.to(device)
+            rows = [self.rows[text] for text in instructions]
+            if unit or self.only_unit:
+                return self.embeddings[rows]
+            return self.embeddings[rows] * self.lengths[rows, None]

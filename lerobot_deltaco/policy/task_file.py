@@ -8,8 +8,9 @@ checked before anything of it is used.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -25,8 +26,9 @@ TASK_FILE = "tasks.safetensors"
 _DOWNLOAD_OPTIONS = ("revision", "cache_dir", "token", "local_files_only", "force_download")
 # Of a unit vector's length, in single precision.
 LENGTH_TOLERANCE = 1e-3
-_EMBEDDINGS, _FRAMES, _EPISODES = "embeddings", "frames", "episodes"
-_NAMES = (_EMBEDDINGS, _FRAMES, _EPISODES)
+_EMBEDDINGS, _LENGTHS = "embeddings", "lengths"
+_FRAMES, _EPISODES, _FEATURES = "frames", "episodes", "features"
+_NAMES = (_EMBEDDINGS, _LENGTHS, _FRAMES, _EPISODES, _FEATURES)
 
 
 class TaskFileError(ValueError):
@@ -40,6 +42,7 @@ class StoredDemonstrations(NamedTuple):
     episodes: Tensor  # (demonstrations,) int64, indices in their dataset
     tasks: list[str]  # of each demonstration
     target_objects: list[int] | None  # index of the object that each moves; None if it is not known
+    features: Tensor | None = None  # (demonstrations, features) float32, by a frozen image encoder
 
 
 class TaskFile(NamedTuple):
@@ -49,6 +52,10 @@ class TaskFile(NamedTuple):
     instructions: list[str]
     embeddings: Tensor  # (instructions, embedding), unit vectors
     demonstrations: StoredDemonstrations | None
+    # The lengths of the embeddings as the encoder gives them, (instructions,); None in files of version 0.1.
+    lengths: Tensor | None = None
+    # Sentences in people's own words for task strings.
+    paraphrases: Mapping[str, Sequence[str]] = MappingProxyType({})
 
 
 def hub_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -77,10 +84,16 @@ def write_task_file(path: Path, contents: TaskFile) -> None:
         "instructions": json.dumps(contents.instructions),
     }
     if contents.demonstrations is not None:
-        frames, episodes, tasks, target_objects = contents.demonstrations
+        frames, episodes, tasks, target_objects, features = contents.demonstrations
         tensors |= {_FRAMES: frames.cpu().contiguous(), _EPISODES: episodes.cpu().contiguous()}
+        if features is not None:
+            tensors[_FEATURES] = features.float().cpu().contiguous()
         known["tasks"] = json.dumps(tasks)
         known["target_objects"] = json.dumps(target_objects)
+    if contents.lengths is not None:
+        tensors[_LENGTHS] = contents.lengths.float().cpu().contiguous()
+    if contents.paraphrases:
+        known["paraphrases"] = json.dumps({task: list(own) for task, own in contents.paraphrases.items()})
     save_file(tensors, path, metadata=known)
 
 
@@ -111,8 +124,13 @@ def read_task_file(path: Path) -> TaskFile:
     lengths = embeddings.norm(dim=1)
     if not bool(((lengths - 1).abs() < LENGTH_TOLERANCE).all()):
         raise _error(path, f"`{_EMBEDDINGS}` must be unit vectors of finite numbers")
+    as_computed = tensors.pop(_LENGTHS, None)
+    if as_computed is not None:
+        _check(path, _LENGTHS, as_computed, torch.float32, (len(instructions),))
+        if not bool((as_computed.isfinite() & (as_computed > 0)).all()):
+            raise _error(path, f"`{_LENGTHS}` must be finite and greater than 0")
     demonstrations = _demonstrations(path, tensors, known) if set(tensors) > {_EMBEDDINGS} else None
-    return TaskFile(encoder, instructions, embeddings, demonstrations)
+    return TaskFile(encoder, instructions, embeddings, demonstrations, as_computed, _paraphrases(path, known))
 
 
 def check_demonstrations(
@@ -133,6 +151,23 @@ def check_demonstrations(
     _check(path, _FRAMES, demonstrations.frames, torch.uint8, shape)
 
 
+def check_features(path: Path, demonstrations: StoredDemonstrations, feature_dim: int | None) -> None:
+    """Checks that features of a file are those of a policy's image encoder.
+
+    Args:
+        path: The file.
+        demonstrations: Demonstrations of the file, with features.
+        feature_dim: Number of the encoder's features; None if it is not known.
+
+    Raises:
+        TaskFileError: They are of another number.
+    """
+    assert demonstrations.features is not None
+    if feature_dim is not None:
+        shape = (len(demonstrations.tasks), feature_dim)
+        _check(path, _FEATURES, demonstrations.features, torch.float32, shape)
+
+
 def _demonstrations(
     path: Path, tensors: Mapping[str, Tensor], known: Mapping[str, str]
 ) -> StoredDemonstrations:
@@ -149,7 +184,16 @@ def _demonstrations(
         shape = tuple(frames.shape)
         raise _error(path, f"`{_FRAMES}` must have the shape (n, 2 or more, 3, h, w), not {shape}")
     _check(path, _FRAMES, frames, torch.uint8, (len(tasks), frames.shape[1], 3, *frames.shape[3:]))
-    return StoredDemonstrations(frames, episodes, tasks, _target_objects(path, known, len(tasks)))
+    features = tensors.get(_FEATURES)
+    if features is not None:
+        if features.ndim != 2:
+            shape = tuple(features.shape)
+            raise _error(path, f"`{_FEATURES}` must have the shape (n, features), not {shape}")
+        _check(path, _FEATURES, features, torch.float32, (len(tasks), features.shape[1]))
+        if not bool(features.isfinite().all()):
+            raise _error(path, f"`{_FEATURES}` must be finite")
+    target_objects = _target_objects(path, known, len(tasks))
+    return StoredDemonstrations(frames, episodes, tasks, target_objects, features)
 
 
 def _target_objects(path: Path, known: Mapping[str, str], n_demonstrations: int) -> list[int] | None:
@@ -163,6 +207,19 @@ def _target_objects(path: Path, known: Mapping[str, str], n_demonstrations: int)
     if not is_a(indices, list[int]) or len(indices) != n_demonstrations or min(indices) < 0:
         raise _error(path, "`target_objects` must have an integer of at least 0 for each demonstration")
     return list(indices)
+
+
+def _paraphrases(path: Path, known: Mapping[str, str]) -> dict[str, list[str]]:
+    try:
+        found = json.loads(known.get("paraphrases", "{}"))
+    except ValueError as error:
+        raise _error(path, f"`paraphrases` must be JSON: {error!r}") from error
+    is_valid = isinstance(found, dict) and all(
+        isinstance(own, list) and all(isinstance(sentence, str) for sentence in own) for own in found.values()
+    )
+    if not is_valid:
+        raise _error(path, "`paraphrases` must have a list of strings for each task string")
+    return found
 
 
 def _strings(path: Path, known: Mapping[str, str], name: str) -> list[str]:

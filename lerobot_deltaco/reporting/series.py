@@ -232,6 +232,7 @@ def _check_together(everything: Sequence[Series]) -> None:
         comparisons[series.comparison, series.counterfactual].append(series)
     for experiment, group in experiments.items():
         _check_same("method", f"records of {experiment!r}", group, lambda item: item.record.method)
+        _check_same("wording", f"records of {experiment!r}", group, lambda item: item.record.wording)
     for (comparison, counterfactual), group in comparisons.items():
         records = f"records of {comparison or group[0].experiment!r}"
         if counterfactual != "none":

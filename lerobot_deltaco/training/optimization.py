@@ -17,12 +17,21 @@ class FusedAdamWConfig(AdamWConfig):
     """AdamW (Adam, where `weight_decay` is 0), updated in one pass over the weights.
 
     On a CPU, LeRobot's Adam, which runs operation by operation, takes a fifth of a small network's step.
+
+    Args:
+        l2: Weight of an L2 penalty on the weights, which is added to the gradients: Adam's own weight decay
+            instead of AdamW's.
     """
+
+    l2: float = 0.0
 
     def build(self, params: Any) -> torch.optim.Optimizer:
         """The optimizer of some weights."""
         options = asdict(self)
         options.pop("grad_clip_norm")
+        l2 = options.pop("l2")
+        if l2:
+            return torch.optim.Adam(params, fused=True, **{**options, "weight_decay": l2})
         return torch.optim.AdamW(params, fused=True, **options)
 
 

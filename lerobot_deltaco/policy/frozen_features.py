@@ -1,0 +1,152 @@
+"""What a frozen image encoder says of demonstrations: computed once, and kept.
+
+A frozen encoder gives the same features for the same image, so that no training step has to run it. Where
+the paper draws the crop and the frames between the ends anew for each sample, here a fixed number of such
+variants of each demonstration is drawn beforehand, and each sample gets one of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from tqdm import tqdm
+
+from lerobot_deltaco.policy.demo_encoders import crop_array, frame_array
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet
+from lerobot_deltaco.policy.networks import random_crop
+from lerobot_deltaco.policy.vision import BATCH_SIZE, VisionEncoder
+
+logger = logging.getLogger(__name__)
+
+
+class Variants(NamedTuple):
+    """How images are made of a demonstration."""
+
+    n_frames: int  # in an image
+    n_rows: int  # of the array that they are laid out in
+    n_drawn: int  # random variants for training, 0 for none
+    crop_padding: int  # px by which a variant is shifted at most
+    crops_array: bool  # whether the array is shifted, or each frame
+    spreads_frames: bool  # whether frames between the ends are of equal parts of the time
+    seed: int
+
+    @property
+    def are_random(self) -> bool:
+        """Whether variants of a demonstration differ."""
+        return self.n_drawn > 0 and (self.crop_padding > 0 or self.n_frames > 2)
+
+
+class FrozenFeatures:
+    """A frozen encoder, and the features of the demonstrations that it has been asked for.
+
+    It is no module, so that the encoder is neither trained nor saved. The encoder is loaded when it is first
+    needed: never, where the features are already known.
+
+    Args:
+        load: Loads the encoder.
+        variants: How images are made of a demonstration.
+        folder: Where features are kept for further trainings; None for nowhere.
+    """
+
+    def __init__(
+        self, load: Callable[[], VisionEncoder], variants: Variants, folder: Path | None = None
+    ) -> None:
+        self.variants = variants
+        self._load = load
+        self._folder = folder
+        self._encoder: VisionEncoder | None = None
+
+    @property
+    def encoder(self) -> VisionEncoder:
+        """The encoder."""
+        if self._encoder is None:
+            self._encoder = self._load()
+        return self._encoder
+
+    def drawn(self, demonstrations: DemonstrationSet, rows: Tensor, generator: torch.Generator) -> Tensor:
+        """Features of random variants of demonstrations, for training.
+
+        Args:
+            demonstrations: The set.
+            rows: Which of them, (batch,).
+            generator: Source of the draws, on the CPU.
+
+        Returns:
+            (batch, features) float32.
+        """
+        if not self.variants.are_random:
+            return self.plain(demonstrations, rows)
+        n_known = 1 + self.variants.n_drawn
+        if demonstrations.features is None or demonstrations.features.shape[1] != n_known:
+            demonstrations.features = self._computed(demonstrations, self.variants.n_drawn)
+        which = torch.randint(1, n_known, (len(rows),), generator=generator).to(rows.device)
+        return demonstrations.features[rows, which].float()
+
+    def plain(self, demonstrations: DemonstrationSet, rows: Tensor | None = None) -> Tensor:
+        """Features of demonstrations without a crop, with the same frames between the ends every time.
+
+        Args:
+            demonstrations: The set.
+            rows: Which of them, (batch,); None for all.
+
+        Returns:
+            (batch, features) float32.
+        """
+        if demonstrations.features is None:
+            demonstrations.features = self._computed(demonstrations, 0)
+        plain = demonstrations.features[:, 0]
+        return (plain if rows is None else plain[rows]).float()
+
+    def _computed(self, demonstrations: DemonstrationSet, n_drawn: int) -> Tensor:
+        """Features, (episodes, 1 + n_drawn, features) float16: without a crop, and of variants."""
+        device = demonstrations.frames.device
+        path = self._path(demonstrations, n_drawn)
+        if path is not None and path.exists():
+            logger.info("The features of the demonstrations are read from %s.", path)
+            return load_file(path)["features"].to(device)
+        generator = torch.Generator().manual_seed(self.variants.seed)
+        n_episodes = len(demonstrations.tasks)
+        columns = []
+        with tqdm(
+            total=n_episodes * (1 + n_drawn), desc="Encoding demonstrations", unit="image", leave=False
+        ) as bar:
+            for variant in range(1 + n_drawn):
+                parts = []
+                for rows in torch.arange(n_episodes, device=device).split(BATCH_SIZE):
+                    frames = demonstrations.sample_frames(
+                        rows, self.variants.n_frames, generator, self.variants.spreads_frames
+                    )
+                    if variant > 0 and self.variants.crop_padding:
+                        frames = self._cropped(frames, generator)
+                    parts.append(self.encoder(frame_array(frames, self.variants.n_rows)).half())
+                    bar.update(len(rows))
+                columns.append(torch.cat(parts))
+        features = torch.stack(columns, dim=1)
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            unfinished = path.with_suffix(".unfinished")
+            save_file({"features": features.cpu()}, unfinished)
+            os.replace(unfinished, path)
+        return features.to(device)
+
+    def _cropped(self, frames: Tensor, generator: torch.Generator) -> Tensor:
+        if self.variants.crops_array:
+            return crop_array(frames, self.variants.n_rows, self.variants.crop_padding, generator)
+        return random_crop(frames, self.variants.crop_padding, generator)
+
+    def _path(self, demonstrations: DemonstrationSet, n_drawn: int) -> Path | None:
+        """Where the features of a set are kept: under a name that stands for all that they depend on."""
+        if self._folder is None:
+            return None
+        digest = hashlib.sha256(self.encoder.fingerprint().encode())
+        digest.update(repr(self.variants._replace(n_drawn=n_drawn)).encode())
+        digest.update(demonstrations.frames.cpu().contiguous().view(-1).numpy())
+        return self._folder / f"{digest.hexdigest()[:32]}.safetensors"
