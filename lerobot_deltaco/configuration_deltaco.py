@@ -83,6 +83,7 @@ PATHS = (
     "vision_encoder_weights",
     "demo_features_dir",
 )
+MAX_LAYER_SIZE = 100_000  # of `language_head` and `demo_head`
 # The least and the greatest valid value. Beyond them, memory would not do, or arithmetic would overflow.
 RANGES = MappingProxyType(
     {
@@ -336,6 +337,10 @@ class DeltacoConfig(PreTrainedConfig):
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
             raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
         check_ranges(self, RANGES)
+        for name in ("language_head", "demo_head"):
+            sizes = getattr(self, name) or []
+            if not all(1 <= size <= MAX_LAYER_SIZE for size in sizes):
+                raise ValueError(f"`{name}` must be sizes of layers, 1 to {MAX_LAYER_SIZE}. Got {sizes}.")
         if self.optimizer_l2 and self.optimizer_weight_decay:
             raise ValueError(
                 "`optimizer_l2` and `optimizer_weight_decay` exclude each other. Set one of them to 0."

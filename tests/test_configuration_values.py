@@ -48,6 +48,8 @@ def test_numbers_beyond_their_range_are_refused_by_name(name):
 @pytest.mark.parametrize(
     "options",
     [
+        {"language_head": [0]},
+        {"demo_head": [2**31]},
         {"temperature": 1e-40},
         {"seed": 2**63},
         {"image_size": 2**31},

@@ -222,6 +222,18 @@ VALUES = {
     "temperature": [0.1, 1, 1e-40, 0.0, -1.0, math.nan],
     "crop_padding": [0, 4, 20, -1, 2.0],
     "demo_crop_padding": [0, 4, 1000, None],
+    "instructions_split": ["train", "held_out", "x"],
+    "instructions_templates": [False, True, 1],
+    "language_head": [None, [8], [0], [2**31], 8],
+    "normalize_language": [True, False, None],
+    "vision_image_size": [None, 32, 0],
+    "vision_input": ["published", "x"],
+    "demo_variants": [1, 8, 0],
+    "demo_head": [None, [8], [-1]],
+    "demo_crop": ["array", "frame", "x"],
+    "demo_frames_between": ["spread", "any", "x"],
+    "initial_weights": [None, "authors", "torch", "x"],
+    "optimizer_l2": [0.0, 1e-4, -1.0],
     "demo_camera": [None, "observation.images.wrist", "observation.images.none", 3],
     "n_demonstrations": [1, 2, 0, None],
     "goal_noise": [0.0, 0.04, -1.0, math.nan],
@@ -257,7 +269,8 @@ def dataset(tmp_path_factory):
 def test_every_option_is_tried():
     config = make_policy_config("deltaco", device="cpu")
     elsewhere = {"language_encoder", "instruction_embeddings", "demo_repo_id", "demo_root", "demo_episode"}
-    elsewhere |= {"push_to_hub", "normalization_mapping", "one_hot_tasks"}
+    elsewhere |= {"push_to_hub", "normalization_mapping", "one_hot_tasks", "demo_feature_dim", "demo_task"}
+    elsewhere |= {"instructions", "vision_encoder", "vision_encoder_weights", "demo_features_dir"}  # files
     assert set(VALUES) == set(type_hints(type(config))) - elsewhere
 
 
