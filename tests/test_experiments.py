@@ -39,7 +39,7 @@ TRAINING_OPTIONS = {field.name for field in dataclasses.fields(TrainPipelineConf
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    episodes = [task for task in TASKS for _ in range(2)]
+    episodes = [task for task in TASKS for _ in range(8)]
     return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
 
 

@@ -146,11 +146,11 @@ def parsed_rollout(config: RolloutConfig):
     return config
 
 
-def test_the_commands_of_the_readme_are_lerobots(session, monkeypatch):
+def test_the_commands_of_the_robots_page_are_lerobots(session, monkeypatch):
     def words(name):
-        return shlex.split(re.search(rf"^    (lerobot-{name} .+)$", readme, re.MULTILINE)[1])
+        return shlex.split(re.search(rf"^(lerobot-{name} .+)$", page, re.MULTILINE)[1])
 
-    readme = (Path(__file__).parents[1] / "README.md").read_text().replace("\\\n", " ")
+    page = (Path(__file__).parents[1] / "docs" / "robot.md").read_text().replace("\\\n", " ")
     monkeypatch.setattr("sys.argv", words("record"))
     recorded = parsed_record()
     ours = {"--policy.path": f"--policy.path={session / POLICY}"}
