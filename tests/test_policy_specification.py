@@ -139,7 +139,7 @@ def test_the_optimizer_has_every_weight_of_the_networks_and_changes_it(make, dat
     (group,) = optimizer_of(policy).param_groups
     expected = {
         id(parameter)
-        for network in (policy.model, policy.demo_encoder, policy.project_language)
+        for network in (policy.model, policy.demo_encoder, policy.language_head)
         if network is not None
         for parameter in network.parameters()
     }
@@ -227,8 +227,9 @@ def test_the_loss_is_that_of_the_papers_formulas(dataset, method):
         return imitation(*outputs)
 
     if method == "mcil":
-        projection = weights_of(policy, "project_language.")
-        projected = known[task] @ projection["weight"].T + projection["bias"]
+        head = weights_of(policy, "language_head.layers.")
+        hidden = reference.relu(known[task] @ head["0.weight"].T + head["0.bias"])
+        projected = reference.unit(hidden @ head["2.weight"].T + head["2.bias"])
         expected = (imitated(projected, state) + imitated(demo, state)) / 2
     else:
         one_hot = np.eye(len(policy.config.one_hot_tasks) or 1)
