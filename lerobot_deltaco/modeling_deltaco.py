@@ -422,7 +422,7 @@ class DeltacoPolicy(PreTrainedPolicy):
                 description = self.goals.locator.describe(frames)
             some_instructions = [instructions[sample] for sample in some.tolist()]
             condition = self._goal_condition(some_instructions)
-            logits = self.goals.locator(scenes, plain, description, condition)
+            logits = self.goals.locator(scenes, plain, description, condition, generator=generator)
         loss = goal_loss(logits, places)
         return torch.where(self.train_goals.found[own][:, None], loss, 0.0)
 

@@ -274,6 +274,16 @@ def test_every_method_trains_acts_and_is_the_same_when_it_is_loaded(dataset, tmp
     assert "| goal: where to grasp |" in card.text
 
 
+def test_the_loss_is_a_function_of_the_seed_and_the_step(policy, dataset):
+    batch = batch_of(dataset, [0, LENGTH])
+    losses = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)  # of draws that a resumed training would not repeat
+        policy.step.zero_()
+        losses.append(policy.forward(batch)[0].item())
+    assert losses[0] == losses[1]
+
+
 def test_goals_are_found_in_the_first_image_of_an_episode(policy, dataset):
     policy.forward(batch_of(dataset, [0, LENGTH]))
     policy.eval()

@@ -113,6 +113,7 @@ class GoalLocator(nn.Module):
         description: Description | None,
         condition: Tensor | None,
         grasp_condition: Tensor | None = None,
+        generator: torch.Generator | None = None,
     ) -> Tensor:
         """Finds the goals.
 
@@ -123,6 +124,7 @@ class GoalLocator(nn.Module):
             description: Of the demonstrations; None if there are none.
             condition: (batch, condition_dim); None if there is none.
             grasp_condition: Another condition for the grasp alone.
+            generator: Source of the noise in training, on the CPU.
 
         Returns:
             Logits of the grasp and the release over places, (batch, 2, H / 2, W / 2).
@@ -130,7 +132,8 @@ class GoalLocator(nn.Module):
         if grasp_condition is None:
             grasp_condition = condition
         if self.training and condition is not None and grasp_condition is not None:
-            noise = self.condition_noise * torch.randn_like(condition)
+            noise = torch.randn(condition.shape, generator=generator).to(condition)
+            noise = self.condition_noise * noise
             condition, grasp_condition = condition + noise, grasp_condition + noise
         features = self.trunk(scenes)
         if self.grasp_source == "condition":
