@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -87,7 +87,7 @@ class Engine:
         """The result of a function of a checkpoint, once its turn has come."""
         return self._worker.call(lambda: function(self._player(name)))
 
-    def stream(self, name: str, function: Callable[[Player], Iterator[T]]) -> Iterator[T]:
+    def stream(self, name: str, function: Callable[[Player], Generator[T]]) -> Iterator[T]:
         """Yields what a generator yields that uses a checkpoint, once its turn has come."""
         return self._worker.stream(lambda: function(self._player(name)))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -237,7 +237,7 @@ class Player:
             raise PlayError("The checkpoint has no demonstration of another task. Let the expert make one.")
         return task.instruction, rng.randint(1, counts[task.instruction])
 
-    def run(self, scene: Scene, demonstration: Demonstration | None, sentence: str) -> Iterator[Moment]:
+    def run(self, scene: Scene, demonstration: Demonstration | None, sentence: str) -> Generator[Moment]:
         """Runs an episode of the policy.
 
         Args:
@@ -273,7 +273,7 @@ class Player:
                 if step < EPISODE_STEPS:
                     action = self._act(observation, sentence)
 
-    def expert_demonstration(self, scene: Scene) -> Iterator[Moment | Demonstration]:
+    def expert_demonstration(self, scene: Scene) -> Generator[Moment | Demonstration]:
         """Runs an episode of the scripted expert.
 
         Args:

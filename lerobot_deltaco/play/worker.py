@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from typing import TypeVar
@@ -34,7 +34,7 @@ class Worker:
         """The result of a function, once its turn has come."""
         return self._executor.submit(function).result()
 
-    def stream(self, make: Callable[[], Iterator[T]]) -> Iterator[T]:
+    def stream(self, make: Callable[[], Generator[T]]) -> Iterator[T]:
         """Yields what a generator yields. If the caller stops early, the generator is closed."""
         items: queue.SimpleQueue[T | _End] = queue.SimpleQueue()
         is_cancelled = threading.Event()

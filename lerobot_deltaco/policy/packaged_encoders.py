@@ -120,13 +120,17 @@ def read_bert(graph_file: bytes) -> BertModel:
             weights[f"{layer}.weight"] = arrays[node.input[1]].T
     try:
         vocabulary_size, hidden_size = weights["embeddings.word_embeddings.weight"].shape
-        config = BertConfig(
-            vocab_size=vocabulary_size,
-            hidden_size=hidden_size,
-            num_hidden_layers=len({name.split(".")[2] for name in weights if name.startswith("encoder.")}),
-            num_attention_heads=hidden_size // 32,  # as in every MiniLM
-            intermediate_size=len(weights["encoder.layer.0.intermediate.dense.bias"]),
-            max_position_embeddings=len(weights["embeddings.position_embeddings.weight"]),
+        layers = {name.split(".")[2] for name in weights if name.startswith("encoder.")}
+        # From a dictionary: type checkers do not see the arguments of transformers' decorated classes.
+        config = BertConfig.from_dict(
+            {
+                "vocab_size": vocabulary_size,
+                "hidden_size": hidden_size,
+                "num_hidden_layers": len(layers),
+                "num_attention_heads": hidden_size // 32,  # as in every MiniLM
+                "intermediate_size": len(weights["encoder.layer.0.intermediate.dense.bias"]),
+                "max_position_embeddings": len(weights["embeddings.position_embeddings.weight"]),
+            }
         )
         model = BertModel(config, add_pooling_layer=False)
         model.load_state_dict({name: torch.tensor(array) for name, array in weights.items()})
