@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -24,11 +25,12 @@ from small_policies import (
 
 from lerobot_deltaco.commands import experiment as experiment_command
 from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.data.finished_dataset import UNFINISHED
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
-from lerobot_deltaco.experiments import command_runner, side_by_side
+from lerobot_deltaco.experiments import command_runner, gpus, side_by_side
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
 from lerobot_deltaco.experiments.config import ExperimentConfigError, experiment_names, read_experiment
-from lerobot_deltaco.experiments.run import ExperimentRun
+from lerobot_deltaco.experiments.run import ExperimentRun, dataset_folder, run_folder
 from lerobot_deltaco.experiments.side_by_side import run_side_by_side
 from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS
 
@@ -210,13 +212,140 @@ def test_fewer_runs_than_jobs_take_all_cores(asked):
     assert commands.runners["deltaco"].n_threads == side_by_side.available_cores()
 
 
+@pytest.mark.parametrize(("listed", "expected"), [("2,3", ["2", "3"]), ("", []), ("1,-1,2", ["1"])])
+def test_the_gpus_are_those_that_the_environment_lists(monkeypatch, listed, expected):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", listed)
+    assert gpus.visible_gpus() == expected
+
+
+def test_without_a_list_all_gpus_are_visible(monkeypatch):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
+    assert gpus.visible_gpus() == ["0", "1", "2"]
+
+
+def test_each_of_several_runs_gets_a_gpu_of_its_own(asked, monkeypatch):
+    """No GPU has two runs while another one has none, also after some have ended."""
+    monkeypatch.setattr(side_by_side, "visible_gpus", lambda: ["5", "7", "GPU-1c"])
+    at_once, most = Counter(), Counter()
+
+    class Commands(_Commands):
+        def run(self, runner, command, arguments):
+            at_once[runner.gpu] += command != "collect"
+            for gpu in at_once:
+                most[gpu] = max(most[gpu], at_once[gpu])
+            super().run(runner, command, arguments)
+            at_once[runner.gpu] -= command != "collect"
+
+    run_side_by_side(
+        asked(Commands(), "deltaco", "language_only", "one_hot", seeds=(0, 1, 2)), 3, lambda run: None
+    )
+    assert most == {None: 0, "5": 1, "7": 1, "GPU-1c": 1}
+    most.clear()
+    run_side_by_side(asked(Commands(), "deltaco", seeds=range(10, 15)), 5, lambda run: None)
+    assert sorted(most[gpu] for gpu in ("5", "7", "GPU-1c")) == [1, 2, 2]
+
+
+@pytest.mark.parametrize(("gpus", "device"), [(["0"], "cuda"), (["0", "1"], "cpu"), (["0", "1"], "cuda:1")])
+def test_a_run_sees_all_gpus_where_it_has_no_choice(asked, monkeypatch, tmp_path, gpus, device):
+    monkeypatch.setattr(side_by_side, "visible_gpus", lambda: gpus)
+    commands = _Commands()
+    asked(commands)
+    config = read_experiment(FOLDER, "scenario_a/deltaco", [f"policy.device={device}"])
+    run_side_by_side([ExperimentRun(config, seed, tmp_path) for seed in (0, 1)], 2, lambda run: None)
+    assert {runner.gpu for runner in commands.runners.values()} == {None}
+
+
+# One step alone
+
+
+@pytest.fixture
+def called(monkeypatch, tmp_path):
+    """Runs `deltaco-experiment`, and returns the commands that it ran."""
+    calls = []
+    monkeypatch.setattr(CommandRunner, "run", lambda _, *call: calls.append(call))
+
+    def called(*arguments):
+        calls.clear()
+        experiment_command.main(
+            [*arguments, "--experiments", str(FOLDER), "--out", str(tmp_path), "--seed", "0", "1"]
+        )
+        return [command for command, _ in calls]
+
+    return called
+
+
+def finish_data(outputs, name):
+    config = read_experiment(FOLDER, name)
+    for plan in (config.data, config.demonstrations):
+        info = dataset_folder(outputs, plan) / "meta/info.json"
+        info.parent.mkdir(parents=True)
+        info.write_text('{"codebase_version": "v3.0"}')
+
+
+def finish_training(outputs, name, seed, step):
+    last = run_folder(outputs, name, seed) / "checkpoints/last"
+    for path, text in (
+        ("pretrained_model/train_config.json", "{}"),
+        ("training_state/training_step.json", f'{{"step": {step}}}'),
+    ):
+        (last / path).parent.mkdir(parents=True, exist_ok=True)
+        (last / path).write_text(text)
+
+
+def test_a_step_alone_runs_nothing_else(called, tmp_path):
+    names = ("small_a/deltaco", "small_a/language_only")
+    # Both experiments and seeds share the datasets.
+    assert called(*names, "--only", "collect") == ["collect"] * 2
+    finish_data(tmp_path, names[0])
+    for jobs in ("1", "2"):
+        assert called(*names, "--only", "train", "--jobs", jobs) == ["train"] * 4
+    steps = read_experiment(FOLDER, names[0]).training["steps"]
+    for name in names:
+        for seed in (0, 1):
+            finish_training(tmp_path, name, seed, steps)
+    assert called(*names, "--only", "train") == []
+    for jobs in ("1", "2"):
+        assert called(*names, "--only", "evaluate", "--jobs", jobs) == ["evaluate"] * 4
+
+
+def test_a_step_alone_says_what_it_lacks(called, tmp_path, capsys):
+    def refusal(*arguments):
+        with pytest.raises(SystemExit):
+            called("small_a/deltaco", *arguments)
+        return capsys.readouterr().err
+
+    assert "is missing. Collect it first: deltaco-experiment small_a/deltaco --only collect" in refusal(
+        "--only", "train"
+    )
+    finish_data(tmp_path, "small_a/deltaco")
+    info = next((tmp_path / "data").glob("*/meta/info.json"))
+    info.write_text(f'{{"codebase_version": "{UNFINISHED}"}}')
+    assert f"{info.parents[1]}, which is not finished" in refusal("--only", "train")
+    assert "has no checkpoint. Finish it first: deltaco-experiment small_a/deltaco --seed 0" in refusal(
+        "--only", "evaluate"
+    )
+    finish_training(tmp_path, "small_a/deltaco", 0, 7)
+    assert "stands at step 7 of" in refusal("--only", "evaluate")
+    assert "--only report needs --report" in refusal("--only", "report")
+    assert (
+        "no record of an evaluation of small_a/deltaco with seed 0, small_a/deltaco with seed 1"
+        in refusal("--only", "report", "--report", str(tmp_path / "report"))
+    )
+
+
+def test_a_dry_run_prints_the_commands_of_a_step_alone(called, capsys):
+    assert called("small_a/deltaco", "--dry-run", "--only", "collect") == []
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["deltaco-collect"] * 2
+
+
 def test_a_row_waits_for_the_one_that_it_starts_from(asked, monkeypatch):
     commands = _Commands()
     experiments = asked(commands, "demo_only_finetuned_10", "demo_only", "deltaco")
     monkeypatch.setattr(
         ExperimentRun,
         "train_and_evaluate",
-        lambda self, runner: commands.run(runner, "train", [f"--output_dir={self.folder}"]),
+        lambda self, runner, step: commands.run(runner, "train", [f"--output_dir={self.folder}"]),
     )
     run_side_by_side(experiments, 3, lambda run: None)
     began = commands.events.index(("began", "train", "demo_only_finetuned_10"))
@@ -314,11 +443,12 @@ def test_a_command_prints_to_its_log_with_its_share_of_the_cores(tmp_path, monke
     monkeypatch.setattr(subprocess, "Popen", Process)
     log = tmp_path / "log"
     log.write_text("of before\n")
-    CommandRunner(log, n_threads=3).run("train", ["--steps=5"])
+    CommandRunner(log, n_threads=3, gpu="2").run("train", ["--steps=5"])
     assert log.read_text() == "of before\n\ndeltaco-train --steps=5\nwhat it says\n"
     assert started["words"][-2:] == ["lerobot_deltaco.commands.train", "--steps=5"]
     assert started["stderr"] == subprocess.STDOUT
     assert started["env"]["OMP_NUM_THREADS"] == "3"
+    assert started["env"]["CUDA_VISIBLE_DEVICES"] == "2"
 
 
 def test_a_command_that_fails_names_its_log_which_says_why(tmp_path):

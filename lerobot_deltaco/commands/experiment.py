@@ -15,7 +15,7 @@ from lerobot_deltaco.experiments.config import (
     experiment_names,
     read_experiment,
 )
-from lerobot_deltaco.experiments.run import ExperimentRun
+from lerobot_deltaco.experiments.run import STEPS, ExperimentRun, missing_records
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -27,6 +27,8 @@ def main(arguments: list[str] | None = None) -> None:
     if options.list:
         sys.stdout.write("".join(f"{name}\n" for name in experiment_names(options.experiments)))
         return
+    if options.only == "report" and options.report is None:
+        parser.error("--only report needs --report DIR, the folder for the report.")
     if not options.names:
         parser.error("Name at least one experiment. --list prints their names.")
     try:
@@ -41,11 +43,11 @@ def main(arguments: list[str] | None = None) -> None:
     ]
     if options.dry_run:
         with exit_on_error(parser, ExperimentError, OSError):
-            _print_commands(runs)
+            _print_commands(runs, options.only)
         return
     # Only here, since they take a second to import.
     from lerobot_deltaco.evaluation.record import RecordError
-    from lerobot_deltaco.experiments.side_by_side import run_side_by_side
+    from lerobot_deltaco.experiments.side_by_side import collect_once, run_side_by_side
     from lerobot_deltaco.reporting.report import write_report
     from lerobot_deltaco.reporting.series import ReportError
 
@@ -54,23 +56,39 @@ def main(arguments: list[str] | None = None) -> None:
     def report(run: Path) -> None:
         """Writes the report after each run, so that there is one after an interruption, too."""
         finished.append(run)
-        if options.report is not None:
+        if options.report is not None and options.only != "train":
             write_report(finished, options.report)
 
     with exit_on_error(parser, ExperimentError, ReportError, RecordError, OSError):
-        if options.jobs > 1:
-            run_side_by_side(runs, options.jobs, report)
+        if options.only == "report":
+            _report(runs, options.report)
+        elif options.only == "collect":
+            for run in runs:
+                run.check_settings()
+            collect_once(runs)
+        elif options.jobs > 1:
+            run_side_by_side(runs, options.jobs, report, options.only)
         else:
             for run in runs:
-                run.run()
+                run.run(options.only)
                 report(run.folder)
 
 
-def _print_commands(runs: list[ExperimentRun]) -> None:
+def _report(runs: list[ExperimentRun], folder: Path) -> None:
+    """Writes the report of runs that have been evaluated, and runs nothing."""
+    from lerobot_deltaco.reporting.report import write_report
+
+    problem = missing_records(runs)
+    if problem is not None:
+        raise ExperimentError(problem)
+    write_report([run.folder for run in runs], folder)
+
+
+def _print_commands(runs: list[ExperimentRun], only: str | None) -> None:
     """Prints each command that the runs would run, once."""
     for run in runs:
         run.check_settings()
-    commands = [command for run in runs for command in run.commands()]
+    commands = [command for run in runs for command in run.commands() if only in (None, command.name)]
     lines = dict.fromkeys(shlex.join([f"deltaco-{name}", *arguments]) for name, arguments in commands)
     sys.stdout.write("".join(f"{line}\n" for line in lines))
 
@@ -110,7 +128,15 @@ def _parser() -> argparse.ArgumentParser:
         default=1,
         metavar="N",
         help="number of runs at a time (default: %(default)s). Each gets an equal share of the processor's "
-        "cores and holds its own copy of the frames in memory; on a GPU, all share it.",
+        "cores, holds its own copy of the frames in memory, and gets a GPU of its own; where there are fewer "
+        "GPUs than runs, they share them.",
+    )
+    parser.add_argument(
+        "--only",
+        choices=(*STEPS, "report"),
+        metavar="STEP",
+        help="run only this step: collect, train, evaluate or report. The steps before it must be finished. "
+        "So the jobs of a cluster can share datasets.",
     )
     parser.add_argument(
         "--report", type=Path, metavar="DIR", help="folder for the report, as deltaco-report writes it"

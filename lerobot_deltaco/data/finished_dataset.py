@@ -49,6 +49,16 @@ _ENTRY_FIELDS = {
 }
 
 
+def is_finished(root: Path) -> bool:
+    """Whether a folder holds a dataset that no collection is adding to. Only its info.json is read."""
+    try:
+        info = json.loads((root / files.INFO_FILE).read_text(encoding="utf-8"))
+        is_unfinished = info["codebase_version"] == UNFINISHED
+    except (OSError, ValueError, TypeError, KeyError):
+        return False
+    return not is_unfinished and not (root / STAGING / "plan.json").exists()
+
+
 def read_json(path: Path, kind: Any) -> Any:
     """Contents of a JSON file.
 

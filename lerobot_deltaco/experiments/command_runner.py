@@ -26,11 +26,13 @@ class CommandRunner:
     Args:
         log: A file that what they print is appended to; None is this terminal.
         n_threads: How many of the processor's cores they may use; None is all.
+        gpu: The one GPU that they see, as `CUDA_VISIBLE_DEVICES` names it; None is all.
     """
 
-    def __init__(self, log: Path | None = None, n_threads: int | None = None) -> None:
+    def __init__(self, log: Path | None = None, n_threads: int | None = None, gpu: str | None = None) -> None:
         self.log = log
         self.n_threads = n_threads
+        self.gpu = gpu
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = False
         self._lock = threading.Lock()
@@ -79,6 +81,8 @@ class CommandRunner:
         environment = {}
         if self.n_threads is not None:
             environment["OMP_NUM_THREADS"] = str(self.n_threads)
+        if self.gpu is not None:
+            environment["CUDA_VISIBLE_DEVICES"] = self.gpu
         if self.log is not None:
             environment["TQDM_MININTERVAL"] = str(SECONDS_BETWEEN_PROGRESS)
         return environment

@@ -1,17 +1,26 @@
-"""Runs an experiment: collects its data, trains and evaluates all checkpoints. Finished steps are skipped."""
+"""Runs an experiment: collects its data, trains and evaluates all checkpoints. Finished steps are skipped.
+
+A step alone needs what the steps before it made, and says what is missing. It neither begins nor locks
+anything else, so that the jobs of a cluster may each run one.
+"""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from gym_deltaco.atomic_files import write_json
 from lerobot_deltaco.common.run_folder import last_policy, last_step, last_train_config
+from lerobot_deltaco.data.finished_dataset import is_finished
+from lerobot_deltaco.evaluation.record import RECORDS_FOLDER
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
 from lerobot_deltaco.experiments.config import ExperimentConfig
+
+Step = Literal["collect", "train", "evaluate"]
+STEPS: tuple[Step, ...] = get_args(Step)
 
 
 class Command(NamedTuple):
@@ -37,15 +46,17 @@ class ExperimentRun:
         self.folder = run_folder(outputs, config.name, seed)
         self.log = self.folder.with_name(f"{self.folder.name}.log")  # if several run at the same time
 
-    def run(self) -> None:
-        """Runs all steps that are not finished yet.
+    def run(self, step: Step | None = None) -> None:
+        """Runs all steps that are not finished yet, or one of them.
 
         Raises:
-            ExperimentError: A step failed, or the run was started with other settings.
+            ExperimentError: A step failed or lacks what it needs, or the run was started with other settings.
         """
         self.check_settings()
-        self.collect()
-        self.train_and_evaluate(CommandRunner())
+        if step in (None, "collect"):
+            self.collect()
+        if step != "collect":
+            self.train_and_evaluate(CommandRunner(), step)
 
     def commands(self) -> list[Command]:
         """The commands that `run` would run now."""
@@ -67,26 +78,76 @@ class ExperimentRun:
                     f"{values}. Use the same settings or another --out, or move the run and {file.name} away."
                 )
 
+    @property
+    def uses_any_gpu(self) -> bool:
+        """Whether it trains on whichever GPU it sees, rather than on a certain one or on none."""
+        return self.config.policy.get("device") in (None, "cuda")
+
     def collect(self) -> None:
         """Collects the datasets that the experiment needs; complete ones are kept as they are."""
         for command in self._collect_commands():
             CommandRunner().run(*command)
 
-    def train_and_evaluate(self, runner: CommandRunner) -> None:
-        """Trains on the collected datasets, and evaluates.
+    def train_and_evaluate(self, runner: CommandRunner, step: Step | None = None) -> None:
+        """Trains on the collected datasets, and evaluates; or does one of both.
 
         Raises:
-            ExperimentError: A step failed, or the experiment that this one starts from was not trained.
+            ExperimentError: A step failed; the experiment that this one starts from was not trained; or a
+                step that is run alone lacks what it needs.
         """
+        if step in (None, "train"):
+            if step == "train":
+                self.check_data()
+            self._train(runner)
+        if step in (None, "evaluate"):
+            if step == "evaluate":
+                self.check_trained()
+            runner.run(*self._evaluate_command())
+
+    def check_data(self) -> None:
+        """Checks that the datasets are finished; they are not locked.
+
+        Raises:
+            ExperimentError: One is missing, or its collection is not finished.
+        """
+        plans = (self.config.data, self.config.demonstrations)
+        for root in dict.fromkeys(dataset_folder(self.outputs, plan) for plan in plans):
+            if not is_finished(root):
+                state = "is not finished" if root.exists() else "is missing"
+                raise ExperimentError(
+                    f"{self.config.name} is trained on the dataset {root}, which {state}. Collect it first: "
+                    f"deltaco-experiment {self.config.name} --only collect, with the same --set and --out."
+                )
+
+    def check_trained(self) -> None:
+        """Checks that the training has come to its end.
+
+        Raises:
+            ExperimentError: It has not.
+        """
+        steps = self.config.training["steps"]
+        reached = last_step(self.folder) if last_train_config(self.folder).exists() else 0
+        if reached < steps:
+            state = f"stands at step {reached} of {steps}" if reached else "has no checkpoint"
+            raise ExperimentError(
+                f"The training in {self.folder} {state}. Finish it first: deltaco-experiment "
+                f"{self.config.name} --seed {self.seed} --only train, with the same --set and --out."
+            )
+
+    def has_records(self) -> bool:
+        """Whether an evaluation has left a record, from which a report can be made."""
+        return any((self.folder / RECORDS_FOLDER).glob("*.json"))
+
+    def _train(self, runner: CommandRunner) -> None:
         write_json(self._settings_file(), self._settings())
         train = self._train_command()
-        if train is not None:
-            if not last_train_config(self.folder).exists():
-                self._check_start()
-                # An interrupted training may have left a folder without any checkpoint.
-                shutil.rmtree(self.folder, ignore_errors=True)
-            runner.run(*train)
-        runner.run(*self._evaluate_command())
+        if train is None:
+            return
+        if not last_train_config(self.folder).exists():
+            self._check_start()
+            # An interrupted training may have left a folder without any checkpoint.
+            shutil.rmtree(self.folder, ignore_errors=True)
+        runner.run(*train)
 
     def _settings_file(self) -> Path:
         return self.folder.with_name(f"{self.folder.name}.json")
@@ -179,6 +240,17 @@ def run_folder(outputs: Path, experiment_name: str, seed: int) -> Path:
 def dataset_folder(outputs: Path, plan: Mapping[str, Any]) -> Path:
     """The folder of a collection's dataset, which experiments share."""
     return outputs / "data" / "_".join(f"{key}-{value}" for key, value in sorted(plan.items()))
+
+
+def missing_records(runs: Sequence[ExperimentRun]) -> str | None:
+    """What to do about the runs without any record; None if all have some."""
+    missing = [f"{run.config.name} with seed {run.seed}" for run in runs if not run.has_records()]
+    if not missing:
+        return None
+    return (
+        f"There is no record of an evaluation of {', '.join(missing)}. Evaluate first: deltaco-experiment "
+        "--only evaluate, with the same --set and --out; or name fewer experiments and seeds."
+    )
 
 
 def _text(value: Any) -> str:

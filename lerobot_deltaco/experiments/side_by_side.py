@@ -1,7 +1,8 @@
 """Runs several experiments at the same time.
 
 A small network does not keep several processor cores busy: two trainings with a core each have a higher
-throughput than one after the other with both cores. (Measured with `small_a` on two cores: 1.4x.)
+throughput than one after the other with both cores. (Measured with `small_a` on two cores: 1.4x.) Where
+there are several GPUs, each run sees one of them.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from lerobot_deltaco.experiments.command_runner import CommandRunner
-from lerobot_deltaco.experiments.run import ExperimentRun, run_folder
+from lerobot_deltaco.experiments.gpus import gpu_of_its_own, visible_gpus
+from lerobot_deltaco.experiments.run import ExperimentRun, Step, run_folder
 
 SECONDS_BETWEEN_LOOKS = 1.0
 SECONDS_BETWEEN_LINES = 60.0  # where what is printed goes to a file
@@ -32,7 +34,12 @@ class _Running(NamedTuple):
     commands: CommandRunner
 
 
-def run_side_by_side(experiments: Sequence[ExperimentRun], jobs: int, report: Callable[[Path], None]) -> None:
+def run_side_by_side(
+    experiments: Sequence[ExperimentRun],
+    jobs: int,
+    report: Callable[[Path], None],
+    step: Step | None = None,
+) -> None:
     """Collects what is missing, one dataset after the other; trains and evaluates several runs at a time.
 
     Each run prints to its log. An experiment that starts from another one of these waits for it.
@@ -41,21 +48,19 @@ def run_side_by_side(experiments: Sequence[ExperimentRun], jobs: int, report: Ca
         experiments: What to run; each is another run.
         jobs: How many at a time. Each takes the same share of the processor's cores, also when some are done.
         report: Called with the folder of each run that is complete.
+        step: The only step to run, "train" or "evaluate"; None for all.
 
     Raises:
         ExperimentError: A step failed. Those that had begun were completed, no other was begun.
     """
     for experiment in experiments:
         experiment.check_settings()
-    collected = []
-    for experiment in experiments:
-        plans = (experiment.config.data, experiment.config.demonstrations)
-        if plans not in collected:
-            experiment.collect()
-            collected.append(plans)
+    if step is None:
+        collect_once(experiments)
 
     jobs = min(jobs, len(experiments))
     n_threads = max(1, available_cores() // jobs)
+    gpus = visible_gpus() if jobs > 1 else []
     waiting = list(experiments)
     running: dict[Future[None], _Running] = {}
     failure: Exception | None = None
@@ -64,10 +69,14 @@ def run_side_by_side(experiments: Sequence[ExperimentRun], jobs: int, report: Ca
             while running or (waiting and failure is None):
                 while failure is None and len(running) < jobs and (ready := _next(waiting, running.values())):
                     waiting.remove(ready)
-                    commands = CommandRunner(ready.log, n_threads)
-                    future = pool.submit(ready.train_and_evaluate, commands)
+                    gpu = None
+                    if ready.uses_any_gpu:
+                        gpu = gpu_of_its_own(gpus, [now.commands.gpu for now in running.values()])
+                    commands = CommandRunner(ready.log, n_threads, gpu)
+                    future = pool.submit(ready.train_and_evaluate, commands, step)
                     running[future] = _Running(ready, commands)
-                    progress.write(f"{_label(ready)} prints to {ready.log}")
+                    place = "" if gpu is None else f" runs on GPU {gpu} and"
+                    progress.write(f"{_label(ready)}{place} prints to {ready.log}")
                 done, _ = wait(running, SECONDS_BETWEEN_LOOKS, FIRST_COMPLETED)
                 for future in done:
                     experiment = running.pop(future).experiment
@@ -85,6 +94,16 @@ def run_side_by_side(experiments: Sequence[ExperimentRun], jobs: int, report: Ca
             raise
     if failure is not None:
         raise failure
+
+
+def collect_once(experiments: Sequence[ExperimentRun]) -> None:
+    """Collects what is missing, one dataset after the other, and each once."""
+    collected = []
+    for experiment in experiments:
+        plans = (experiment.config.data, experiment.config.demonstrations)
+        if plans not in collected:
+            experiment.collect()
+            collected.append(plans)
 
 
 def available_cores() -> int:
