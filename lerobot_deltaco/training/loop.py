@@ -13,6 +13,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import chain, cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,31 @@ class ResumableSampler(EpisodeAwareSampler):
 
     accelerate 1.15 counts the epochs of a process from 0, and sets them in the sampler: with LeRobot's own,
     a resumed training begins with the order of the first epoch, wherever it was interrupted.
+
+    Several processes take batches in turn. Where the last turn of an epoch is not complete, accelerate fills
+    it up with the first batches that it has seen; after a resume, these are not the epoch's first. So the
+    epoch is filled up here, with the same frames.
+
+    Args:
+        arguments: Those of LeRobot's sampler.
+        samples_per_turn: Samples that all processes take in a turn; 1 for a single process, whose last batch
+            may be smaller.
+        options: Those of LeRobot's sampler.
     """
+
+    def __init__(self, *arguments: Any, samples_per_turn: int = 1, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._n_filled_up = -super().__len__() % samples_per_turn
+
+    def __len__(self) -> int:
+        return super().__len__() + self._n_filled_up
+
+    def __iter__(self) -> Iterator[int]:
+        state = self.state_dict()
+        self.load_state_dict({**state, "start_index": 0})
+        first = super().__iter__()
+        self.load_state_dict(state)
+        return chain(super().__iter__(), islice(cycle(first), self._n_filled_up))
 
     def set_epoch(self, epoch: int) -> None:
         """Does nothing: the epoch is that of `load_state_dict`, or follows the last one."""
@@ -144,8 +169,14 @@ class InMemoryTraining:
 
     def make_sampler(self, from_indices: Any, to_indices: Any, **options: Any) -> Any:
         """Batches of tasks if they are wanted, else LeRobot's sampler."""
-        stock = ResumableSampler(from_indices, to_indices, **options)
         assert self._config is not None
+        n_processes = _n_processes()
+        stock = ResumableSampler(
+            from_indices,
+            to_indices,
+            samples_per_turn=self._config.batch_size * n_processes if n_processes > 1 else 1,
+            **options,
+        )
         assert self._frames is not None
         config: DeltacoConfig = self._config.policy
         if not config.tasks_per_batch:
@@ -177,6 +208,7 @@ class InMemoryTraining:
             config.upsampled_share,
             seed=options.get("seed", 0),
             use=use,
+            n_processes=n_processes,
         )
 
     def batches(self, loader: Any) -> Iterator[dict[str, Any]]:
@@ -244,6 +276,11 @@ class InMemoryTraining:
         from accelerate import PartialState
 
         return PartialState().device
+
+
+def _n_processes() -> int:
+    """How many processes train together."""
+    return torch.distributed.get_world_size() if torch.distributed.is_initialized() else 1
 
 
 def train() -> None:

@@ -24,6 +24,7 @@ class TaskBatchSampler:
         upsampled_share: That share of `tasks_per_batch`, which must be a whole number of tasks.
         seed: Seed of the order.
         use: Which frames are drawn, (frames,) bool; all by default.
+        n_processes: Number of processes that take batches in turn; an epoch has whole turns.
 
     Raises:
         ValueError: The numbers do not fit; the message says what does.
@@ -38,6 +39,7 @@ class TaskBatchSampler:
         upsampled_share: float = 0.0,
         seed: int = 0,
         use: NDArray[np.bool_] | None = None,
+        n_processes: int = 1,
     ) -> None:
         if batch_size % tasks_per_batch:
             raise ValueError(
@@ -51,7 +53,8 @@ class TaskBatchSampler:
         frames = np.arange(len(tasks)) if use is None else np.flatnonzero(use)
         self._frames_of = {int(task): frames[tasks[frames] == task] for task in np.unique(tasks[frames])}
         self._groups = self._make_groups(tasks_per_batch, set(upsampled), upsampled_share)
-        self._n_batches = max(1, len(frames) // batch_size)
+        n_turns = -(-max(1, len(frames) // batch_size) // n_processes)
+        self._n_batches = n_turns * n_processes
         self._epoch = 0
         self._start_index = 0
 
