@@ -72,7 +72,7 @@ def measure_parts(episodes_per_task: int) -> dict[str, float]:
     env = PickPlaceEnv()
     env.reset(seed=0)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        job = collection._make_job(Path(folder), plan, None)
+        job = collection.make_job(Path(folder), plan)
         worker = collection._Worker(job, env, files.data_schema(plan.features))
         stack.enter_context(mock.patch.object(collection, "_worker", worker))
         for owner, name in (

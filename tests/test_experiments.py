@@ -24,6 +24,7 @@ from small_policies import (
 )
 
 from lerobot_deltaco.commands import experiment as experiment_command
+from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.finished_dataset import UNFINISHED
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
@@ -203,13 +204,13 @@ def test_runs_side_by_side_are_all_done_in_their_logs_with_their_share_of_the_co
     assert commands.most_at_once == 2
     for config in ("deltaco", "language_only", "one_hot"):
         assert commands.runners[config].log.parent.name == config
-        assert commands.runners[config].n_threads == max(1, side_by_side.available_cores() // 2)
+        assert commands.runners[config].n_threads == max(1, available_cores() // 2)
 
 
 def test_fewer_runs_than_jobs_take_all_cores(asked):
     commands = _Commands()
     run_side_by_side(asked(commands, "deltaco"), 100, lambda run: None)
-    assert commands.runners["deltaco"].n_threads == side_by_side.available_cores()
+    assert commands.runners["deltaco"].n_threads == available_cores()
 
 
 @pytest.mark.parametrize(("listed", "expected"), [("2,3", ["2", "3"]), ("", []), ("1,-1,2", ["1"])])
@@ -337,6 +338,17 @@ def test_a_step_alone_says_what_it_lacks(called, tmp_path, capsys):
 def test_a_dry_run_prints_the_commands_of_a_step_alone(called, capsys):
     assert called("small_a/deltaco", "--dry-run", "--only", "collect") == []
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["deltaco-collect"] * 2
+
+
+def test_shards_are_passed_on_to_the_collections(called, monkeypatch, capsys):
+    arguments = []
+    monkeypatch.setattr(CommandRunner, "run", lambda _, *call: arguments.append(call[1]))
+    called("small_a/deltaco", "--only", "collect", "--shard", "2/5")
+    called("small_a/deltaco", "--only", "collect", "--join")
+    assert [call[-1] for call in arguments] == ["--shard=2/5"] * 2 + ["--join"] * 2
+    with pytest.raises(SystemExit):
+        called("small_a/deltaco", "--join")
+    assert "--shard and --join need --only collect" in capsys.readouterr().err
 
 
 def test_a_row_waits_for_the_one_that_it_starts_from(asked, monkeypatch):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +13,7 @@ from gym_deltaco import EXPERT_NOISE, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY
 from lerobot_deltaco.commands.command_errors import exit_on_error
+from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.data.collection_plan import COLLECTED_SPLITS, DATA_SETS, CollectionPlan
 
 # What takes long to import is imported where it is used, so that --help and worker processes start quickly.
@@ -49,13 +49,48 @@ def main(arguments: list[str] | None = None) -> None:
         )
     except ValueError as error:
         parser.error(str(error))
+    if options.append and (options.join or options.shard):
+        parser.error("--append adds to a finished dataset. It cannot be combined with --shard and --join.")
+    if options.shard is not None:
+        _collect_shard(parser, options, plan)
+        return
     _check_sharing(parser, options)
     with exit_on_error(parser, CollectionError, OSError):
-        summary = collect(options.root, plan, options.workers, options.append)
+        if options.join:
+            from lerobot_deltaco.data.shards import join_shards
+
+            summary = join_shards(options.root, plan, options.workers)
+        else:
+            summary = collect(options.root, plan, options.workers, options.append)
     sys.stdout.write(_text(summary, options.root))
     if options.summary:
         options.summary.write_text(json.dumps(asdict(summary), indent=2) + "\n")
     _share(parser, options)
+
+
+def _collect_shard(
+    parser: argparse.ArgumentParser, options: argparse.Namespace, plan: CollectionPlan
+) -> None:
+    """Collects a part of the dataset, into a folder beside it."""
+    from lerobot_deltaco.data.collection import CollectionError
+    from lerobot_deltaco.data.shards import Shard, collect_shard
+
+    if options.push_to_hub:
+        parser.error("A shard is no dataset yet: push with --join.")
+    try:
+        shard = Shard.parse(options.shard)
+    except ValueError as error:
+        parser.error(str(error))
+    with exit_on_error(parser, CollectionError, OSError):
+        summary = collect_shard(options.root, plan, shard, options.workers)
+    speed = "nothing to do" if summary.episodes_per_s is None else f"{summary.episodes_per_s:.1f} episodes/s"
+    sys.stdout.write(
+        f"{summary.folder}: {summary.episodes} of {summary.all_episodes} episodes; {speed}.\n"
+        "When all shards are there, join them: the same command with --join instead of --shard.\n"
+    )
+    if options.summary:
+        contents = {**asdict(summary), "folder": str(summary.folder)}
+        options.summary.write_text(json.dumps(contents, indent=2) + "\n")
 
 
 def _check_sharing(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
@@ -180,8 +215,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--workers",
         type=int,
-        default=os.cpu_count(),
+        default=available_cores(),
         help="number of processes, which does not change the dataset (default: %(default)s)",
+    )
+    shards = parser.add_mutually_exclusive_group()
+    shards.add_argument(
+        "--shard",
+        metavar="I/N",
+        help="collect only the I-th of N equal parts, into ROOT.shards/I-of-N: for N machines",
+    )
+    shards.add_argument(
+        "--join",
+        action="store_true",
+        help="join the shards in ROOT.shards into the dataset that one machine would have collected",
     )
     parser.add_argument("--repo-id", metavar="USER/NAME", help="name of the dataset on the Hugging Face Hub")
     parser.add_argument(

@@ -29,6 +29,8 @@ def main(arguments: list[str] | None = None) -> None:
         return
     if options.only == "report" and options.report is None:
         parser.error("--only report needs --report DIR, the folder for the report.")
+    if options.only != "collect" and _shard_options(options):
+        parser.error("--shard and --join need --only collect.")
     if not options.names:
         parser.error("Name at least one experiment. --list prints their names.")
     try:
@@ -43,7 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     ]
     if options.dry_run:
         with exit_on_error(parser, ExperimentError, OSError):
-            _print_commands(runs, options.only)
+            _print_commands(runs, options.only, _shard_options(options))
         return
     # Only here, since they take a second to import.
     from lerobot_deltaco.evaluation.record import RecordError
@@ -65,13 +67,18 @@ def main(arguments: list[str] | None = None) -> None:
         elif options.only == "collect":
             for run in runs:
                 run.check_settings()
-            collect_once(runs)
+            collect_once(runs, _shard_options(options))
         elif options.jobs > 1:
             run_side_by_side(runs, options.jobs, report, options.only)
         else:
             for run in runs:
                 run.run(options.only)
                 report(run.folder)
+
+
+def _shard_options(options: argparse.Namespace) -> list[str]:
+    """What is passed on to the collections."""
+    return ["--join"] if options.join else [f"--shard={options.shard}"] if options.shard else []
 
 
 def _report(runs: list[ExperimentRun], folder: Path) -> None:
@@ -84,12 +91,15 @@ def _report(runs: list[ExperimentRun], folder: Path) -> None:
     write_report([run.folder for run in runs], folder)
 
 
-def _print_commands(runs: list[ExperimentRun], only: str | None) -> None:
+def _print_commands(runs: list[ExperimentRun], only: str | None, shard_options: list[str]) -> None:
     """Prints each command that the runs would run, once."""
     for run in runs:
         run.check_settings()
     commands = [command for run in runs for command in run.commands() if only in (None, command.name)]
-    lines = dict.fromkeys(shlex.join([f"deltaco-{name}", *arguments]) for name, arguments in commands)
+    lines = dict.fromkeys(
+        shlex.join([f"deltaco-{name}", *arguments, *(shard_options if name == "collect" else ())])
+        for name, arguments in commands
+    )
     sys.stdout.write("".join(f"{line}\n" for line in lines))
 
 
@@ -137,6 +147,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="STEP",
         help="run only this step: collect, train, evaluate or report. The steps before it must be finished. "
         "So the jobs of a cluster can share datasets.",
+    )
+    shards = parser.add_mutually_exclusive_group()
+    shards.add_argument(
+        "--shard", metavar="I/N", help="with --only collect: collect the I-th of N parts of each dataset"
+    )
+    shards.add_argument(
+        "--join", action="store_true", help="with --only collect: join the parts of each dataset"
     )
     parser.add_argument(
         "--report", type=Path, metavar="DIR", help="folder for the report, as deltaco-report writes it"

@@ -78,6 +78,7 @@ from lerobot_deltaco.data.integrity import (
 # The same folder once all is done; it is renamed before it is removed, so that it never counts half-removed.
 FINISHED_STAGING = ".collecting.finished"
 JOINED = "joined"
+LOCK = "lock"
 # Each worker holds it as long as it lives.
 WORKERS_LOCK = "workers"
 # What a collection under way has in its folder, once its plan is written down.
@@ -127,7 +128,7 @@ class _Base:
 
 
 @dataclass(frozen=True)
-class _Job:
+class Job:
     """Everything that a worker needs to know of a collection."""
 
     root: Path
@@ -139,9 +140,11 @@ class _Job:
     base_frames: int
     base_files: int
     episodes_per_file: int
+    collected: range  # the episodes that are collected here; those of a shard are not all
 
     @property
     def staging(self) -> Path:
+        """The folder of the collection under way."""
         return self.root / STAGING
 
     @property
@@ -169,7 +172,32 @@ class _Job:
 
     @property
     def n_parts(self) -> int:
+        """Number of data files of the whole plan."""
         return -(-self.plan.n_episodes // self.episodes_per_file)
+
+    @property
+    def parts(self) -> range:
+        """The data files with episodes that are collected here."""
+        if not self.collected:
+            return range(0)
+        size = self.episodes_per_file
+        return range(self.collected.start // size, -(-self.collected.stop // size))
+
+    def is_whole(self, part: int) -> bool:
+        """Whether all episodes of a data file are collected here, so that they can be joined."""
+        episodes = self.part(part)
+        return self.collected.start <= episodes.start and episodes.stop <= self.collected.stop
+
+    def missing_episodes(self, part: int) -> list[int]:
+        """The episodes of a data file that are to be collected here, and have not been."""
+        if self.part_file(part).exists():
+            return []
+        episodes = self.part(part)
+        first, stop = (
+            max(episodes.start, self.collected.start),
+            min(episodes.stop, self.collected.stop),
+        )
+        return [index for index in range(first, stop) if not self.episode_file(index).exists()]
 
     def task_and_number(self, index: int) -> tuple[int, int]:
         """Task of an episode, and its number among those of the task."""
@@ -196,12 +224,32 @@ def collect(root: Path, plan: CollectionPlan, n_workers: int = 1, append: bool =
         OSError: The folder cannot be written to, or is full. What is finished is kept.
     """
     try:
-        return _collect_into(root, plan, n_workers, append)
+        return collect_into(root, plan, n_workers, append)
     except DatasetError as error:
         raise CollectionError(str(error)) from None
 
 
-def _collect_into(root: Path, plan: CollectionPlan, n_workers: int, append: bool) -> Summary:
+def collect_into(
+    root: Path,
+    plan: CollectionPlan,
+    n_workers: int,
+    append: bool = False,
+    bring: Callable[[Job], None] | None = None,
+) -> Summary:
+    """As `collect`; what was collected elsewhere is brought first.
+
+    Args:
+        root: As in `collect`.
+        plan: As in `collect`.
+        n_workers: As in `collect`.
+        append: As in `collect`.
+        bring: Puts files of episodes and parts where the job looks for them. What it does may be repeated.
+
+    Raises:
+        DatasetError: A file is damaged.
+        CollectionError: As in `collect`.
+        OSError: As in `collect`.
+    """
     root.mkdir(parents=True, exist_ok=True)
     base = _read_base(root)
     staging = root / STAGING
@@ -210,21 +258,23 @@ def _collect_into(root: Path, plan: CollectionPlan, n_workers: int, append: bool
         if not append and base.plans == [plan] and not (staging / "plan.json").exists():
             return _summary(root, episodes_per_s=None)
     _check_may_begin(root, base, plan, append)
-    with _locked(staging):
+    with locked(staging):
         # Both again: only now can no other process come between.
         if _read_base(root) != base:
             raise CollectionError(
                 f"Another process has just finished collecting into {root}. Look at it first."
             )
         _check_may_begin(root, base, plan, append)
-        write_checked_json(staging / "plan.json", _identity(plan, append))
+        write_checked_json(staging / "plan.json", identity(plan, append))
         seconds = n_collected = 0.0
         if not (staging / "commit.json").exists():
             if base is None:
                 _mark_unfinished(root, plan)
-            job = _make_job(root, plan, base)
+            job = make_job(root, plan, base)
+            if bring is not None:
+                bring(job)
             start = time.perf_counter()
-            n_collected = _run(job, n_workers)
+            n_collected = run_job(job, n_workers)
             seconds = time.perf_counter() - start
             _prepare_commit(job, base)
         _commit(root)
@@ -273,7 +323,7 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
     plan_file = root / STAGING / "plan.json"
     if plan_file.exists():
         remedy = f"The arguments of the collection are lost: delete {root}, and collect again."
-        begun, wanted = read_checked_json(plan_file, remedy), _identity(plan, append)
+        begun, wanted = read_checked_json(plan_file, remedy), identity(plan, append)
         differences = [
             f"{name}: {begun.get(name)} there, {wanted[name]} now"
             for name in wanted
@@ -320,7 +370,7 @@ def _is_begun(root: Path) -> bool:
     return info_file.exists() and read_json(info_file, dict[str, Any]).get("codebase_version") == UNFINISHED
 
 
-def _identity(plan: CollectionPlan, append: bool) -> dict[str, Any]:
+def identity(plan: CollectionPlan, append: bool = False) -> dict[str, Any]:
     """What has to be the same for a collection to be continued."""
     return {
         **asdict(plan),
@@ -331,16 +381,21 @@ def _identity(plan: CollectionPlan, append: bool) -> dict[str, Any]:
     }
 
 
+def versions() -> dict[str, str]:
+    """Versions of what an episode depends on."""
+    return {name: version(name) for name in ("lerobot_policy_deltaco", "pybullet", "numpy")}
+
+
 def _mark_unfinished(root: Path, plan: CollectionPlan) -> None:
     info = files.dataset_info(plan.features, FPS, ROBOT_TYPE, 0, 0, 0)
     write_json(root / files.INFO_FILE, {**info, "codebase_version": UNFINISHED})
 
 
 @contextmanager
-def _locked(staging: Path) -> Iterator[None]:
+def locked(staging: Path) -> Iterator[None]:
     """Keeps a second collection out; the lock ends with the process, however it ends."""
     staging.mkdir(exist_ok=True)
-    with (staging / "lock").open("w") as lock, (staging / WORKERS_LOCK).open("w") as workers_lock:
+    with (staging / LOCK).open("w") as lock, (staging / WORKERS_LOCK).open("w") as workers_lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -353,12 +408,22 @@ def _locked(staging: Path) -> Iterator[None]:
         yield
 
 
-def _make_job(root: Path, plan: CollectionPlan, base: _Base | None) -> _Job:
+def make_job(
+    root: Path, plan: CollectionPlan, base: _Base | None = None, collected: range | None = None
+) -> Job:
+    """What workers need to know of a collection.
+
+    Args:
+        root: The dataset's folder.
+        plan: What the dataset gets.
+        base: What is added to, if anything.
+        collected: The episodes of the plan that are collected in this folder; all by default.
+    """
     base = base or _Base([], 0, 0, 0, {}, [], {})
     instructions = dict.fromkeys([*base.tasks, *(get_task(task_id).instruction for task_id in plan.task_ids)])
     order = {instruction: index for index, instruction in enumerate(instructions)}
     taken = first_numbers(plan, base.plans)
-    return _Job(
+    return Job(
         root=root,
         plan=plan,
         tasks=list(instructions),
@@ -368,26 +433,26 @@ def _make_job(root: Path, plan: CollectionPlan, base: _Base | None) -> _Job:
         base_frames=base.n_frames,
         base_files=base.n_files,
         episodes_per_file=EPISODES_PER_FILE,
+        collected=range(plan.n_episodes) if collected is None else collected,
     )
 
 
 # Meanwhile
 
 
-def _run(job: _Job, n_workers: int) -> int:
+def run_job(job: Job, n_workers: int) -> int:
     """Collects what is missing. Returns the number of episodes collected."""
-    parts = [part for part in range(job.n_parts) if not job.part_file(part).exists()]
-    missing = {part: {i for i in job.part(part) if not job.episode_file(i).exists()} for part in parts}
+    parts = [part for part in job.parts if not job.part_file(part).exists()]
+    missing = {part: set(job.missing_episodes(part)) for part in parts}
     n_missing = sum(map(len, missing.values()))
-    progress = tqdm(
-        total=job.plan.n_episodes, initial=job.plan.n_episodes - n_missing, desc="Collecting", unit="episode"
-    )
+    n_all = len(job.collected)
+    progress = tqdm(total=n_all, initial=n_all - n_missing, desc="Collecting", unit="episode")
     with progress, _executor(job, n_workers) as executor:
         waiting = ((part, index) for part in parts for index in sorted(missing[part]))
         running: dict[Future, tuple[int, int | None]] = {}
         try:
             for part in parts:
-                if not missing[part]:
+                if not missing[part] and job.is_whole(part):
                     running[_submit(executor, _join, part)] = (part, None)
             while True:
                 for part, index in islice(waiting, max(0, _JOBS_PER_WORKER * n_workers - len(running))):
@@ -401,7 +466,7 @@ def _run(job: _Job, n_workers: int) -> int:
                         continue
                     progress.update()
                     missing[part].remove(collected)
-                    if not missing[part]:
+                    if not missing[part] and job.is_whole(part):
                         running[_submit(executor, _join, part)] = (part, None)
         except BrokenProcessPool:
             raise CollectionError(
@@ -412,7 +477,7 @@ def _run(job: _Job, n_workers: int) -> int:
             executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _executor(job: _Job, n_workers: int) -> Executor:
+def _executor(job: Job, n_workers: int) -> Executor:
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(n_workers, mp_context=context, initializer=_start_worker, initargs=(job,))
 
@@ -431,7 +496,7 @@ def _submit(executor: Executor, function: Callable[[int], None], number: int) ->
 class _Worker:
     """What a worker process keeps from one episode to the next."""
 
-    job: _Job
+    job: Job
     env: PickPlaceEnv
     schema: pa.Schema
 
@@ -439,7 +504,7 @@ class _Worker:
 _worker: _Worker | None = None
 
 
-def _start_worker(job: _Job) -> None:
+def _start_worker(job: Job) -> None:
     global _worker
     _end_with_main_process(job.staging / WORKERS_LOCK)
     env = PickPlaceEnv(**job.plan.env_settings)
@@ -498,7 +563,7 @@ def _join(part: int) -> None:
 
     def tables() -> Iterator[pa.Table]:
         for index in episodes:
-            table = _read_episode(job.episode_file(index))
+            table = read_episode(job.episode_file(index))
             known.append(json.loads(table.schema.metadata[_KNOWN]))
             yield table.replace_schema_metadata(schema.metadata)
 
@@ -531,7 +596,12 @@ def _join(part: int) -> None:
         job.episode_file(index).unlink()
 
 
-def _read_episode(path: Path) -> pa.Table:
+def read_episode(path: Path) -> pa.Table:
+    """The frames of an episode that waits for its data file, which still are as they were written.
+
+    Raises:
+        DatasetError: They are not.
+    """
     remedy = "Delete it and run the command again: its episode is then collected again."
     try:
         with pa.ipc.open_file(read_checked(path, remedy)) as reader:
@@ -547,9 +617,9 @@ def _merged(parts: Sequence[dict[str, Statistics]]) -> dict[str, Statistics]:
 # After
 
 
-def _prepare_commit(job: _Job, base: _Base | None) -> None:
+def _prepare_commit(job: Job, base: _Base | None) -> None:
     """Writes down the dataset's metadata as they shall be."""
-    known = [_read_part(job, part) for part in range(job.n_parts)]
+    known = [read_part(job, part) for part in range(job.n_parts)]
     statistics = [files.statistics_from_json(item["statistics"]) for item in known]
     digests: dict[str, str] = {}
     if base is not None:
@@ -568,7 +638,7 @@ def _prepare_commit(job: _Job, base: _Base | None) -> None:
         "plan": asdict(job.plan),
         "benchmark": ENV_ID,
         "renderer": renderer(),
-        "versions": {name: version(name) for name in ("lerobot_policy_deltaco", "pybullet", "numpy")},
+        "versions": versions(),
         "attempts": attempts,
     }
     n_episodes = job.base_episodes + job.plan.n_episodes
@@ -583,8 +653,12 @@ def _prepare_commit(job: _Job, base: _Base | None) -> None:
     write_checked_json(job.staging / "commit.json", contents)
 
 
-def _read_part(job: _Job, part: int) -> dict[str, Any]:
-    """What is known of a complete data file, which still is as it was written."""
+def read_part(job: Job, part: int) -> dict[str, Any]:
+    """What is known of a complete data file, which still is as it was written.
+
+    Raises:
+        DatasetError: It is not.
+    """
     part_file = job.part_file(part)
     remedy = f"Delete {part_file} and run the command again: its episodes are then collected again."
     known = read_checked_json(part_file, remedy)

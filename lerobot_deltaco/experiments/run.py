@@ -83,10 +83,14 @@ class ExperimentRun:
         """Whether it trains on whichever GPU it sees, rather than on a certain one or on none."""
         return self.config.policy.get("device") in (None, "cuda")
 
-    def collect(self) -> None:
-        """Collects the datasets that the experiment needs; complete ones are kept as they are."""
-        for command in self._collect_commands():
-            CommandRunner().run(*command)
+    def collect(self, options: Sequence[str] = ()) -> None:
+        """Collects the datasets that the experiment needs; complete ones are kept as they are.
+
+        Args:
+            options: More options of `deltaco-collect`, such as "--join".
+        """
+        for command, arguments in self._collect_commands():
+            CommandRunner().run(command, [*arguments, *options])
 
     def train_and_evaluate(self, runner: CommandRunner, step: Step | None = None) -> None:
         """Trains on the collected datasets, and evaluates; or does one of both.

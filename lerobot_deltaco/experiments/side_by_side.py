@@ -7,7 +7,6 @@ there are several GPUs, each run sees one of them.
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 import time
@@ -18,6 +17,7 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
+from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.experiments.command_runner import CommandRunner
 from lerobot_deltaco.experiments.gpus import gpu_of_its_own, visible_gpus
 from lerobot_deltaco.experiments.run import ExperimentRun, Step, run_folder
@@ -96,21 +96,19 @@ def run_side_by_side(
         raise failure
 
 
-def collect_once(experiments: Sequence[ExperimentRun]) -> None:
-    """Collects what is missing, one dataset after the other, and each once."""
+def collect_once(experiments: Sequence[ExperimentRun], options: Sequence[str] = ()) -> None:
+    """Collects what is missing, one dataset after the other, and each once.
+
+    Args:
+        experiments: Those whose data are collected.
+        options: More options of `deltaco-collect`, such as "--join".
+    """
     collected = []
     for experiment in experiments:
         plans = (experiment.config.data, experiment.config.demonstrations)
         if plans not in collected:
-            experiment.collect()
+            experiment.collect(options)
             collected.append(plans)
-
-
-def available_cores() -> int:
-    """How many of the processor's cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def last_progress(log: Path) -> str:
