@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gym_deltaco import gallery
 from gym_deltaco.atomic_files import atomic_write
-from gym_deltaco.gallery import Episode, draw_random_objects, object_views
+from gym_deltaco.gallery import episodes
+from gym_deltaco.gallery.episodes import Episode
+from gym_deltaco.gallery.objects import draw_random_objects, object_views
+from gym_deltaco.gallery.sheets import caption, down
 from gym_deltaco.object_sets import select_objects
 from gym_deltaco.objects import object_model
-from gym_deltaco.sheets import caption, down
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import OBJECTS, get_task
 from lerobot_deltaco.commands.gallery import main
@@ -133,12 +134,12 @@ def test_the_outcome_of_an_episode_is_what_its_info_says(info, success_step, out
 
 
 def test_an_expert_that_fails_is_recorded_to_its_end():
-    class Idle(gallery.PickPlaceEnv):
+    class Idle(episodes.PickPlaceEnv):
         def step(self, action):
             return super().step(np.array([0.0, 0.0, 1.0, 1.0]))
 
     env = Idle()
-    episode = gallery.record(env, 4, 0)
+    episode = episodes.record(env, 4, 0)
     env.close()
     assert len(episode.frames) == 31
     assert episode.outcome == "no success in 30 steps (last grasped: nothing)"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,14 @@ RGB = tuple[int, int, int]
 Align = Literal["start", "middle", "end"]
 
 
+class Figure(NamedTuple):
+    """An image of the page."""
+
+    file: str
+    title: str
+    text: str
+
+
 def to_image(pixels: NDArray[np.uint8], size: int | None = None) -> Image.Image:
     """An image of an array (H, W, 3), smoothly shrunk to `size` px where that is given."""
     image = Image.fromarray(pixels)
@@ -35,26 +43,29 @@ def enlarged(pixels: NDArray[np.uint8], factor: int) -> Image.Image:
     return Image.fromarray(pixels).resize((width * factor, height * factor), Image.Resampling.NEAREST)
 
 
-def caption(text: str, width: int, size: int = 15, color: RGB = INK, n_lines: int = 1) -> Image.Image:
+def caption(
+    text: str, width: int, size: int = 15, color: RGB = INK, n_lines: int = 1, indent: int = 0
+) -> Image.Image:
     """Text, wrapped at words.
 
     Args:
-        text: May have line breaks of its own.
+        text: The text, which may have line breaks.
         width: Width of the image, px.
         size: Size of the font, px.
         color: Color of the text.
-        n_lines: Leave room for at least so many lines, so that captions in a row are equally high.
+        n_lines: Least number of lines to leave room for, so that captions in a row are equally high.
+        indent: Space to the left of the text, px.
 
     Returns:
         An image, as high as its lines.
     """
     font = _font(size)
-    lines = [line for paragraph in text.split("\n") for line in _wrapped(paragraph, width, font)]
+    lines = [line for paragraph in text.split("\n") for line in _wrapped(paragraph, width - indent, font)]
     line_height = round(size * _LINE_SPACING)
     image = Image.new("RGB", (width, line_height * max(len(lines), n_lines)), PAPER)
     draw = ImageDraw.Draw(image)
     for number, line in enumerate(lines):
-        draw.text((0, number * line_height), line, fill=color, font=font)
+        draw.text((indent, number * line_height), line, fill=color, font=font)
     return image
 
 
