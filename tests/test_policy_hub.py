@@ -115,7 +115,7 @@ def test_every_method_has_a_card(dataset, method):
     assert "\n\n\n" not in card.text
     uses_demo = method not in ("language_only", "one_hot")
     assert ("--policy.demo_repo_id" in card.text) == uses_demo
-    assert ("| a demonstration is | 1 x 2 frames" in card.text) == uses_demo
+    assert ("| demonstration | 1 x 2 frames" in card.text) == uses_demo
     uses_language = method != "one_hot"
     assert ("paraphrase-MiniLM-L3-v2" in card.text) == uses_language
 
@@ -142,9 +142,12 @@ def test_the_card_says_what_was_trained_and_on_what(dataset):
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", card.text, re.MULTILINE))
     assert (rows["steps"], rows["batch size"], rows["seed"]) == ("12,345", "24", "77")
     assert (rows["optimizer"], rows["learning rate"]) == ("Adam", "0.0003, constant")
-    assert (rows["gripper's loss"], rows["random shifts"]) == ("squared error, weight 30", "up to 4 pixels")
+    assert (rows["gripper loss"], rows["random shifts of observations"]) == (
+        "squared error, weight 30",
+        "up to 4 pixels",
+    )
     assert (rows["backbone"], rows["seed of demonstrations and crops"]) == ("strided", "5")
-    assert rows["through FiLM, into each residual block"] == "the embedding of the demonstration"
+    assert rows["input through FiLM, in each residual block"] == "the embedding of the demonstration"
     assert "embedding of the instruction, and the robot's state" in text
     assert "contrastive, with the instructions of the batch; weight 10, temperature 0.1" in text
     encoder = LANGUAGE_ENCODERS["all-distilroberta-v1"].repo_id
@@ -169,7 +172,7 @@ def test_the_card_names_what_was_chosen_for_a_run():
         "| weight decay | 0.01 |",
         "| tasks in a batch | 16 |",
         "| tasks drawn more often | those with `green\\|red`, 50% of each batch |",
-        "| gripper's loss | cross entropy, weight 3 |",
+        "| gripper loss | cross entropy, weight 3 |",
     ):
         assert row in text
 
@@ -183,18 +186,18 @@ def test_an_ablation_is_named(dataset):
 
 def test_what_is_beyond_the_paper_is_named(dataset):
     ours = words_of(foreign_card(dataset, demo_encoder="attention", motion_modes=5)[0])
-    assert "| encoder of demonstrations | a convolutional network with attention" in ours
-    assert "the likeliest of 5 Gaussians' means" in ours
+    assert "| demonstration encoder | a convolutional network with attention" in ours
+    assert "the mean of the likeliest of 5 Gaussians" in ours
     paper = words_of(foreign_card(dataset)[0])
-    assert "| encoder of demonstrations | the paper's convolutional network" in paper
+    assert "| demonstration encoder | the paper's convolutional network" in paper
     assert "Gaussians" not in paper
 
 
 def test_the_demonstrations_that_it_carries_are_listed(dataset, shown):
     text = words_of(foreign_card(dataset)[0])
-    assert "carries no demonstrations" in text
+    assert "has no demonstrations" in text
     card, _ = foreign_card(dataset, demo_repo_id=REPO_ID, demo_root=str(shown.root))
-    assert "carries demonstrations of 4 tasks" in words_of(card)
+    assert "has demonstrations of 4 tasks" in words_of(card)
     assert all(f"\n- {task}\n" in card.text for task in [*TASKS, "juggle"])
     assert str(shown.root) not in card.text
     many = [f"task\n {number}" for number in range(MAX_TASKS_LISTED + 3)]
@@ -333,4 +336,4 @@ def test_a_pushed_policy_is_fetched_by_its_name(tmp_path):
 
         card = ModelCard(files["README.md"].decode())
         assert card.data.datasets == [REPO_ID]
-        assert "carries demonstrations of 4 tasks" in words_of(card)
+        assert "has demonstrations of 4 tasks" in words_of(card)

@@ -1,4 +1,4 @@
-"""The card of a policy on the Hub: what is known when it is pushed, which excludes success rates."""
+"""The card of a policy on the Hub, as far as it is known at the push: without success rates."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS
 TAGS = ("robotics", "lerobot", "deltaco", "imitation-learning")
 MAX_TASKS_LISTED = 10
 
-# Name of each method, and what conditions the policy.
+# Name of each method, and the inputs that say which task to perform.
 METHOD_TEXTS = {
     "deltaco": (
         "DeL-TaCo",
-        "A demonstration and an instruction together tell it its task, which it need not have trained on.",
+        "It performs a task from one demonstration and one instruction, even a task it was not trained on.",
     ),
-    "language_only": ("language-only baseline", "An instruction alone tells it its task."),
-    "demo_only": ("demo-only baseline", "A demonstration alone tells it its task."),
+    "language_only": ("language-only baseline", "It performs a task from an instruction alone."),
+    "demo_only": ("demonstration-only baseline", "It performs a task from one demonstration alone."),
     "one_hot": (
         "one-hot baseline",
-        "The number of the task, among those that it knows, tells it its task.",
+        "It performs one of the tasks that it was trained on, given as a one-hot vector.",
     ),
     "bc_z": (
         "BC-Z baseline",
-        "A demonstration tells it its task; in training, its embedding was drawn to the instruction's.",
+        "It performs a task from one demonstration, whose embedding was trained to match the instruction's.",
     ),
     "mcil": (
         "MCIL baseline",
-        "An instruction or a demonstration tells it its task; in evaluation, the episodes of a task use them "
-        "in turn.",
+        "It performs a task from an instruction or a demonstration. In evaluation, the episodes of a task "
+        "use them in turn.",
     ),
 }
 
@@ -56,18 +56,18 @@ _INPUT_TEXTS = {
     "language_or_demo": "the embedding of the instruction (projected) or of the demonstration",
 }
 
-# With goals: what determines where to grasp, and where to release.
+# With goals: the inputs that determine where to grasp, and where to release.
 _GOAL_TEXTS = {
     "deltaco": ("the object that the demonstration moved, found in the scene", "the instruction"),
     "demo_only": ("the object that the demonstration moved, found in the scene", "the demonstration"),
     "language_only": ("the instruction", "the instruction"),
-    "one_hot": ("the number of the task", "the number of the task"),
+    "one_hot": ("the one-hot vector of the task", "the one-hot vector of the task"),
 }
 
 _DEMO_ENCODER_TEXTS = {
     "cnn": "the paper's convolutional network, on the array of frames",
-    "attention": "a convolutional network with attention, on the frames laid upon each other (ours)",
-    "correspondence": "none: what the demonstration moved is looked for in the scene (ours)",
+    "attention": "a convolutional network with attention, on the stacked frames (ours)",
+    "correspondence": "none: the policy looks in the scene for the object that was moved (ours)",
     "pretrained": "the frozen image encoder {encoder}, on the array of frames",
 }
 
@@ -187,12 +187,12 @@ def _encoder_loss_text(config: DeltacoConfig) -> str:
         "contrastive": f"contrastive, with the instructions of the batch; {weight}, temperature "
         f"{config.temperature:g}",
         "cosine": f"1 - cosine of the demonstration's and the instruction's embedding; {weight}",
-        "none": "none of its own",
+        "none": "none",
     }[config.conditioning.encoder_loss]
 
 
 def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -> dict[str, Any]:
-    """The options that matter, by name."""
+    """The most important options, by name."""
     options: dict[str, Any] = {}
     if train_config is not None:
         options |= {"steps": f"{train_config.steps:,}", "batch size": train_config.batch_size}
@@ -219,13 +219,13 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
     options |= {
         "seed of demonstrations and crops": config.seed,
         "backbone": config.backbone,
-        "size of the images": f"{config.image_size} x {config.image_size}",
-        "random shifts": f"up to {config.crop_padding} pixels",
-        "arithmetic": config.dtype,
+        "image size": f"{config.image_size} x {config.image_size}",
+        "random shifts of observations": f"up to {config.crop_padding} pixels",
+        "precision": config.dtype,
     }
     if config.gripper_index is not None:
         kind = config.gripper_loss.replace("_", " ")
-        options["gripper's loss"] = f"{kind}, weight {config.gripper_weight:g}"
+        options["gripper loss"] = f"{kind}, weight {config.gripper_weight:g}"
     return options
 
 
@@ -236,7 +236,7 @@ def _example(
     train_config: TrainPipelineConfig | None,
     meta: LeRobotDatasetMetadata | None,
 ) -> tuple[str, str]:
-    """The command that runs the policy where it was trained for, and its options for that place."""
+    """The command that runs the policy where it was trained to act, and its options for that."""
     env = train_config.env if train_config is not None else None
     episodes = "--eval.n_episodes=2 --eval.batch_size=2"
     if benchmark_image is not None:

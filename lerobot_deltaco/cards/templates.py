@@ -56,7 +56,7 @@ def scene_settings(info: dict[str, Any]) -> dict[str, Any]:
     """Arguments of the environment that a dataset's scenes were drawn with.
 
     Args:
-        info: What the dataset's feature "observation.image" says of them, as in LeRobot's info.json.
+        info: Info of the dataset's feature "observation.image", as in LeRobot's info.json.
     """
     return {name: info[name] for name in SCENE_SETTINGS if name in info}
 
