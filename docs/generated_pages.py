@@ -27,7 +27,7 @@ WITHOUT_API = ("lerobot_deltaco.commands", "lerobot_deltaco.demo")
 
 
 class Documented(NamedTuple):
-    """What the source says of a class."""
+    """Documentation of a class, read from its source."""
 
     text: str  # Markdown, up to the sections
     arguments: dict[str, str]  # descriptions, in the docstring's order
@@ -142,7 +142,7 @@ def options(name: str, prefix: str) -> str:
 
     Args:
         name: Name of the dataclass.
-        prefix: What precedes an option on the command line, such as "--policy.".
+        prefix: Prefix of an option on the command line, such as "--policy.".
     """
     spec = documented(name)
     entries = []
