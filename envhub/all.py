@@ -8,7 +8,7 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
 
     Args:
         n_envs: Number of environments for each task.
-        use_async_envs: Whether each environment has its own process, if there are several.
+        use_async_envs: Whether each environment runs in a process of its own, if there are several.
         cfg: Configuration with which LeRobot loads the environment, if any; its `task` selects other tasks.
     """
     return make_env_of_tasks("all", n_envs, use_async_envs, cfg)

@@ -20,11 +20,11 @@ from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAd
 
 
 class Conditioning(NamedTuple):
-    """How a method tells the policy its task."""
+    """Conditioning of a method."""
 
-    film: str  # what goes through FiLM
-    concat: str  # what is concatenated to the feature points
-    encoder_loss: str  # what aligns demonstrations with instructions
+    film: str  # input through FiLM
+    concat: str  # input concatenated to the feature points
+    encoder_loss: str  # loss that aligns demonstrations with instructions
 
 
 # The methods of the paper's tables 1 and 2.
@@ -53,7 +53,7 @@ ENCODER_LOSSES = ("contrastive", "cosine", "none")
 
 
 class Backbone(NamedTuple):
-    """What differs between the convolutional networks."""
+    """Sizes of a convolutional network."""
 
     channels: tuple[int, ...]  # of the residual blocks
     stem_stride: int  # of the first convolution
@@ -129,26 +129,27 @@ class DeltacoConfig(PreTrainedConfig):
     size.
 
     Args:
-        method: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
-        film: Ablation: what goes through FiLM instead of the method's: none, demo, language or demo+language.
-        concat: Ablation: what is concatenated to the feature points instead of the method's; the same names.
-        encoder_loss: Ablation: contrastive, cosine or none, instead of the method's.
-        language_encoder: A frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'),
+        method: Method of the paper: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
+        film: Ablation: input through FiLM, instead of the method's: none, demo, language or demo+language.
+        concat: Ablation: input that is concatenated to the feature points, instead of the method's; the same
+            values.
+        encoder_loss: Ablation: encoder loss, instead of the method's: contrastive, cosine or none.
+        language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'),
             all-distilroberta-v1, distilbert-base-uncased or all-MiniLM-L6-v2. The extra `offline` brings the
             first and the last, which then need no network.
-        instruction_embeddings: A file with embeddings of instructions, which are then not computed: a
+        instruction_embeddings: File with embeddings of instructions, which are then not computed: a
             checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
             language model.
         instructions: CSV file with sentences in people's own words for the benchmark's tasks, as
             `deltaco-instructions` fetches or checks it. In training, each sample's instruction is drawn from
             those of its task. In evaluation, each sentence has the demonstrations of its task.
-        instructions_split: Which of the file's sentences are trained on: train, those that are held out for
-            no task; held_out, the last one of each task; or all.
-        instructions_templates: Whether the task string itself is trained on, too, as often as each sentence.
+        instructions_split: Split of the file's sentences for training: train, those that are held out for no
+            task; held_out, the last one of each task; or all.
+        instructions_templates: Whether to also train on the task string itself, as often as on each sentence.
         language_head: Sizes of the hidden layers of fully connected layers behind the language encoder, whose
             output has unit length, such as [512]; none by default. MCIL always has such layers; the authors'
             are [384], its default.
-        normalize_language: Whether instructions' embeddings are scaled to unit length, as in the paper. (The
+        normalize_language: Whether to scale instructions' embeddings to unit length, as in the paper. (The
             authors' code does so only where an encoder loss compares them with demonstrations.)
         demo_encoder: Encoder of demonstrations. cnn: the paper's. attention (ours): compares the frames at
             each place, and attends to a few places. correspondence (ours): no embedding; what the
@@ -156,76 +157,77 @@ class DeltacoConfig(PreTrainedConfig):
             is given both places as goals. It needs a camera that does not move, a robot state, and a gripper;
             without demonstrations (language_only, one_hot), the method's other input says what to look for.
             pretrained: a frozen image encoder.
-        vision_encoder: Which one, for `demo_encoder=pretrained`: clip-vit-base-patch32, r3m-resnet18,
-            r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0 (which the extra
-            `offline` brings, without a network), a folder with an image model of transformers, or its name on
-            the Hugging Face Hub.
-        vision_encoder_weights: A file with R3M's weights, which are otherwise downloaded.
+        vision_encoder: Frozen image encoder for `demo_encoder=pretrained`: clip-vit-base-patch32,
+            r3m-resnet18, r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0 (which
+            the extra `offline` brings, without a network), a folder with an image model of transformers, or
+            its name on the Hugging Face Hub.
+        vision_encoder_weights: File with R3M's weights, which are otherwise downloaded.
         vision_image_size: Height and width to which the array of a demonstration's frames is scaled for that
             encoder; by default, that of the images it was trained on.
-        vision_input: published, or authors: R3M gets images in 0..1 instead of 0..255, not scaled to 224, as
-            in the authors' code.
-        demo_variants: With a pretrained encoder, how many variants of a demonstration are encoded before
-            training (random crops, and random frames between the ends), of which each sample gets one.
-        demo_features_dir: Folder where those features are kept for further trainings; none by default.
+        vision_input: Format of R3M's images: published, or authors: in 0..1 instead of 0..255, and not scaled
+            to 224 pixels, as in the authors' code.
+        demo_variants: Number of variants of each demonstration (random crops, and random frames between the
+            ends) that a pretrained encoder encodes before training; each sample gets one of them.
+        demo_features_dir: Folder that keeps those features for further trainings; none by default.
         demo_head: Sizes of the hidden layers of fully connected layers behind a pretrained encoder, such as
             [256]; by default, there are no layers at all.
-        demo_rows: m, rows of the array of a demonstration's frames.
-        demo_columns: n, columns of that array; it has the first frame, the last, and random ones between.
-            (For the attention, which has no array, they are m n frames.)
+        demo_rows: Number of rows of the array of a demonstration's frames, m in the paper.
+        demo_columns: Number of columns of that array, n in the paper. Its m n frames are the first, the last,
+            and random ones between them; the attention takes as many, without an array.
         image_size: Height and width to which images are scaled, if they differ.
-        backbone: paper or strided.
-        motion_modes: Gaussians of the motion's distribution. The paper has one, whose mean is between two
-            motions where either would do; of several, the likeliest acts.
-        gripper: Which dimension of the action is the gripper: an index, "auto" (the last one whose name
-            contains "gripper", if any) or "none".
-        gripper_loss: squared_error, or cross_entropy (ours).
+        backbone: Convolutional network: paper or strided.
+        motion_modes: Number of Gaussians of the motion's distribution. The paper has one, whose mean is
+            between two motions where either would do; of several, the likeliest acts.
+        gripper: Gripper's dimension of the action: an index, "auto" (the last one whose name contains
+            "gripper", if any) or "none".
+        gripper_loss: Loss of the gripper: squared_error, or cross_entropy (ours).
         gripper_weight: Weight of the gripper loss in the policy loss; by default 30, or 3 for cross_entropy.
         encoder_loss_weight: Weight of the encoder loss, alpha_d in the paper's equation 3.
         temperature: Temperature of the contrastive loss.
-        crop_padding: Pixels by which observations are shifted at random in training, 0 for none.
-        demo_crop_padding: The same for demonstrations. Without it, the encoder overfits to a small
-            dataset, and misreads new demonstrations.
+        crop_padding: Largest random shift of observations in training, in pixels; 0 for none.
+        demo_crop_padding: The same for demonstrations. Without it, the encoder overfits to a small dataset,
+            and misreads new demonstrations.
         demo_camera: Name of the camera for demonstrations and goals, such as "observation.images.front". By
             default, the first.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation, with
             `demo_encoder=correspondence`.
-        goal_noise: Standard deviation of the noise on goals in training, where an image's edges are at -1 and
-            1; 0.04 is a pixel of 48.
-        locator_share: Share of each batch's samples on which goals are learned to be found.
+        goal_noise: Standard deviation of the noise on goals in training, in coordinates in which an image's
+            edges are at -1 and 1; 0.04 is a pixel of 48.
+        locator_share: Share of each batch's samples on which the policy learns to find goals.
         recolor_share: Share of training samples in which one random change of hue, saturation and brightness
             is applied to the observation and the demonstration alike, with `demo_encoder=correspondence`.
         color_blind_tasks: Regular expression that is found in the instructions of tasks in which color does
             not count: their demonstrations are recolored apart from the scene.
-        frames_after_release: With `deltaco-train`, the number of frames that are trained on after the gripper
-            has last opened in an episode, instead of leaving out the last `drop_n_last_frames`; None for all.
-        demo_crop: What of a demonstration is shifted, where its frames are laid out in an array (`cnn` and
-            `pretrained`): the array, as in the authors' code, or each frame.
-        demo_frames_between: Which frames there are between the first and the last: spread, one of each of as
+        frames_after_release: Number of frames after the gripper's last opening in an episode that
+            `deltaco-train` trains on, instead of leaving out the last `drop_n_last_frames`; None for all.
+        demo_crop: Part of a demonstration that a random crop shifts, if its frames are laid out in an array
+            (`cnn` and `pretrained`): array, the whole array, as in the authors' code; or frame, each frame.
+        demo_frames_between: Choice of the frames between the first and the last: spread, one from each of as
             many equal parts of the time between, as in the authors' code; or any, drawn independently.
-        demos_per_task: In training, how many demonstrations the samples of a task in a batch share, at
-            least 2, so that none gets its own episode; 0 for a new one for every sample. Sharing
-            saves most of the demonstration encoder's time.
+        demos_per_task: Number of demonstrations that the samples of a task share in a training batch, at
+            least 2, so that none gets its own episode; 0 for a new one for every sample. Sharing saves most
+            of the demonstration encoder's time.
         demo_repo_id: Dataset of demonstrations for evaluation, with at least one episode of each task.
         demo_root: Folder of that dataset, if it is not in LeRobot's cache.
-        demo_episode: Its one episode that shows the task whatever the instruction; for paraphrases and for
-            sentences of one's own.
-        demo_task: Task string whose demonstrations are used whatever the instruction; for the same.
+        demo_episode: Episode of that dataset to use as the demonstration of every instruction, such as a
+            paraphrase or a sentence of your own.
+        demo_task: Task string whose demonstrations are used for every instruction, likewise.
         demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default, those
             that are trained on.
-        drop_n_last_frames: How many of the last frames of each episode are not trained on.
-        tasks_per_batch: With `deltaco-train`, the number of tasks in a batch, with as many samples each (the
+        drop_n_last_frames: Number of frames at the end of each episode that are not trained on.
+        tasks_per_batch: Number of tasks in a batch of `deltaco-train`, with equally many samples of each (the
             paper: 16 tasks x 64 samples); 0 for samples of any tasks.
-        upsampled_tasks: With `deltaco-train`, a regular expression; the tasks in which it is found get
+        upsampled_tasks: Regular expression for `deltaco-train`: the tasks in which it is found get
             `upsampled_share` of each batch.
-        upsampled_share: See above; the paper's scenario B has 0.5.
-        initial_weights: authors, those of the authors' code (`policy/initial_weights.py`), or torch, those of
-            PyTorch. By default, the authors' for the paper's backbone.
+        upsampled_share: Share of each batch for the upsampled tasks; 0.5 in the paper's scenario B.
+        initial_weights: Initial weights of the networks: authors, as in the authors' code
+            (`policy/initial_weights.py`); or torch, PyTorch's. By default, the authors' for the paper's
+            backbone.
         seed: Seed of the draws of demonstrations and crops, which also depend on the step.
         dtype: Precision of the networks: float32 or bfloat16; their last layers always use float32.
         compile: Whether to compile the networks, which makes training on a GPU faster.
         optimizer_lr: Learning rate of Adam.
-        optimizer_weight_decay: Weight decay, as in AdamW.
+        optimizer_weight_decay: Weight decay of AdamW.
         optimizer_l2: Weight of an L2 penalty in Adam's gradients, instead of that decay. (The authors' code:
             1e-4; the paper names none.)
         scheduler_name: Schedule of the learning rate: constant, or cosine, which decays to 0.

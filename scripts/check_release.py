@@ -226,7 +226,7 @@ def _uv() -> str:
 
 
 def _run(command: Sequence[str], folder: Path) -> str:
-    """What a command prints. It sees nothing of this environment's packages."""
+    """Output of a command. It sees nothing of this environment's packages."""
     environment = {
         name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")
     }

@@ -96,7 +96,7 @@ class Arm:
         """Moves the end effector, and opens or closes the gripper; runs the physics of one control step.
 
         Args:
-            position: Where to, (3,), m; clipped to the limits.
+            position: Position to move to, (3,), m; clipped to the limits.
             is_open: The gripper's state to reach or keep.
         """
         goal = kin.inverse(np.clip(position, POSITION_LOW, POSITION_HIGH), near=self._joint_targets)

@@ -35,7 +35,7 @@ _RETREAT = 0.05  # of the gripper, upwards, after it has let go
 
 
 class Stage(Enum):
-    """What the expert is doing."""
+    """Stage of the expert's plan."""
 
     REACH = "move above the object"
     DESCEND = "come down around it"

@@ -79,7 +79,7 @@ def container_mesh(color: ContainerColor) -> Mesh:
 
 
 def _open_box_mesh(boxes: tuple[Box, ...], wall_color: Color, floor_color: Color) -> Mesh:
-    """What `_open_box` made: up the outside, over the rim and down the inside to the middle of the floor."""
+    """The surface of `_open_box`: up outside, over the rim and down inside to the middle of the floor."""
     floor, wall = boxes[0], boxes[1]
     outer = np.array(floor.half_extents[:2])
     inner = outer - 2 * wall.half_extents[0]

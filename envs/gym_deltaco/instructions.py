@@ -33,7 +33,7 @@ def read_instructions(path: str | Path, split: str = "all") -> dict[int, tuple[s
     Args:
         path: The file, in UTF-8, with the columns `task_id` (0 to 299) and `instruction`; or the authors'
             file, with the columns "" (the row's number), "Task ID" and "Instruction".
-        split: Which of them: see `split_instructions`.
+        split: Split of the sentences; see `split_instructions`.
 
     Returns:
         By index of the task, its distinct sentences in the order of the file. Runs of spaces are one space.
@@ -59,7 +59,7 @@ def choose_instructions(
     Args:
         task_ids: Indices of the tasks.
         path: A CSV file, as `read_instructions` takes it.
-        split: Which of the file's sentences.
+        split: Split of the file's sentences; see `split_instructions`.
         sentence: A sentence for all of the tasks, in whatever words.
 
     Returns:
@@ -99,8 +99,8 @@ def parse_instructions(text: str, source: str) -> list[tuple[int, str]]:
     """Reads the rows of a CSV file.
 
     Args:
-        text: Its content.
-        source: What it is called in errors.
+        text: Content of the file.
+        source: Name of the file, for error messages.
 
     Returns:
         Index of the task and sentence, of each row.
@@ -215,7 +215,7 @@ def check_tasks(instructions: Mapping[int, Sequence[str]], task_ids: Iterable[in
     Args:
         instructions: The sentences of each task.
         task_ids: Indices of the tasks.
-        source: Where the sentences come from, for the error.
+        source: Origin of the sentences, for the error message.
 
     Raises:
         InstructionsError: A task has none.
@@ -234,7 +234,7 @@ def check_authors(rows: Iterable[tuple[int, str]], source: str) -> None:
 
     Args:
         rows: Index of the task and sentence, of each row.
-        source: Where they come from, for the error.
+        source: Origin of the rows, for the error message.
 
     Raises:
         InstructionsError: A task has more or fewer.

@@ -33,7 +33,7 @@ class PlacedObject(NamedTuple):
 
     @property
     def label(self) -> ObjectLabel:
-        """What it is called."""
+        """Name, shape and color."""
         return self.model.label
 
 
@@ -67,7 +67,7 @@ def sample_layout(
     """Draws a scene for a task.
 
     Args:
-        task: What is asked for.
+        task: The task that the instruction asks for.
         ambiguity: "container": exactly one object fits the instruction, which is what a demonstration
             alone leaves open about containers (the paper's scheme i). "object": the target has an identical
             twin on the other side of the tray, and only the demonstration tells which of the two (scheme ii).

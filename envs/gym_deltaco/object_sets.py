@@ -55,7 +55,7 @@ def select_objects(name: str) -> tuple[ObjectLabel, ...]:
 
 
 def find_label(index: int) -> ObjectLabel:
-    """What an object is called, one of the paper's or a random one.
+    """Name, shape and color of an object, one of the paper's or a random one.
 
     Raises:
         ValueError: There is no such object.

@@ -27,11 +27,11 @@ class ObjectModel:
     """The geometry of one object: z up, standing as on a table, origin in the middle of its bounding box.
 
     Attributes:
-        label: What it is called.
-        mesh: What is drawn, in meters.
+        label: Name, shape and color of the object.
+        mesh: The visible surface, in meters.
         parts: Corners of the convex collision parts, in meters, (P, 3) each; together they are like the mesh.
         grasp_height: Height above the object's base for the middle of the fingertips' pads, in meters.
-        yaw_range: How it may be turned about z so that it fits between the fingers: (low, high), in radians.
+        yaw_range: Rotations about z at which it fits between the fingers: (low, high), in radians.
     """
 
     label: ObjectLabel
@@ -69,11 +69,11 @@ class ObjectModel:
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """How an object is made, in millimeters and radians.
+    """Recipe for an object, in millimeters and radians.
 
     Attributes:
-        solids: What is drawn.
-        parts: Convex solids that it collides as.
+        solids: Visible solids.
+        parts: Convex solids for collisions.
         grasp: Height above the table at which it is held.
         yaw: Greatest angle by which it may be turned to either side.
     """

@@ -36,7 +36,7 @@ _MAX_PART_POINTS = 24
 
 @cache
 def random_label(index: int) -> ObjectLabel:
-    """What a random object is called: its shape and its color, and a name that no instruction uses.
+    """Shape and color of a random object, and a name that no instruction uses.
 
     The pairs of `COLOR_SHAPE_PAIRS` come in turn, in a new order each time.
 
@@ -77,15 +77,15 @@ class _Form:
     """The form of an object, without its colors. Radii and centers are those of `Loft`.
 
     Attributes:
-        outline: Outline of what is drawn.
+        outline: Outline of the visible solid.
         part_outline: Outline of the collision parts, with fewer corners.
         outside: Rings from the bottom to the top.
         band: Lowest and highest height at which the sides are vertical and widest: where it may be held.
         inside: Rings from the top inwards and down, for something hollow.
-        is_ring: Whether it is open below too.
+        is_ring: Whether it is open at the bottom, too.
         yaw: Greatest angle by which it may be turned, rad.
-        lift: How much higher the tips of a boat lie than its middle.
-        extras: Further solids, given their paint, and the parts that they collide as.
+        lift: Height of the tips of a boat above its middle.
+        extras: Further solids, as functions of their paint, and their collision parts.
     """
 
     outline: np.ndarray

@@ -90,7 +90,7 @@ class Scene:
         self._settle()
 
     def render(self, size: int) -> NDArray[np.uint8]:
-        """What the camera sees, (size, size, 3)."""
+        """Image of the camera, (size, size, 3)."""
         return self._simulation.render(CAMERA, size)
 
     def object_pose(self, index: int) -> Pose:

@@ -73,12 +73,12 @@ class Link:
         parent: Index of the parent link, -1 for the base.
         origin: Origin of the joint in the parent's frame, m.
         axis: Axis of the joint in the link's frame.
-        is_prismatic: Whether the joint slides (m) or turns (rad).
+        is_prismatic: Whether the joint slides (in m) instead of turning (in rad).
         is_rolled: Whether the link's frame is rolled by pi about the parent's x axis.
         mass: kg.
         inertia: Diagonal of the inertia tensor, kg m².
-        mesh: What it looks like.
-        boxes: What it touches with, if anything.
+        mesh: Visible surface.
+        boxes: Collision boxes, if any.
         limits: Limits of the joint, m or rad; None for no limits.
     """
 
@@ -182,7 +182,7 @@ class Simulation:
         """Adds a body that falls, and touches with the union of convex hulls.
 
         Args:
-            mesh: What it looks like, in the body's frame.
+            mesh: Visible surface, in the body's frame.
             hulls: Vertices of the hulls, (P, 3) each, m, in the body's frame.
             position: Position of the body's origin and center of mass, (3,), m.
             yaw: Angle about the vertical axis, rad.
@@ -344,7 +344,7 @@ class Simulation:
 
         Args:
             body: Id of the articulated body.
-            joints: Their indices.
+            joints: Indices of the joints.
             positions: Targets, rad or m.
             max_forces: N m or N.
             gains: Share of the position error that a motor corrects in one step, 0..1.

@@ -185,7 +185,7 @@ def pointed_oval(sides: int, lift: float = 0.0) -> np.ndarray:
 
     Args:
         sides: Number of corners, a multiple of 4; two of them are the tips.
-        lift: How much higher the tips lie than the middle.
+        lift: Height of the tips above the middle.
     """
     along = np.linspace(-1.0, 1.0, sides // 2 + 1)[:-1]
     starboard = np.column_stack([1.0 - np.abs(along) ** 2.6, along, lift * np.abs(along) ** 4])

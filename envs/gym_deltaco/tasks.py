@@ -40,11 +40,11 @@ CONTAINER_WORDS: tuple[ContainerWord, ...] = ("green", "red", "front", "back", "
 
 @dataclass(frozen=True)
 class ObjectLabel:
-    """What one of the 32 objects is called. Its geometry is in `gym_deltaco.objects`.
+    """Name, shape and color of one of the 32 objects. Its geometry is in `gym_deltaco.objects`.
 
     Attributes:
         index: 0..31, the order of the paper's table; 0..23 are scenario A's training objects.
-        name: Its own name, such as "conic cup".
+        name: Name of the object, such as "conic cup".
         shape: One of `SHAPES`.
         color: One of `COLORS`.
     """
@@ -130,7 +130,7 @@ class Task:
 
     @property
     def kind(self) -> TaskKind:
-        """How the object is asked for."""
+        """Word by which the instruction names the object."""
         if self.row < _FIRST_COLOR_ROW:
             return "name"
         if self.row >= N_ROWS:

@@ -38,7 +38,7 @@ class Region(NamedTuple):
     high: NDArray[np.float64]  # (2,), m
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of the points (..., 2) lie in it."""
+        """Whether each of the points (..., 2) lies in it."""
         return np.all((points >= self.low) & (points <= self.high), axis=-1)
 
 

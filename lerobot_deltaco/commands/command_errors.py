@@ -20,7 +20,7 @@ def exit_on_error(
     Args:
         parser: Parser of the command.
         errors: Errors whose messages a user can act on. Others are bugs, and show a traceback.
-        interrupted: What to say after an interrupt.
+        interrupted: Message after an interrupt.
     """
     actionable: tuple[type[Exception], ...] = (SimulatorMissingError, *errors)
     try:

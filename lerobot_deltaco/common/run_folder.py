@@ -32,13 +32,13 @@ class Checkpoint(NamedTuple):
 
 @dataclass(frozen=True)
 class RunDescription:
-    """What a training run says of itself.
+    """Description of a training run.
 
     Attributes:
-        experiment: Its job name.
-        seed: Seed of its training.
+        experiment: Job name of the run.
+        seed: Seed of the training.
         image_size: Height and width of the images that it was trained on, px.
-        episode_length: Steps of an episode of its environment, or of the benchmark's if it had none.
+        episode_length: Steps of an episode in the training's environment; the benchmark's without one.
     """
 
     experiment: str

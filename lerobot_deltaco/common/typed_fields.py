@@ -30,8 +30,8 @@ def check_ranges(instance: Any, ranges: Mapping[str, tuple[float, float]]) -> No
     """Checks that numbers are within their ranges.
 
     Args:
-        instance: What has them as attributes.
-        ranges: For each name, the least and the greatest valid value. None is always valid.
+        instance: Object with the numbers as attributes.
+        ranges: Least and greatest valid value of each attribute, by name. None is always valid.
 
     Raises:
         ValueError: A number is not; the message names it and says what is valid.

@@ -22,7 +22,7 @@ def fetch_instructions(path: Path, url: str = AUTHORS_URL) -> int:
 
     Args:
         path: The file to write; nothing is written unless all is well.
-        url: Where the instructions are.
+        url: Address of the instructions.
 
     Returns:
         Their number.

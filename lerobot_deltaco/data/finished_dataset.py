@@ -96,7 +96,7 @@ def read_info(root: Path) -> dict[str, Any]:
 
 
 def read_history(root: Path) -> list[dict[str, Any]]:
-    """How a dataset was collected, one entry for each collection.
+    """History of a dataset, one entry for each collection.
 
     Raises:
         DatasetError: The file is missing, or no such list.
@@ -214,13 +214,13 @@ def _check_fields(
 
 @dataclass(frozen=True)
 class Verification:
-    """What was found to be whole.
+    """Result of a verification.
 
     Attributes:
         episodes: Number of episodes.
         n_files: Number of files.
         n_bytes: Size of the files.
-        has_digests: Whether they were compared with their checksums; else they were read and decoded.
+        has_digests: Whether the files were compared with checksums; else they were read and decoded.
     """
 
     episodes: int

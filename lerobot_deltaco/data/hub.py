@@ -36,7 +36,7 @@ def push_dataset(root: Path, repo_id: str, private: bool = False, branch: str | 
         root: The dataset's folder; it is only read.
         repo_id: "USER/NAME" on the Hub. It is made if there is none; what it has of an earlier dataset is
             replaced.
-        private: Whether a new repository is for its owner only. False leaves it to the owner's settings.
+        private: Whether a new repository is private. False leaves it to the owner's settings.
         branch: Branch to upload to, created if missing, without a tag; None for the main branch.
 
     Returns:
@@ -145,7 +145,7 @@ def _one_line_errors(repo_id: str | None = None, arrived: str = "") -> Iterator[
 
     Args:
         repo_id: Name of the repository that is written to.
-        arrived: What the repository has, should something go wrong now, as a sentence.
+        arrived: Sentence that says what has arrived in the repository so far.
     """
     arrived = f" {arrived}" if arrived else ""
     try:

@@ -28,8 +28,8 @@ def damaged(path: Path, reason: object, remedy: str) -> DatasetError:
 
     Args:
         path: The file.
-        reason: What is wrong with it.
-        remedy: What to do, as a sentence.
+        reason: The reason, such as an exception.
+        remedy: Advice to the user, as a sentence.
     """
     return DatasetError(f"The file {path} is damaged or missing ({reason}). {remedy}")
 
@@ -55,7 +55,7 @@ def read_checked(path: Path, remedy: str) -> bytes:
 
     Args:
         path: The file.
-        remedy: What to do if it is damaged, as a sentence.
+        remedy: Advice to the user if it is damaged, as a sentence.
 
     Raises:
         DatasetError: The file is missing, or its contents do not have their checksum.
@@ -82,7 +82,7 @@ def read_checked_json(path: Path, remedy: str) -> Any:
 
     Args:
         path: The file.
-        remedy: What to do if it is damaged, as a sentence.
+        remedy: Advice to the user if it is damaged, as a sentence.
 
     Raises:
         DatasetError: The file is missing, or its contents do not have their checksum.
@@ -110,7 +110,7 @@ def write_digests(root: Path, digests: Mapping[str, str]) -> None:
 
     Args:
         root: The dataset's folder.
-        digests: For each file, its path in the folder and its SHA-256 in hexadecimal digits.
+        digests: SHA-256 of each file in hexadecimal digits, by the file's path in the folder.
     """
     with atomic_write(root / DIGESTS_FILE) as temporary:
         temporary.write_text("".join(f"{digests[name]}  {name}\n" for name in sorted(digests)))

@@ -13,7 +13,7 @@ def read_paraphrases(path: str | Path, split: str = "all") -> dict[str, tuple[st
 
     Args:
         path: CSV file, as `gym_deltaco.instructions.read_instructions` takes it.
-        split: Which of its sentences: "all", "train" or "held_out".
+        split: Split of the file's sentences: "all", "train" or "held_out".
 
     Returns:
         By task string, the benchmark's template, its sentences.

@@ -44,7 +44,7 @@ def _seconds(dtype: torch.dtype) -> float:
 
 
 def seconds_per_step(repo_id: str, root: Path, policy: Mapping[str, Any], batch_size: int) -> float:
-    """How long a step of `lerobot-train` takes, from reading the batch to the optimizer, by trying some.
+    """Seconds of a step of `lerobot-train`, from reading the batch to the optimizer, measured on a few.
 
     Args:
         repo_id: Repository id of the training dataset.

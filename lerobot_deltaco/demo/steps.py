@@ -85,7 +85,7 @@ class Demo:
         return last_policy(self.run)
 
     def seconds(self) -> dict[str, float]:
-        """How long each finished step took, interruptions not counted."""
+        """Seconds of each finished step, without interruptions."""
         file = self.folder / _DONE
         return json.loads(file.read_text()) if file.exists() else {}
 

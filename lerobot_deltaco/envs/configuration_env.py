@@ -28,7 +28,7 @@ class DeltacoEnv(EnvConfig):
     LeRobot's evaluation reports a success rate for each kind of task: "name", "color" and "shape".
 
     Args:
-        task: Which tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_a_validation,
+        task: Tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_a_validation,
             scenario_b_test, scenario_b_train, all, ...), or indices and ranges of 0 to 299, such as 4,50-73.
         fps: Frames per second of the videos of episodes. The simulation has no frame rate of its own.
         episode_length: Number of steps after which an episode ends. The benchmark's is 30.
@@ -46,7 +46,7 @@ class DeltacoEnv(EnvConfig):
         instructions: CSV file with sentences for the tasks, as `deltaco-instructions` fetches or checks it.
             The instruction of an episode is then one of its task's, drawn by the episode's seed. By default,
             it is the benchmark's template.
-        instructions_split: Which of the file's sentences: all; held_out, the last one of each task; or train,
+        instructions_split: Split of the file's sentences: all; held_out, the last one of each task; or train,
             those that are held out for no task.
         instruction: A sentence of your own, in whatever words, that replaces the instruction of every task.
     """
@@ -111,7 +111,7 @@ class DeltacoEnv(EnvConfig):
 
         Args:
             n_envs: Number of environments for each task.
-            use_async_envs: Whether each environment has its own process, if there are several.
+            use_async_envs: Whether each environment runs in a process of its own, if there are several.
 
         Returns:
             {kind of task: {index of the task: vector environment}}.

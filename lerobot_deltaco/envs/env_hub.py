@@ -22,7 +22,7 @@ def make_env_of_tasks(
     Args:
         tasks: Selection of tasks, as `--env.task` takes it; `cfg.task` takes precedence if it is set.
         n_envs: Number of environments for each task.
-        use_async_envs: Whether each environment has its own process, if there are several.
+        use_async_envs: Whether each environment runs in a process of its own, if there are several.
         cfg: Configuration with which LeRobot loads the environment, if any. Of a `DeltacoEnv`, all options
             are used; of another type, `task` alone.
 

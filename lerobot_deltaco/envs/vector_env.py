@@ -28,51 +28,51 @@ from gym_deltaco.seeding import episode_seed
 _LEROBOT_COMMANDS = ("lerobot.scripts.lerobot_train", "lerobot.scripts.lerobot_eval")
 
 
-class SimulatorPool:
+class VectorEnvPool:
     """Vector environments that tasks take turns to use.
 
     It holds as many as were ever in use at the same time, and closes them when the last of its tasks is
     closed. It may be used from several threads.
 
     Args:
-        make_simulator: Makes an environment that runs any task: `reset(options={"task_id": ...})`.
+        make_env: Function that makes an environment for any task: `reset(options={"task_id": ...})`.
         n_envs: Number of environments in each vector environment.
-        use_async_envs: Whether each environment has its own process, if there are several.
+        use_async_envs: Whether each environment runs in a process of its own, if there are several.
     """
 
-    def __init__(self, make_simulator: Callable[[], gym.Env], n_envs: int, use_async_envs: bool = False):
+    def __init__(self, make_env: Callable[[], gym.Env], n_envs: int, use_async_envs: bool = False):
         self.n_envs = n_envs
-        self._make_simulator = make_simulator
+        self._make_env = make_env
         self._use_async_envs = use_async_envs and n_envs > 1
         self._idle: list[VectorEnv] = []
         self._n_tasks = 0
         # Reentrant, since the garbage collector may close a forgotten task in the middle of any statement.
         self._lock = threading.RLock()
 
-    def register(self) -> None:
-        """Counts one more task; each has to call `release` once."""
+    def add_task(self) -> None:
+        """Counts one more task; each has to call `remove_task` once."""
         with self._lock:
             self._n_tasks += 1
 
     def acquire(self) -> VectorEnv:
-        """A vector environment that no one else uses until it is returned by `release`."""
+        """A vector environment that no other task uses until `remove_task` returns it."""
         with self._lock:
             if self._idle:
                 return self._idle.pop()
-        return self._build()
+        return self._make()
 
-    def release(self, borrowed: VectorEnv | None = None) -> None:
-        """Ends one task, which returns what it borrowed. The last one closes all that was lent."""
+    def remove_task(self, acquired: VectorEnv | None = None) -> None:
+        """Removes one task, which returns what it acquired. The last one closes all vector environments."""
         with self._lock:
-            if borrowed is not None:
-                self._idle.append(borrowed)
+            if acquired is not None:
+                self._idle.append(acquired)
             self._n_tasks -= 1
             unused, self._idle = (self._idle, []) if self._n_tasks == 0 else ([], self._idle)
         for env in unused:
             env.close()
 
-    def _build(self) -> VectorEnv:
-        env_fns = [self._make_simulator] * self.n_envs
+    def _make(self) -> VectorEnv:
+        env_fns = [self._make_env] * self.n_envs
         if not self._use_async_envs:
             return SyncVectorEnv(env_fns, autoreset_mode=AutoresetMode.NEXT_STEP)
         # Has no effect, and needs none, once the process that workers are forked from is running.
@@ -91,12 +91,12 @@ class TaskVectorEnv(VectorEnv):
 
     Args:
         task_id: Index of the task, 0..299.
-        pool: Where simulators come from.
-        example: An environment as the pool makes them. Only its spaces and metadata are read.
+        pool: Pool of the vector environments that run the task.
+        example: Environment like those of the pool. Only its spaces and metadata are read.
         fps: Frames per second at which LeRobot's videos of episodes play.
     """
 
-    def __init__(self, task_id: int, pool: SimulatorPool, example: gym.Env, fps: int):
+    def __init__(self, task_id: int, pool: VectorEnvPool, example: gym.Env, fps: int):
         self.task_id = task_id
         self.num_envs = pool.n_envs
         self.metadata = {
@@ -109,9 +109,9 @@ class TaskVectorEnv(VectorEnv):
         self.single_action_space = example.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._simulators: VectorEnv | None = None
+        self._running: VectorEnv | None = None
         self._pool = pool
-        pool.register()
+        pool.add_task()
 
     def reset(
         self,
@@ -131,48 +131,48 @@ class TaskVectorEnv(VectorEnv):
         self, seeds: Sequence[int | None], options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Starts the episodes that the environments' own seeds stand for, of `gym_deltaco.seeding`."""
-        if self._simulators is None and not self.closed:
-            self._simulators = self._pool.acquire()
+        if self._running is None and not self.closed:
+            self._running = self._pool.acquire()
         options = {**(options or {}), NEW_ROLLOUT_OPTION: True, "task_id": self.task_id}
-        return self._call_simulators("reset", seed=list(seeds), options=options)
+        return self._call_running("reset", seed=list(seeds), options=options)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Does one action, of shape (4,), in each environment."""
-        return self._call_simulators("step", actions)
+        return self._call_running("step", actions)
 
     def render(self) -> tuple[Any, ...]:
         """One image of each environment."""
-        return self._call_simulators("call", "render")
+        return self._call_running("call", "render")
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Calls a method of each environment, or reads an attribute."""
-        return self._call_simulators("call", name, *args, **kwargs)
+        return self._call_running("call", name, *args, **kwargs)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Reads an attribute of each environment."""
-        return self._call_simulators("get_attr", name)
+        return self._call_running("get_attr", name)
 
     def close_extras(self) -> None:
         """Hands the simulators back. `close` calls this once."""
-        simulators, self._simulators = self._simulators, None
-        self._pool.release(simulators)
+        running, self._running = self._running, None
+        self._pool.remove_task(running)
 
-    def _call_simulators(self, method: str, *args: Any, **kwargs: Any) -> Any:
+    def _call_running(self, method: str, *args: Any, **kwargs: Any) -> Any:
         if self.closed:
             raise gym.error.ClosedEnvironmentError(
                 f"The environment of task {self.task_id} is closed. Make a new one with `create_envs`."
             )
-        if self._simulators is None:
+        if self._running is None:
             raise gym.error.ResetNeeded(
                 f"The environment of task {self.task_id} is not running. Call `reset()` first."
             )
         try:
-            return getattr(self._simulators, method)(*args, **kwargs)
+            return getattr(self._running, method)(*args, **kwargs)
         except Exception:
-            if isinstance(self._simulators, AsyncVectorEnv):
+            if isinstance(self._running, AsyncVectorEnv):
                 # Its process ended with the error. The next reset starts afresh.
-                self._simulators.close()
-                self._simulators = None
+                self._running.close()
+                self._running = None
             raise
 
     def _episode_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
@@ -197,19 +197,19 @@ def make_task_vector_envs(
         env_kwargs: Further arguments of `gymnasium.make`.
         task_ids: Indices of the tasks.
         n_envs: Number of environments for each task.
-        use_async_envs: Whether each environment has its own process, if there are several.
+        use_async_envs: Whether each environment runs in a process of its own, if there are several.
         fps: Frames per second at which LeRobot's videos of episodes play.
     """
-    make_simulator = partial(_make_simulator, env_id, env_kwargs)
-    pool = SimulatorPool(make_simulator, n_envs, use_async_envs)
-    example = make_simulator()
+    make_env = partial(_make_env, env_id, env_kwargs)
+    pool = VectorEnvPool(make_env, n_envs, use_async_envs)
+    example = make_env()
     try:
         return [TaskVectorEnv(task_id, pool, example, fps) for task_id in task_ids]
     finally:
         example.close()
 
 
-def _make_simulator(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
+def _make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
     # The mask of LeRobot's metric includes the step after an episode's end. With the next-step autoreset and
     # LeRobot's wrapper, which stays in the finished episode, no other episode is counted there.
     env = gym.make(env_id, disable_env_checker=True, **env_kwargs)

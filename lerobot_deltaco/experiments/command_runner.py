@@ -24,9 +24,9 @@ class CommandRunner:
     """Runs commands one after the other.
 
     Args:
-        log: A file that what they print is appended to; None is this terminal.
-        n_threads: How many of the processor's cores they may use; None is all.
-        gpu: The one GPU that they see, as `CUDA_VISIBLE_DEVICES` names it; None is all.
+        log: File to which the commands' output is appended; None for this terminal.
+        n_threads: Number of the processor's cores that they may use; None for all.
+        gpu: The only GPU that they see, as `CUDA_VISIBLE_DEVICES` names it; None for all.
     """
 
     def __init__(self, log: Path | None = None, n_threads: int | None = None, gpu: str | None = None) -> None:

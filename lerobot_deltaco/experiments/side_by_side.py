@@ -45,8 +45,8 @@ def run_side_by_side(
     Each run prints to its log. An experiment that starts from another one of these waits for it.
 
     Args:
-        experiments: What to run; each is another run.
-        jobs: How many at a time. Each takes the same share of the processor's cores, also when some are done.
+        experiments: Experiments to run, each a run of its own.
+        jobs: Number of runs at a time. Each has the same share of the cores, also when some are done.
         report: Called with the folder of each run that is complete.
         step: The only step to run, "train" or "evaluate"; None for all.
 

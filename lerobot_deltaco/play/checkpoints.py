@@ -74,7 +74,7 @@ def check_files(folder: Path, name: str) -> None:
 
     Args:
         folder: Folder of the checkpoint.
-        name: What the user calls it, for the message.
+        name: Name that the user entered, for the message.
 
     Raises:
         PlayError: They are not.

@@ -23,11 +23,11 @@ MAX_LOADED = 3  # checkpoints at a time
 
 
 class Status(NamedTuple):
-    """How far the engine is.
+    """Progress of the engine's start.
 
     Attributes:
-        text: What it is doing, or why it cannot go on.
-        is_done: Whether there is nothing more to wait for.
+        text: Description of the present step, or of the error that ended the start.
+        is_done: Whether the start has ended, well or not.
         is_ready: Whether the first checkpoint is loaded.
     """
 
@@ -54,7 +54,7 @@ class Engine:
 
     @property
     def status(self) -> Status:
-        """How far the engine is with its start."""
+        """Progress of the start."""
         return self._status
 
     def start(self) -> None:

@@ -47,9 +47,9 @@ class SceneView:
     """A scene as it is before anything moves.
 
     Attributes:
-        image: What the camera sees, (H, W, 3).
-        objects: Names of the objects that stand there.
-        info: The environment's.
+        image: Image of the camera, (H, W, 3).
+        objects: Names of the objects in the scene.
+        info: The `info` of the environment's reset.
     """
 
     image: NDArray[np.uint8]
@@ -62,8 +62,8 @@ class Demonstration:
     """An episode that shows a task.
 
     Attributes:
-        title: What is shown, in words.
-        frames: Its kept images, the first and the last among them, (kept, H, W, 3), at the policy's size.
+        title: Description for the page.
+        frames: Kept images, the first and the last among them, (kept, H, W, 3), at the policy's size.
     """
 
     title: str
@@ -81,7 +81,7 @@ class Moment(NamedTuple):
     Attributes:
         image: The scene, for people, (H, W, 3).
         view: The policy's view of the demonstration and the scene, (H, W, 3); None for the expert.
-        text: What has happened so far.
+        text: Summary of the episode so far.
     """
 
     image: NDArray[np.uint8]
@@ -202,7 +202,7 @@ class Player:
 
         Args:
             task: Task string.
-            number: Which of its demonstrations, from 1.
+            number: Number of the demonstration among those of the task, from 1.
 
         Raises:
             PlayError: There is none.
@@ -242,7 +242,7 @@ class Player:
 
         Args:
             scene: The scene.
-            demonstration: What is demonstrated; None if the policy takes no demonstrations.
+            demonstration: The demonstration; None if the policy takes none.
             sentence: The instruction.
 
         Yields:
@@ -338,7 +338,7 @@ class Player:
 
 
 def outcome(info: dict[str, Any], reached: int) -> str:
-    """What happened in an episode, in a sentence or two.
+    """Summary of an episode, in a sentence or two.
 
     Args:
         info: The environment's, after the last step.

@@ -257,7 +257,7 @@ def _enlarged(image: NDArray[np.uint8]) -> Image.Image:
 
 
 def _explained(error: Exception) -> str:
-    """What a user is told of an error."""
+    """Message for the user about an error."""
     if isinstance(error, PlayError):
         return str(error)
     logger.error("An action of the page failed.", exc_info=error)

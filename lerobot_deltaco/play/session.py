@@ -20,11 +20,11 @@ _MAX_RANDOM_SEED = 9999
 
 @dataclass(frozen=True)
 class Run:
-    """An episode that runs or has run, as it is shown.
+    """An episode that runs or has run, for the page.
 
     Attributes:
-        title: Who acted, in which scene, by which demonstration and instruction.
-        moment: Its latest moment.
+        title: Description: who acts, in which scene, by which demonstration and instruction.
+        moment: The latest moment of the episode.
     """
 
     title: str
@@ -37,9 +37,9 @@ class Session:
 
     Attributes:
         checkpoint: Name of the checkpoint; None until the first is loaded.
-        demonstrated_tasks: Task strings of the checkpoint's demonstrations, with how many each has.
+        demonstrated_tasks: Number of the checkpoint's demonstrations by task string.
         scene: The scene.
-        view: What it looks like.
+        view: View of the scene.
         demonstration: The demonstration; None if the checkpoint has none, or none is chosen.
         demonstrated: Task string and number of a demonstration of the checkpoint's; None for another one.
         sentence: The instruction.
@@ -61,7 +61,7 @@ class Session:
 
 
 class Actions:
-    """What users can do. Each action takes a session and returns the next one, or yields several.
+    """Actions of the users. Each action takes a session and returns the next one, or yields several.
 
     All of them raise `PlayError` with a message for the user.
 

@@ -71,7 +71,7 @@ class StateToImage:
 
 
 def _changes(first: Tensor, last: Tensor) -> Tensor:
-    """How much more each pixel changes in an episode than it does in the others, (episodes, H, W)."""
+    """Change of each pixel in an episode, beyond its usual change in the others, (episodes, H, W)."""
     changes = torch.stack(
         [(b.float() - a.float()).abs().mean(dim=0) / 255 for a, b in zip(first, last, strict=True)]
     )

@@ -17,7 +17,7 @@ def check_dataset_folder(option: str, root: str | Path | None) -> None:
     """Checks, without a network, that a folder has a dataset.
 
     Args:
-        option: Which one names the folder, for the message.
+        option: Command-line option that names the folder, for the message.
         root: The folder; None is LeRobot's cache.
 
     Raises:

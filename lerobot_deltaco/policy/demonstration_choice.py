@@ -28,7 +28,7 @@ def choose_training_demonstrations(
         n_tasks: Number of tasks.
         demos_per_task: Number of demonstrations that the samples of a task share; 0 draws one per sample.
         generator: Source of the draws, on the CPU.
-        check: Whether to check that all episodes are among the demonstrations; a GPU has to be waited for.
+        check: Whether to check that all episodes are among the demonstrations, which waits for a GPU.
 
     Returns:
         Rows of the drawn demonstrations, and the place of each sample's demonstration among them, (batch,);
@@ -54,7 +54,7 @@ def choose_eval_demonstrations(
         candidates: Sets of demonstrations, in the order in which they are searched.
         tasks: Instruction of each sample.
         trials: Number of each sample's episode among those of its task, from 0.
-        demonstrated_as: For an instruction, the task string whose demonstrations it gets instead of its own.
+        demonstrated_as: Task strings by instruction: those whose demonstrations replace its own.
 
     Returns:
         The first set that has demonstrations of all tasks, and the row of each sample's, (batch,).

@@ -117,7 +117,7 @@ class DemonstrationSet(torch.nn.Module):
         Args:
             episodes: The samples' own, (batch,), as indices of the dataset.
             generator: Source of the draws, on the CPU.
-            check: Whether to look if they are all in the set, for which a GPU is waited for.
+            check: Whether to check that all of them are in the set, which waits for a GPU.
             tasks: Task of each sample. If it is given, episodes may be missing from the set, as those that
                 `--dataset.eval_split` holds back: any episode of their task demonstrates them.
 
@@ -155,10 +155,10 @@ class DemonstrationSet(torch.nn.Module):
         Args:
             episodes: The samples' own, (batch,), as indices of the dataset.
             column: The samples' tasks, (batch,), numbered from 0.
-            n_tasks: How many tasks they are.
-            n_each: How many episodes of each task are drawn, at least 2.
+            n_tasks: Number of tasks.
+            n_each: Number of episodes drawn of each task, at least 2.
             generator: Source of the draws, on the CPU.
-            check: Whether to look if the episodes are all in the set, for which a GPU is waited for.
+            check: Whether to check that all episodes are in the set, which waits for a GPU.
 
         Returns:
             Rows, (tasks * n_each,), and the place of each sample's among them, (batch,). An episode is drawn
@@ -235,8 +235,8 @@ class DemonstrationSet(torch.nn.Module):
             rows: (batch,).
             n_frames: Number of frames per demonstration, at least 2.
             generator: Source of the draws, on the CPU.
-            spread: Whether each frame between the ends is drawn from its own of as many equal parts of the
-                time, so that none is drawn twice if there are enough; else, all of them are independent.
+            spread: Whether one frame is drawn from each of as many equal parts of the time between the ends,
+                so that none is drawn twice if there are enough; else, all frames are drawn independently.
 
         Returns:
             (batch, n_frames, 3, H, W) in 0..1.
@@ -299,7 +299,7 @@ def load_demonstrations(
 
 
 class RobotData(NamedTuple):
-    """What the robot did in episodes.
+    """States and actions of episodes.
 
     Attributes:
         states: Robot states of frames, (frames, state).
@@ -318,7 +318,7 @@ def load_robot_data(repo_id: str, root: str | Path | None, episodes: Sequence[in
     Args:
         repo_id: Id of the dataset.
         root: Folder of the dataset, None for LeRobot's cache.
-        episodes: Which of its episodes.
+        episodes: Indices of the episodes to read.
     """
     dataset = LeRobotDataset(repo_id, root=root)
     columns = dataset.hf_dataset.select_columns([OBS_STATE, ACTION]).with_format("numpy")[:]
@@ -330,11 +330,11 @@ def load_robot_data(repo_id: str, root: str | Path | None, episodes: Sequence[in
 
 
 def kept_frame_indices(first: int, last: int, n_demo_frames: int) -> Tensor:
-    """Which frames of an episode are kept for demonstrations, (kept,) int64.
+    """Indices of the frames of an episode that are kept for demonstrations, (kept,) int64.
 
     Args:
-        first: Its first frame.
-        last: Its last frame.
+        first: Index of the first frame.
+        last: Index of the last frame.
         n_demo_frames: Number of frames per demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
     """
     n_kept = 2 if n_demo_frames == 2 else max(N_KEPT_FRAMES, n_demo_frames)

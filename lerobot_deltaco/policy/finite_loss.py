@@ -28,8 +28,8 @@ class FiniteLoss:
 
         Args:
             loss: The loss, of any shape.
-            inputs: What the batch has of numbers: actions and states, by name.
-            step: The step's number, from 1, of shape ().
+            inputs: Actions and states of the batch, by name.
+            step: Number of the step, from 1, of shape ().
         """
         self._loss = loss.detach()
         self._inputs_are_finite = torch.stack(
@@ -71,7 +71,7 @@ def check_weights_to_save(module: nn.Module, step: int) -> None:
     """Checks that what is about to be saved can be used.
 
     Args:
-        module: What is trained.
+        module: The trained module.
         step: The training step, for the message.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a frozen image encoder says of demonstrations: computed once, and kept.
+"""Features of demonstrations from a frozen image encoder: computed once, and kept.
 
 A frozen encoder gives the same features for the same image, so that no training step has to run it. Where
 the paper draws the crop and the frames between the ends anew for each sample, here a fixed number of such
@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 
 class Variants(NamedTuple):
-    """How images are made of a demonstration."""
+    """How a demonstration becomes images."""
 
     n_frames: int  # in an image
     n_rows: int  # of the array that they are laid out in
@@ -52,8 +52,8 @@ class FrozenFeatures:
 
     Args:
         load: Loads the encoder.
-        variants: How images are made of a demonstration.
-        folder: Where features are kept for further trainings; None for nowhere.
+        variants: Rules by which a demonstration becomes images.
+        folder: Folder that keeps the features for further trainings; None for none.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class FrozenFeatures:
 
         Args:
             demonstrations: The set.
-            rows: Which of them, (batch,).
+            rows: Rows of the demonstrations in the set, (batch,).
             generator: Source of the draws, on the CPU.
 
         Returns:
@@ -95,7 +95,7 @@ class FrozenFeatures:
 
         Args:
             demonstrations: The set.
-            rows: Which of them, (batch,); None for all.
+            rows: Rows of the demonstrations in the set, (batch,); None for all.
 
         Returns:
             (batch, features) float32.

@@ -121,8 +121,8 @@ class InstructionTable:
         rows: Place of each known instruction among the embeddings.
         embeddings: Unit vectors of the known instructions, (instructions, embedding).
         lengths: Lengths of the embeddings as the encoder gives them, (instructions,).
-        only_unit: Whether some of those lengths are not known, since a file of version 0.1 has only unit
-            vectors; then all embeddings are used with unit length.
+        only_unit: Whether some lengths are unknown, since files of version 0.1 have only unit vectors. Then
+            all embeddings are used with unit length.
     """
 
     def __init__(self, encoder_name: str) -> None:
@@ -152,9 +152,8 @@ class InstructionTable:
 
         Args:
             instructions: Instructions that are not in the table.
-            embeddings: Their embeddings, (instructions, embedding).
-            lengths: The lengths that the encoder gave them, (instructions,), if the embeddings are unit
-                vectors.
+            embeddings: Embeddings of the instructions, (instructions, embedding).
+            lengths: Lengths before scaling, (instructions,), if the embeddings are unit vectors.
         """
         if lengths is None:
             lengths = embeddings.norm(dim=1)
@@ -167,7 +166,7 @@ class InstructionTable:
             self.rows |= {text: n_known + i for i, text in enumerate(instructions)}
 
     def contents(self) -> TaskFile:
-        """What is known, as the contents of a file, without demonstrations."""
+        """Contents for a task file, without demonstrations."""
         with _LOCK:
             lengths = None if self.only_unit else self.lengths.cpu()
             return TaskFile(self.encoder_name, list(self.rows), self.embeddings.cpu(), None, lengths)
@@ -205,7 +204,7 @@ class InstructionTable:
         Args:
             instructions: Instructions, in any words.
             device: Device of the result.
-            unit: Whether they are unit vectors, or have the lengths that the encoder gives them.
+            unit: Whether to return unit vectors, instead of embeddings as long as the encoder makes them.
 
         Returns:
             Embeddings, (instructions, embedding).

@@ -41,7 +41,7 @@ def mixture_negative_log_likelihood(means: Tensor, logits: Tensor, log_std: Tens
 
 
 def gripper_loss(logit: Tensor, target: Tensor, kind: str) -> Tensor:
-    """How far the gripper, the sigmoid of a logit, is from its target.
+    """Loss of the gripper, the sigmoid of a logit, against its target.
 
     Args:
         logit: (batch,).

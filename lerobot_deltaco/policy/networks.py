@@ -277,7 +277,7 @@ def gaussian_maps(places: Tensor, height: int, width: int, std: float | Tensor) 
 
 
 def features_at(maps: Tensor, places: Tensor) -> Tensor:
-    """What maps (batch, channels, h, w) are around places (batch, places, 2): (batch, places, channels)."""
+    """Features at places (batch, places, 2) in maps (batch, channels, h, w): (batch, places, channels)."""
     height, width = maps.shape[-2:]
     weights = gaussian_maps(places, height, width, GOAL_STD)
     weights = weights / weights.sum(dim=(2, 3), keepdim=True).clamp_min(1e-3)

@@ -144,7 +144,7 @@ def checked_content(file: Path, sha256: str, package: str) -> bytes:
 
     Args:
         file: The file.
-        sha256: Its published SHA-256, in hexadecimal digits.
+        sha256: Published SHA-256 of the file, in hexadecimal digits.
         package: Name of the package, for the error.
 
     Raises:

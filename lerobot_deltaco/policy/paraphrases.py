@@ -12,12 +12,12 @@ logger = logging.getLogger(__name__)
 
 
 class Paraphrases:
-    """Other words for task strings.
+    """Sentences that replace task strings.
 
     Args:
-        known: Sentences of each task string, in which its demonstrations are recognized.
-        drawn: Sentences of each task string, from which training draws; none by default.
-        with_templates: Whether training draws the task string itself, too, as often as each sentence.
+        known: Sentences by task string; each finds the task's demonstrations.
+        drawn: Sentences by task string, from which training draws; none by default.
+        with_templates: Whether training also draws the task string itself, as often as each sentence.
     """
 
     def __init__(

@@ -27,7 +27,7 @@ def check_processor_files(pretrained: str | Path, **hub_options: Any) -> None:
 
     Args:
         pretrained: Folder of the checkpoint, or its name on the Hub.
-        hub_options: Of `hf_hub_download`, such as `revision`.
+        hub_options: Arguments of `hf_hub_download`, such as `revision`.
 
     Raises:
         ProcessorFileError: A file is none of a processor, or names a class of its own.

@@ -13,7 +13,7 @@ from lerobot_deltaco.policy.goal_conditioning import FoundGoals
 
 
 class TaskConditioning(NamedTuple):
-    """What the policy's network receives about the tasks of a batch, computed once per episode."""
+    """Inputs of the policy's network that say the tasks of a batch, computed once per episode."""
 
     tasks: tuple[str, ...]
     film: Tensor | None  # (batch, film_dim)

@@ -46,7 +46,7 @@ class StoredDemonstrations(NamedTuple):
 
 
 class TaskFile(NamedTuple):
-    """What a file knows of tasks."""
+    """Contents of a task file."""
 
     language_encoder: str
     instructions: list[str]
@@ -140,7 +140,7 @@ def check_demonstrations(
 
     Args:
         path: The file.
-        demonstrations: Of the file.
+        demonstrations: Demonstrations of the file.
         image_size: Height and width of the policy's images, px.
         n_kept: Number of frames that the policy keeps of each demonstration.
 

@@ -31,7 +31,7 @@ class VisionEncoderError(RuntimeError):
 
 
 class InputFormat(NamedTuple):
-    """What images an encoder was made for."""
+    """Format of the images that an encoder was trained on."""
 
     size: int | None  # height and width, px; None for those of the image
     mean: tuple[float, ...]  # of the three color channels, 0..1
@@ -43,9 +43,9 @@ class VisionEncoder:
 
     Args:
         network: The model.
-        features: From the model and images (batch, 3, height, width), scaled as it expects, to features,
-            (batch, features).
-        input_format: The images that it was made for.
+        features: Function of the model and its scaled images, (batch, 3, height, width), that returns
+            features, (batch, features).
+        input_format: Format of the images that the model was trained on.
     """
 
     def __init__(
@@ -206,7 +206,7 @@ def r3m_weights(content: dict[str, Any]) -> dict[str, Tensor]:
     """The ResNet's weights in a file of R3M's, which has them under "r3m" and as "module.convnet.*".
 
     Args:
-        content: What the file holds; a ResNet's weights under their plain names will do, too.
+        content: Content of the file; a ResNet's weights under their plain names are accepted, too.
     """
     content = content.get("r3m", content)
     prefix = "module.convnet." if any(name.startswith("module.convnet.") for name in content) else ""
