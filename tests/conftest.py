@@ -9,6 +9,8 @@ import pytest
 for name in ("HF_HUB_OFFLINE", "HF_DATASETS_OFFLINE", "TRANSFORMERS_OFFLINE"):
     os.environ.setdefault(name, "1")
 os.environ.setdefault("WANDB_MODE", "disabled")
+# Before anything imports torch. The tests run in several processes, and so do the commands that they start.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 # Small policies. Their module is imported where it is used: it imports LeRobot, which takes 10 s.

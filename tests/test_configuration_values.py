@@ -159,7 +159,7 @@ def test_fields_of_other_configurations_are_named(make, options):
         ((1, 2), list[int], False),
         ({"a": 1}, dict[str, int], True),
         ({1: 1}, dict[str, int], False),
-        (object(), object, True),
+        pytest.param(object(), object, True, id="any object"),
     ],
     ids=str,
 )

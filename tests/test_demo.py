@@ -5,11 +5,12 @@ import sys
 from html.parser import HTMLParser
 
 import pytest
+import torch
 from PIL import Image
 from small_policies import REPO_ID, TASKS, use_fake_encoder, write_dataset
 
 from gym_deltaco.tasks import get_task
-from lerobot_deltaco.demo import recipe
+from lerobot_deltaco.demo import machine, recipe
 from lerobot_deltaco.demo import steps as demo_steps
 from lerobot_deltaco.demo.machine import seconds_per_step
 from lerobot_deltaco.demo.page import write_page
@@ -27,7 +28,9 @@ def test_new_combinations_are_of_trained_objects_and_containers():
 
 
 @pytest.fixture
-def demo(tmp_path):
+def demo(tmp_path, monkeypatch):
+    """A demo on a machine whose faster number format is known, since measuring it takes seconds."""
+    monkeypatch.setattr(demo_steps, "fast_dtype", lambda: "float32")
     return Demo(tmp_path / "demo")
 
 
@@ -59,13 +62,20 @@ def test_a_demo_with_other_settings_is_not_mixed_with_this_one(demo):
         Demo(demo.folder, {"steps": 1})
 
 
-def test_the_number_format_is_chosen_once(demo):
-    chosen = demo.settings["policy"]["dtype"]
-    assert chosen in ("float32", "bfloat16")
-    other = {"float32": "bfloat16", "bfloat16": "float32"}[chosen]
-    file = demo.folder / "settings.json"
-    file.write_text(file.read_text().replace(chosen, other))
-    assert Demo(demo.folder).settings["policy"]["dtype"] == other
+def test_the_number_format_is_measured(monkeypatch):
+    monkeypatch.setattr(machine, "_BATCH_SIZE", 2)
+    assert machine.fast_dtype() in ("float32", "bfloat16")
+    for seconds, chosen in ((0.5, "bfloat16"), (0.95, "float32"), (2, "float32")):
+        times = {torch.float32: 1, torch.bfloat16: seconds}
+        monkeypatch.setattr(machine, "_seconds", times.__getitem__)
+        assert machine.fast_dtype() == chosen
+
+
+def test_the_number_format_is_chosen_once(demo, monkeypatch):
+    assert demo.settings["policy"]["dtype"] == "float32"
+    monkeypatch.setattr(demo_steps, "fast_dtype", lambda: "bfloat16")
+    assert Demo(demo.folder).settings["policy"]["dtype"] == "float32"
+    assert Demo(demo.folder.with_name("new")).settings["policy"]["dtype"] == "bfloat16"
 
 
 @pytest.mark.parametrize(
