@@ -13,9 +13,9 @@ from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.gallery import episodes
 from gym_deltaco.gallery.episodes import Episode
 from gym_deltaco.gallery.objects import draw_random_objects, object_views
-from gym_deltaco.gallery.sheets import caption, down
 from gym_deltaco.object_sets import select_objects
 from gym_deltaco.objects import object_model
+from gym_deltaco.sheets import caption, down
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import OBJECTS, get_task
 from lerobot_deltaco.commands.gallery import main

@@ -14,8 +14,7 @@ from gym_deltaco.atomic_files import write_text
 from gym_deltaco.gallery.ambiguity import draw_ambiguity
 from gym_deltaco.gallery.episodes import draw_episodes
 from gym_deltaco.gallery.objects import draw_objects, draw_objects_by_name, draw_random_objects, object_cell
-from gym_deltaco.gallery.scenes import POLICY_SIZE, draw_scenes
-from gym_deltaco.gallery.sheets import Figure
+from gym_deltaco.gallery.scenes import POLICY_SIZE, Figure, draw_scenes
 from gym_deltaco.objects import object_model
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import COLORS, OBJECTS, SHAPES, ObjectLabel

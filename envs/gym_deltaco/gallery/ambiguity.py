@@ -12,9 +12,9 @@ from PIL import Image
 
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.gallery.episodes import record
-from gym_deltaco.gallery.scenes import PEOPLE_SIZE, make_env, pixel_of, scene_seed, view_of
-from gym_deltaco.gallery.sheets import GAP, Figure, across, caption, circled, down, framed, save_png
+from gym_deltaco.gallery.scenes import PEOPLE_SIZE, Figure, make_env, pixel_of, scene_seed, view_of
 from gym_deltaco.layout import Layout, twin_word
+from gym_deltaco.sheets import GAP, across, caption, circled, down, framed, save_png
 from gym_deltaco.tasks import OBJECTS, Task, get_task
 from gym_deltaco.workspace import TRAY_FLOOR
 

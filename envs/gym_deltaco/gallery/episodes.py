@@ -12,8 +12,8 @@ from PIL import Image
 from gym_deltaco import CONTROL_FPS, EPISODE_STEPS
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
-from gym_deltaco.gallery.scenes import PEOPLE_SIZE, make_env, scene_seed, view_of
-from gym_deltaco.gallery.sheets import GAP, Figure, caption, down, framed, grid, save_gif, save_png
+from gym_deltaco.gallery.scenes import PEOPLE_SIZE, Figure, make_env, scene_seed, view_of
+from gym_deltaco.sheets import GAP, caption, down, framed, grid, save_gif, save_png
 from gym_deltaco.tasks import OBJECTS, Task, get_task
 
 _SLOWED = 3  # factor by which the animation is slower than nominal

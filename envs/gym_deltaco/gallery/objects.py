@@ -10,13 +10,14 @@ from PIL import Image
 
 from gym_deltaco.camera import Camera
 from gym_deltaco.fixtures import TABLE_BOXES, TRAY_BOXES, table_mesh, tray_mesh
-from gym_deltaco.gallery.scenes import POLICY_SIZE, pixel_of
-from gym_deltaco.gallery.sheets import (
+from gym_deltaco.gallery.scenes import POLICY_SIZE, Figure, pixel_of
+from gym_deltaco.objects import ObjectModel
+from gym_deltaco.random_objects import random_model
+from gym_deltaco.sheets import (
     ACCENT,
     GAP,
     INK,
     PAPER,
-    Figure,
     across,
     caption,
     down,
@@ -26,8 +27,6 @@ from gym_deltaco.gallery.sheets import (
     save_png,
     to_image,
 )
-from gym_deltaco.objects import ObjectModel
-from gym_deltaco.random_objects import random_model
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, SHAPES, ObjectLabel
 from gym_deltaco.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR

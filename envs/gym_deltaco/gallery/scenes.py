@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from gym_deltaco.env import PickPlaceEnv
-from gym_deltaco.gallery.sheets import (
+from gym_deltaco.layout import Ambiguity
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.sheets import (
     GAP,
-    Figure,
     across,
     caption,
     down,
@@ -23,14 +25,20 @@ from gym_deltaco.gallery.sheets import (
     save_png,
     to_image,
 )
-from gym_deltaco.layout import Ambiguity
-from gym_deltaco.seeding import episode_seed
 from gym_deltaco.simulation import camera_matrices
 from gym_deltaco.workspace import CAMERA
 
 POLICY_SIZE = 48  # px, height and width of the policy's image
 PEOPLE_SIZE = 256  # px, height and width of images for people
 _SCENE_ZOOM = 4
+
+
+class Figure(NamedTuple):
+    """An image of the page."""
+
+    file: str
+    title: str
+    text: str
 
 
 def draw_scenes(out: Path, seed: int, task_ids: Sequence[int], tick: Callable[[], object]) -> Figure:

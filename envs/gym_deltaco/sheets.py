@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +21,6 @@ _PALETTE_SIZE = 256
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 RGB = tuple[int, int, int]
 Align = Literal["start", "middle", "end"]
-
-
-class Figure(NamedTuple):
-    """An image of the page."""
-
-    file: str
-    title: str
-    text: str
 
 
 def to_image(pixels: NDArray[np.uint8], size: int | None = None) -> Image.Image:
