@@ -7,6 +7,7 @@
 - A processor step keeps the transition that it processes in an attribute, which several threads overwrite.
 - Some of LeRobot's log messages are pages long: a traceback for each version of FFmpeg that torchcodec does
   not find, and the paths of all videos of an evaluation.
+- LeRobot's rollout has a progress bar of its own, which several processes would write over one another.
 
 What is replaced is checked first: with an unsupported version of LeRobot, an error names those that are
 supported.
@@ -20,6 +21,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -157,6 +159,25 @@ def make_processor_steps_thread_safe() -> None:
 
     if getattr(ProcessorStep, _TRANSITION, ...) is None:
         setattr(ProcessorStep, _TRANSITION, _PerThread())
+
+
+# Rollouts
+
+
+@contextmanager
+def without_rollout_progress() -> Iterator[None]:
+    """Hides the progress bar of each of LeRobot's rollouts, while the context is open.
+
+    A version without the attribute needs no workaround.
+    """
+    from lerobot.scripts import lerobot_eval
+
+    bar = getattr(lerobot_eval, "trange", None)
+    if bar is None:
+        yield
+        return
+    with patch.object(lerobot_eval, "trange", partial(bar, disable=True)):
+        yield
 
 
 # Log messages

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from safetensors import SafetensorError, safe_open
 
 from gym_deltaco import EPISODE_STEPS
 from lerobot_deltaco.common.typed_fields import in_words, is_a, type_hints
@@ -17,6 +19,10 @@ TRAINING_STEP = Path("training_state", "training_step.json")
 WEIGHTS = "model.safetensors"
 TRAIN_CONFIG = "train_config.json"
 POLICY_CONFIG = "config.json"
+
+
+# The weight in which policies of this project keep their training step.
+_STEP = "step"
 
 
 class RunError(ValueError):
@@ -39,12 +45,14 @@ class RunDescription:
         seed: Seed of the training.
         image_size: Height and width of the images that it was trained on, px.
         episode_length: Steps of an episode in the training's environment; the benchmark's without one.
+        policy_type: Type of its policy, such as "deltaco" or "act".
     """
 
     experiment: str
     seed: int
     image_size: int
     episode_length: int
+    policy_type: str
 
 
 def checkpoints(run: Path) -> list[Checkpoint]:
@@ -63,12 +71,31 @@ def checkpoints(run: Path) -> list[Checkpoint]:
         if folder.name.isdecimal() and (folder / PRETRAINED_MODEL / WEIGHTS).is_file()
         if not last.isdecimal() or int(folder.name) <= int(last)
     ]
+    if not found and is_checkpoint(run):
+        return [Checkpoint(_step_of(run), run)]
     if not found:
         raise RunError(
             f"{run} has no checkpoints. Name the `--output_dir` of a training with `lerobot-train` or "
-            "`deltaco-train`."
+            f"`deltaco-train`, or the folder of a checkpoint ({POLICY_CONFIG}, {WEIGHTS})."
         )
     return sorted(found)
+
+
+def is_checkpoint(folder: Path) -> bool:
+    """Whether a folder is itself a checkpoint, such as `checkpoints/012000/pretrained_model` of a run."""
+    return (folder / POLICY_CONFIG).is_file() and (folder / WEIGHTS).is_file()
+
+
+def _step_of(checkpoint: Path) -> int:
+    """The training step of a checkpoint without its run: of its folder's name, or of its weights, else 0."""
+    folder = checkpoint.resolve()
+    if folder.name == PRETRAINED_MODEL and folder.parent.name.isdecimal():
+        return int(folder.parent.name)
+    try:
+        with safe_open(checkpoint / WEIGHTS, framework="numpy") as file:
+            return int(file.get_tensor(_STEP)) if _STEP in file.keys() else 0  # noqa: SIM118
+    except (SafetensorError, TypeError, ValueError) as error:
+        raise RunError(f"{checkpoint / WEIGHTS} is damaged: {error}") from None
 
 
 def last_policy(run: Path) -> Path:
@@ -87,6 +114,15 @@ def last_step(run: Path) -> int:
     return int(json.loads(state.read_text(encoding="utf-8"))["step"])
 
 
+def _train_config(folder: Path) -> dict[str, Any]:
+    """Settings of a checkpoint's training; of one that was published without them, its name and seed."""
+    path = folder / TRAIN_CONFIG
+    if not path.exists() and is_checkpoint(folder) and folder.name != PRETRAINED_MODEL:
+        policy = json.loads((folder / POLICY_CONFIG).read_text(encoding="utf-8"))
+        return {"job_name": folder.resolve().name, "seed": policy.get("seed", 0), "env": None}
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
 def describe(checkpoint: Checkpoint) -> RunDescription:
     """The run's job name and seed, and its environment.
 
@@ -94,7 +130,7 @@ def describe(checkpoint: Checkpoint) -> RunDescription:
         RunError: What the run has written down of itself is damaged, or it was not trained on the benchmark.
     """
     try:
-        run = json.loads((checkpoint.folder / TRAIN_CONFIG).read_text(encoding="utf-8"))
+        run = _train_config(checkpoint.folder)
         policy = json.loads((checkpoint.folder / POLICY_CONFIG).read_text(encoding="utf-8"))
         cameras = [name for name, item in policy["input_features"].items() if item["type"] == "VISUAL"]
         env = run["env"] if (run.get("env") or {}).get("type") == "deltaco" else {}
@@ -103,6 +139,7 @@ def describe(checkpoint: Checkpoint) -> RunDescription:
             seed=run["seed"] if run["seed"] is not None else 0,
             image_size=policy["input_features"][cameras[0]]["shape"][-1],
             episode_length=env.get("episode_length", EPISODE_STEPS),
+            policy_type=policy["type"],
         )
     except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise RunError(

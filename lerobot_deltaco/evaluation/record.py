@@ -139,6 +139,11 @@ def record_path(run_folder: Path, step: int, counterfactual: Counterfactual = "n
     return run_folder / RECORDS_FOLDER / f"{step:07d}{suffix}.json"
 
 
+def extras_folder(run_folder: Path, step: int, counterfactual: Counterfactual = "none") -> Path:
+    """Where a run keeps what belongs to the record of a step: images, videos, results in LeRobot's form."""
+    return record_path(run_folder, step, counterfactual).with_suffix("")
+
+
 def write_record(record: EvaluationRecord, path: Path) -> None:
     """Writes a record, wholly or not at all."""
     write_json(path, {"format": RECORD_FORMAT, **asdict(record)}, indent=1)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_deltaco.envs.vector_env import TaskVectorEnv
 
@@ -20,16 +21,29 @@ class RecordingVectorEnv:
         env: The vector environment.
         seeds: Seeds of the environments' resets, used as they are.
         sample_instructions: Returns the instructions for drawn scenes; None takes the environment's.
+        is_filmed: Whether the scenes are rendered before the first step and after each.
+
+    Attributes:
+        infos: Info of each environment, after its last step.
+        instructions: Instruction of each environment.
+        observed: First images that the policy received, (environments, H, W, 3); None unless filmed.
     """
 
     def __init__(
-        self, env: TaskVectorEnv, seeds: Sequence[int], sample_instructions: SampleInstructions | None = None
+        self,
+        env: TaskVectorEnv,
+        seeds: Sequence[int],
+        sample_instructions: SampleInstructions | None = None,
+        is_filmed: bool = False,
     ) -> None:
         self._env = env
         self._seeds = list(seeds)
         self._sample_instructions = sample_instructions
-        self.infos: list[dict[str, Any]] = []  # of each environment, after its last step
+        self._is_filmed = is_filmed
+        self._rendered: list[tuple[NDArray[np.uint8], ...]] = []
+        self.infos: list[dict[str, Any]] = []
         self.instructions: list[str] = []
+        self.observed: Any = None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._env, name)
@@ -42,13 +56,22 @@ class RecordingVectorEnv:
             self.instructions = list(self._env.call("task_description"))
         else:
             self.instructions = self._sample_instructions(self.infos)
+        if self._is_filmed:
+            self.observed = observations["pixels"].copy()
+            self._rendered = [self._env.render()]
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Does one action in each environment."""
         result = self._env.step(actions)
         self.infos = _of_each(result[-1], self._env.num_envs)
+        if self._is_filmed:
+            self._rendered.append(self._env.render())
         return result
+
+    def film(self, index: int) -> list[NDArray[np.uint8]]:
+        """The rendered images of an environment, (H, W, 3) each."""
+        return [images[index] for images in self._rendered]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Calls a method of each environment, or reads an attribute."""

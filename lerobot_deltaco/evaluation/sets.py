@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 import draccus
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
 
 from gym_deltaco.object_sets import default_objects
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.evaluation.evaluate import evaluate, versions
+from lerobot_deltaco.evaluation.evaluate import Evaluation, versions
+from lerobot_deltaco.evaluation.lerobot_info import write_lerobot_info
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
-from lerobot_deltaco.evaluation.record import EvaluationRecord, record_path, write_record
-from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.evaluation.processes import run_tasks
+from lerobot_deltaco.evaluation.record import EvaluationRecord, extras_folder, record_path, write_record
 
 
 def run_set(
     folder: Path,
     step: int,
-    policy: DeltacoPolicy,
+    policy: PreTrainedPolicy,
     preprocessor: PolicyProcessorPipeline,
     postprocessor: PolicyProcessorPipeline,
     plan: EvaluationPlan,
@@ -27,8 +31,9 @@ def run_set(
     experiment: str,
     run_seed: int,
     command: str,
+    processes: int = 1,
 ) -> EvaluationRecord:
-    """Runs an evaluation set, and writes its record.
+    """Runs an evaluation set, and writes its record, and beside it the results in LeRobot's form.
 
     Args:
         folder: Folder that contains `evaluations`, usually that of the training run.
@@ -40,18 +45,22 @@ def run_set(
         experiment: What was trained, for the record; runs of one name differ in their seeds alone.
         run_seed: Seed of the training run, for the record.
         command: Command line, for the record.
+        processes: Number of processes that share the episodes.
 
     Returns:
         The record.
 
     Raises:
         ValueError: A task has no demonstration.
+        EvaluationError: A process ended unexpectedly.
     """
     start = time.monotonic()
-    episodes = evaluate(policy, preprocessor, postprocessor, plan, step)
+    with Evaluation(policy, preprocessor, postprocessor, plan, step) as evaluation:
+        outcomes = run_tasks(evaluation, processes)
+    config = policy.config
     record = EvaluationRecord(
         experiment=experiment,
-        method=policy.config.method,
+        method=config.method if isinstance(config, DeltacoConfig) else config.type,
         run_seed=run_seed,
         step=step,
         evaluation_seed=plan.seed,
@@ -61,8 +70,8 @@ def run_set(
         adversarial_probability=plan.adversarial_probability,
         tasks=plan.tasks,
         trials=plan.trials,
-        episodes=episodes,
-        policy=_plain(policy.config),
+        episodes=[outcome.result for outcome in outcomes],
+        policy=_plain(config),
         versions=versions(policy),
         command=command,
         seconds=time.monotonic() - start,
@@ -70,13 +79,25 @@ def run_set(
         episode_length=plan.episode_length,
         wording=plan.wording,
     )
+    write_lerobot_info(outcomes, record.seconds, extras_folder(folder, step, plan.counterfactual))
     write_record(record, record_path(folder, step, plan.counterfactual))
     return record
 
 
-def _plain(config: DeltacoConfig) -> dict[str, object]:
-    """The policy's configuration as JSON knows it, less what comes from the data, and where they were."""
-    left_out = {"input_features", "output_features", "one_hot_tasks", "demo_episodes"}
+def _plain(config: PreTrainedConfig) -> dict[str, Any]:
+    """The policy's configuration as JSON knows it, less what comes from the data, and where they were.
+
+    That of another type than this project's has the key `type`.
+    """
+    left_out = {"input_features", "output_features"}
+    if not isinstance(config, DeltacoConfig):
+        # Encoded as its base class, so that the type is there.
+        return _without(draccus.encode(config, PreTrainedConfig), left_out)
+    left_out |= {"one_hot_tasks", "demo_episodes"}
     left_out |= {"demo_repo_id", "demo_root", "instruction_embeddings", "instructions"}
     left_out |= {"vision_encoder_weights", "demo_features_dir", "demo_feature_dim"}
-    return {name: value for name, value in draccus.encode(config).items() if name not in left_out}
+    return _without(draccus.encode(config), left_out)
+
+
+def _without(options: dict[str, Any], left_out: set[str]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if name not in left_out}

@@ -368,6 +368,7 @@ def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
 def _architecture(group: Sequence[Series]) -> str:
     """How the policies of a comparison differ from the paper's, as a sentence; empty if they do not."""
     policies = [series.sets[-1].record.policy for series in group]
+    policies = [policy for policy in policies if "type" not in policy]  # others have no paper to depart from
     differing = {
         name: dict.fromkeys(str(policy[name]) for policy in policies if policy.get(name, own) != own)
         for name, own in PAPER_OPTIONS.items()
@@ -521,6 +522,7 @@ def _origin_section(report: Report) -> str:
     for series in report.series:
         records = [item.record for item in series.sets]
         policy = records[-1].policy
+        kind = "type" if "type" in policy else "method"  # another of LeRobot's policies, or one of ours
         options = "".join(f", `{name}={policy[name]}`" for name in _NAMED_OPTIONS if name in policy)
         versions = defaultdict(set)
         for record in records:
@@ -530,7 +532,7 @@ def _origin_section(report: Report) -> str:
         n_records = f"{len(records)} record{'s' * (len(records) > 1)}"
         parts.append(
             f"### {series.name}\n\n"
-            f"- Policy: `method={records[0].method}`{options}.\n"
+            f"- Policy: `{kind}={records[0].method}`{options}.\n"
             f"- {counted('seed', series.seeds).capitalize()}; {n_records}; "
             f"{sum(record.seconds for record in records) / 60:.0f} min of evaluation.\n"
             f"- {', '.join(f'{name} {" and ".join(sorted(found))}' for name, found in versions.items())}.\n\n"
