@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import sys
 from dataclasses import replace
@@ -11,12 +12,20 @@ from pathlib import Path
 from gym_deltaco.instructions import INSTRUCTION_SPLITS
 from gym_deltaco.layout import AMBIGUITIES
 from lerobot_deltaco.commands.command_errors import exit_on_error
-from lerobot_deltaco.common.run_folder import Checkpoint, RunDescription, RunError, checkpoints, describe
+from lerobot_deltaco.common.run_folder import (
+    Checkpoint,
+    RunDescription,
+    RunError,
+    checkpoints,
+    describe,
+    is_checkpoint,
+)
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import (
     COUNTERFACTUALS,
     EvaluationRecord,
     RecordError,
+    extras_folder,
     read_record,
     record_path,
 )
@@ -50,20 +59,31 @@ def main(arguments: list[str] | None = None) -> None:
             parser.error(f"--out holds the records of a single run. Got {len(options.runs)} runs.")
         if options.demo_root is not None and options.demo_repo_id is None:
             parser.error("--policy.demo_root is the folder of --policy.demo_repo_id. Give both.")
-        if options.demo_repo_id is not None and options.out is None:
+        other_demonstrations = (options.demo_repo_id, options.n_demonstrations) != (None, None)
+        if other_demonstrations and options.out is None:
             parser.error(
                 "An evaluation with other demonstrations must not be mixed with the run's own. Name another "
                 "folder for its records with --out."
             )
+        for name, minimum in (("processes", 1), ("n_demonstrations", 1), ("explain", 0), ("videos", 0)):
+            number = getattr(options, name)
+            if number is not None and number < minimum:
+                parser.error(f"--{name.replace('_', '-')} must be at least {minimum}. Got {number}.")
         if plan.sentences is not None and options.out is None:
             parser.error(
                 "With instructions in other words, an evaluation is not to be taken for the run's own. Name "
                 "another folder for its records with --out."
             )
         todo = [(run, checkpoint) for run in options.runs for checkpoint in _chosen(run, options.steps)]
+        alone = [run for run, checkpoint in todo if run == checkpoint.folder and is_checkpoint(run)]
+        if alone and options.out is None:
+            parser.error(
+                f"{alone[0]} is a checkpoint, not the folder of a training run. Name a folder for its "
+                "records with --out."
+            )
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    with exit_on_error(parser, RunError, RecordError, ValueError, OSError):
+    with exit_on_error(parser, RunError, RecordError, ValueError, OSError, RuntimeError):
         for run, checkpoint in todo:
             description = describe(checkpoint)
             trained_with = {
@@ -99,64 +119,107 @@ def _evaluate(
 ) -> None:
     folder = options.out or run
     experiment = options.experiment or description.experiment
+    if description.policy_type != "deltaco":
+        for name in ("demo_repo_id", "n_demonstrations"):
+            if getattr(options, name) is not None:
+                raise RunError(
+                    f"{run} holds a policy of the type {description.policy_type!r}, which takes no "
+                    f"demonstrations. Leave out --{'policy.' * (name == 'demo_repo_id')}"
+                    f"{name if name == 'demo_repo_id' else 'n-demonstrations'}."
+                )
     path = record_path(folder, checkpoint.step, plan.counterfactual)
+    record = None
     if path.exists():
         record = read_record(path)
-        if options.out is not None and (record.experiment, record.run_seed) != (experiment, description.seed):
-            raise RecordError(
-                f"{path} belongs to another run: {record.experiment!r} with seed {record.run_seed}. Expected "
-                f"{experiment!r} with seed {description.seed}. Name another folder with --out."
-            )
-        made_for = _settings(
-            record.tasks,
-            record.trials,
-            record.evaluation_seed,
-            record.counterfactual,
-            record.ambiguity,
-            record.image_size,
-            record.episode_length,
-            record.objects,
-            record.adversarial_probability,
-            record.wording,
-        )
-        asked_for = _settings(
-            plan.tasks,
-            plan.trials,
-            plan.seed,
-            plan.counterfactual,
-            plan.ambiguity,
-            plan.image_size,
-            plan.episode_length,
-            plan.objects,
-            plan.adversarial_probability,
-            plan.wording,
-        )
-        if made_for != asked_for:
-            raise RecordError(
-                f"{path} belongs to another evaluation: {made_for}. Expected {asked_for}. Use the same "
-                "arguments, or name another folder for the records with --out."
-            )
-        sys.stdout.write(_text(run, record, "already evaluated"))
-        return
-    # Only here, since they take seconds to import.
-    from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
-    from lerobot_deltaco.evaluation.sets import run_set
+        _check_same_evaluation(path, record, plan, experiment, description, options)
+        remark = "already evaluated"
+    if record is None or options.explain or options.videos:
+        # Only here, since they take seconds to import.
+        from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
+        from lerobot_deltaco.evaluation.evaluate import check_combines
+        from lerobot_deltaco.evaluation.films import check_explainable, write_explanations, write_videos
+        from lerobot_deltaco.evaluation.processes import default_processes
+        from lerobot_deltaco.evaluation.sets import run_set
 
-    given = {name: getattr(options, name) for name in ("device", "demo_repo_id", "demo_root")}
-    overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
-    policy, preprocessor, postprocessor = load_policy(checkpoint.folder, overrides)
-    record = run_set(
-        folder,
-        checkpoint.step,
-        policy,
-        preprocessor,
-        postprocessor,
-        plan,
-        experiment=experiment,
-        run_seed=description.seed,
-        command=command,
+        names = ("device", "demo_repo_id", "demo_root", "n_demonstrations")
+        given = {name: getattr(options, name) for name in names}
+        overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
+        loaded = load_policy(checkpoint.folder, overrides, options.rename_map)
+        if options.n_demonstrations is not None:
+            check_combines(loaded.policy)
+        if options.explain:
+            check_explainable(loaded)
+        if record is None:
+            record = run_set(
+                folder,
+                checkpoint.step,
+                *loaded,
+                plan,
+                experiment=experiment,
+                run_seed=description.seed,
+                command=command,
+                processes=options.processes or default_processes(str(loaded.policy.config.device)),
+            )
+            remark = f"{record.seconds:.0f} s"
+    sys.stdout.write(_text(run, record, remark))
+    extras = extras_folder(folder, checkpoint.step, plan.counterfactual)
+    if options.explain:
+        images = write_explanations(extras, loaded, plan, record, options.explain)
+        sys.stdout.write(f"Where the policy looked, in {len(images)} episodes: {images[0].parent}\n")
+    if options.videos:
+        sys.stdout.write(f"Videos: {write_videos(extras, loaded, plan, record, options.videos)}\n")
+
+
+def _check_same_evaluation(
+    path: Path,
+    record: EvaluationRecord,
+    plan: EvaluationPlan,
+    experiment: str,
+    description: RunDescription,
+    options: argparse.Namespace,
+) -> None:
+    """Checks that a record that is there is what the arguments ask for.
+
+    Raises:
+        RecordError: It is another one.
+    """
+    if options.out is not None and (record.experiment, record.run_seed) != (experiment, description.seed):
+        raise RecordError(
+            f"{path} belongs to another run: {record.experiment!r} with seed {record.run_seed}. Expected "
+            f"{experiment!r} with seed {description.seed}. Name another folder with --out."
+        )
+    made_for = _settings(
+        record.tasks,
+        record.trials,
+        record.evaluation_seed,
+        record.counterfactual,
+        record.ambiguity,
+        record.image_size,
+        record.episode_length,
+        record.objects,
+        record.adversarial_probability,
+        record.wording,
     )
-    sys.stdout.write(_text(run, record, f"{record.seconds:.0f} s"))
+    asked_for = _settings(
+        plan.tasks,
+        plan.trials,
+        plan.seed,
+        plan.counterfactual,
+        plan.ambiguity,
+        plan.image_size,
+        plan.episode_length,
+        plan.objects,
+        plan.adversarial_probability,
+        plan.wording,
+    )
+    if options.n_demonstrations is not None:
+        made_for["n_demonstrations"] = record.policy.get("n_demonstrations", 1)
+        asked_for["n_demonstrations"] = options.n_demonstrations
+    if made_for != asked_for:
+        raise RecordError(
+            f"{path} belongs to another evaluation: {made_for}. Expected {asked_for}. Use the same "
+            "arguments, or name another folder for the records with --out."
+        )
 
 
 def _settings(
@@ -201,15 +264,34 @@ def _steps(text: str) -> str:
     return text
 
 
+def _rename_map(text: str) -> dict[str, str]:
+    try:
+        names = json.loads(text)
+    except ValueError:
+        names = None
+    if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
+        raise argparse.ArgumentTypeError(
+            "must be names in JSON, such as "
+            f'{{"observation.image": "observation.images.camera1"}}. Got {text!r}.'
+        )
+    return names
+
+
 def _parser() -> argparse.ArgumentParser:
     plan = EvaluationPlan()
     parser = argparse.ArgumentParser(
         prog="deltaco-evaluate",
-        description="Evaluates checkpoints of training runs, and writes a record of each evaluation set to "
-        "the folder `evaluations` of the run. Checkpoints that have a record are skipped. `deltaco-report` "
-        "tabulates the records.",
+        description="Evaluates checkpoints of training runs, of any LeRobot policy, and writes a record of "
+        "each evaluation set to the folder `evaluations` of the run. Checkpoints that have a record are "
+        "skipped. `deltaco-report` tabulates the records.",
     )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_DIR", help="folder of a training run")
+    parser.add_argument(
+        "runs",
+        nargs="+",
+        type=Path,
+        metavar="RUN_DIR",
+        help="folder of a training run, or of a checkpoint (then with --out)",
+    )
     parser.add_argument(
         "--tasks",
         default=plan.tasks,
@@ -310,6 +392,45 @@ def _parser() -> argparse.ArgumentParser:
         dest="demo_root",
         metavar="DIR",
         help="folder of that dataset, if it is not in LeRobot's cache",
+    )
+    parser.add_argument(
+        "--n-demonstrations",
+        type=int,
+        metavar="N",
+        help="number of demonstrations of each task that are combined, with demo_encoder=correspondence; "
+        "needs --out (default: the checkpoint's, which is 1 unless it was trained otherwise)",
+    )
+    parser.add_argument(
+        "--rename_map",
+        "--rename-map",
+        dest="rename_map",
+        type=_rename_map,
+        metavar="JSON",
+        help="names under which the policy knows the environment's observations, as in lerobot-eval "
+        "(default: those of its training)",
+    )
+    parser.add_argument(
+        "--processes",
+        type=int,
+        metavar="N",
+        help="number of processes that share the episodes; the record is the same with any number (default: "
+        "one for each core, or OMP_NUM_THREADS; one for a policy on a GPU)",
+    )
+    parser.add_argument(
+        "--explain",
+        type=int,
+        default=0,
+        metavar="N",
+        help="draw for N episodes where the policy looks in the demonstration and in the scene, as PNG files "
+        "beside the record",
+    )
+    parser.add_argument(
+        "--videos",
+        type=int,
+        default=0,
+        metavar="N",
+        help="keep videos of N episodes of each outcome (success, wrong object, nothing grasped, wrong "
+        "container, dropped) beside the record, with a page that shows them",
     )
     parser.add_argument(
         "--out",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from gym_deltaco.sheets import across, caption, down, to_image
+from gym_deltaco.sheets import GAP, across, caption, down, to_image
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals
 
 # Colors that no object and no container of the benchmark has.
@@ -18,6 +20,9 @@ _OPACITY = 0.75  # of an overlay where its map is greatest
 _DIMMED = 0.75  # brightness of what lies under an overlay
 _CAPTION_SIZE = 13  # px
 _CAPTION_LINES = 2
+_TITLE_SIZE = 15  # px
+_MOTION = 1.0  # mean change of a pixel's value, 0..255, from one image to the next if something moves
+_MOMENT_SIZE = 130  # px, about, of an image of the episode
 
 
 def draw_explanation(
@@ -63,6 +68,49 @@ def draw_explanation(
     return np.asarray(across(panels))
 
 
+def draw_episode(
+    title: str,
+    images: Sequence[NDArray[np.uint8]],
+    observed: NDArray[np.uint8],
+    demonstration: NDArray[np.uint8] | None,
+    goals: FoundGoals,
+    from_demonstration: tuple[bool, bool] = (True, True),
+) -> NDArray[np.uint8]:
+    """Draws where a policy looked, and below it what it did then: images of the episode with both goals.
+
+    Args:
+        title: Instruction and what happened.
+        images: The scene before the first step and after each, (H, W, 3), as the policy's camera sees it.
+        observed: First image that the policy received, (H, W, 3).
+        demonstration: First and last image of the demonstration, (2, H, W, 3); None if the policy takes none.
+        goals: Goals that the policy found, of this episode alone.
+        from_demonstration: Whether the grasp and the release come from the demonstration.
+
+    Returns:
+        One image, (height, width, 3) RGB.
+    """
+    top = to_image(draw_explanation(observed, demonstration, goals, from_demonstration))
+    n_columns = max(2, round(top.width / _MOMENT_SIZE))
+    size = (top.width - GAP * (n_columns - 1)) // n_columns
+    moments = []
+    for step in np.linspace(0, _last_motion(images), n_columns).round().astype(int).tolist():
+        panel = to_image(images[step]).resize((size, size), Image.Resampling.LANCZOS)
+        for place, color in zip(goals.places[0].tolist(), _COLORS, strict=True):
+            _mark(panel, place, color)
+        panels = [panel, caption(f"step {step}", size, _CAPTION_SIZE)]
+        moments.append(down(panels, gap=4))
+    return np.asarray(down([caption(title, top.width, _TITLE_SIZE), top, across(moments)]))
+
+
+def _last_motion(images: Sequence[NDArray[np.uint8]]) -> int:
+    """Number of the last image that differs from the one before it in more than noise."""
+    for step in range(len(images) - 1, 0, -1):
+        change = np.abs(images[step].astype(np.float32) - images[step - 1].astype(np.float32))
+        if change.mean() > _MOTION:
+            return step
+    return len(images) - 1
+
+
 def _overlaid(
     panel: Image.Image, maps: torch.Tensor, colors: tuple[tuple[int, int, int], ...]
 ) -> Image.Image:
@@ -78,13 +126,15 @@ def _overlaid(
     return Image.fromarray(np.round(pixels).astype(np.uint8))
 
 
-def _mark(panel: Image.Image, place: list[float], color: tuple[int, int, int], name: str) -> None:
-    """Draws a ring and a name at a place, x and y in -1..1."""
+def _mark(panel: Image.Image, place: list[float], color: tuple[int, int, int], name: str = "") -> None:
+    """Draws a ring and perhaps a name at a place, x and y in -1..1."""
     draw = ImageDraw.Draw(panel)
     x, y = ((coordinate + 1) / 2 * side for coordinate, side in zip(place, panel.size, strict=True))
     radius = panel.width / 20
     for outline, reach, width in (((0, 0, 0), radius + 1, 4), (color, radius, 2)):
         draw.ellipse((x - reach, y - reach, x + reach, y + reach), outline=outline, width=width)
+    if not name:
+        return
     above = y > panel.height / 2
     anchor, text_y = ("mb", y - radius - 2) if above else ("mt", y + radius + 2)
     x = min(max(x, 24), panel.width - 24)

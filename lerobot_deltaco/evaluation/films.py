@@ -1,0 +1,292 @@
+"""Episodes of an evaluation set in images: where the policy looked, and videos by what went wrong.
+
+Episodes are chosen by the record and run again, which takes seconds: to render all of them would take many
+times as long as the evaluation.
+"""
+
+from __future__ import annotations
+
+import html
+import re
+import shutil
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from lerobot.utils.io_utils import write_video
+from numpy.typing import NDArray
+from PIL import Image
+
+from gym_deltaco.atomic_files import write_json, write_text
+from gym_deltaco.object_sets import find_label
+from gym_deltaco.sheets import GAP, across, caption, down, save_png, to_image
+from gym_deltaco.tasks import CONTAINER_COLORS
+from lerobot_deltaco.evaluation.checkpoint_policy import LoadedPolicy
+from lerobot_deltaco.evaluation.evaluate import Evaluation, Film
+from lerobot_deltaco.evaluation.explanation import draw_episode
+from lerobot_deltaco.evaluation.plan import EvaluationPlan
+from lerobot_deltaco.evaluation.record import EpisodeResult, EvaluationRecord
+from lerobot_deltaco.lerobot_internals import without_rollout_progress
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+
+# What came of an episode, and what it is called.
+KINDS = MappingProxyType(
+    {
+        "success": "Success",
+        "wrong_object": "Wrong object",
+        "nothing_grasped": "Nothing grasped",
+        "wrong_container": "Wrong container",
+        "dropped": "Dropped",
+    }
+)
+EXPLANATIONS, VIDEOS = "explanations", "videos"
+RENDER_SIZE = 256  # px
+VIDEO_FPS = 10
+_HELD_FRAMES = 10  # for which the last image of a video stays
+_MAX_SLUG = 60  # characters
+
+
+class FilmedEpisode(NamedTuple):
+    """An episode that was run again.
+
+    Attributes:
+        result: What is recorded of it.
+        film: The episode in images.
+        is_repeated: Whether it ended as recorded. On another processor, it may end otherwise.
+    """
+
+    result: EpisodeResult
+    film: Film
+    is_repeated: bool
+
+
+def kind_of(episode: EpisodeResult) -> str:
+    """What came of an episode, one of `KINDS`."""
+    if episode.success:
+        return "success"
+    if episode.grasped_object < 0:
+        return "nothing_grasped"
+    if not episode.right_object:
+        return "wrong_object"
+    if episode.object_containers[episode.target_object] == 1 - episode.target_container:
+        return "wrong_container"
+    return "dropped"
+
+
+def in_words(episode: EpisodeResult) -> str:
+    """What came of an episode, in a sentence."""
+    grasped = None if episode.grasped_object < 0 else find_label(episode.objects[episode.grasped_object]).name
+    target = find_label(episode.objects[episode.target_object]).name
+    wanted = CONTAINER_COLORS[episode.target_container]
+    return {
+        "success": f"Success: the {target} lies in the {wanted} bin.",
+        "wrong_object": f"Wrong object: it grasped the {grasped}, not the {target}.",
+        "nothing_grasped": f"It grasped nothing; the {target} was meant.",
+        "wrong_container": f"Wrong container: the {target} was to lie in the {wanted} bin.",
+        "dropped": f"It grasped the {target}, which lies in no bin.",
+    }[kind_of(episode)]
+
+
+def check_explainable(loaded: LoadedPolicy) -> None:
+    """Checks that a policy finds goals, which are what an explanation shows.
+
+    Raises:
+        ValueError: It finds none.
+    """
+    config = loaded.policy.config
+    if isinstance(loaded.policy, DeltacoPolicy):
+        if config.locates_goals:
+            return
+        kind = f"demo_encoder={config.demo_encoder}"
+    else:
+        kind = f"type={config.type}"
+    raise ValueError(
+        "--explain draws where a policy with `demo_encoder=correspondence` looks. This one "
+        f"(`{kind}`) finds no places in the image that could be drawn. Leave out --explain; --videos shows "
+        "episodes of any policy."
+    )
+
+
+def write_explanations(
+    folder: Path, loaded: LoadedPolicy, plan: EvaluationPlan, record: EvaluationRecord, n_episodes: int
+) -> list[Path]:
+    """Draws where the policy looked in some episodes, spread evenly over the set.
+
+    Args:
+        folder: Folder in which the folder of the images is made anew.
+        loaded: The policy.
+        plan: Plan of the evaluation set.
+        record: Record of the evaluation set.
+        n_episodes: Number of episodes.
+
+    Returns:
+        The images, one for each episode.
+
+    Raises:
+        ValueError: The policy finds no goals.
+    """
+    check_explainable(loaded)
+    assert isinstance(loaded.policy, DeltacoPolicy)
+    assert loaded.policy.goals is not None
+    locator = loaded.policy.goals.locator
+    from_demonstration = (locator.grasp_source == "demo", locator.release_source == "demo")
+    chosen = _evenly(record.episodes, n_episodes)
+    written = []
+    with _NewFolder(folder / EXPLANATIONS) as new:
+        for episode, film, _ in _run_again(loaded, plan, record, chosen):
+            assert film.goals is not None
+            title = f"“{episode.instruction}” {in_words(episode)}"
+            image = draw_episode(
+                title, film.images, film.observed, film.demonstration, film.goals, from_demonstration
+            )
+            save_png(to_image(image), new / f"{_file_name(episode)}.png")
+            written.append(folder / EXPLANATIONS / f"{_file_name(episode)}.png")
+    return written
+
+
+def write_videos(
+    folder: Path, loaded: LoadedPolicy, plan: EvaluationPlan, record: EvaluationRecord, n_each: int
+) -> Path:
+    """Films some episodes of each kind of outcome.
+
+    Args:
+        folder: Folder in which the folder of the videos is made anew: an MP4 file for each episode in a
+            folder for each of `KINDS`, `index.json` with what is known of them, and `index.html`, which
+            shows them.
+        loaded: The policy.
+        plan: Plan of the evaluation set.
+        record: Record of the evaluation set.
+        n_each: Number of episodes of each kind; all of them if there are fewer.
+
+    Returns:
+        The page `index.html`.
+    """
+    groups: dict[str, list[EpisodeResult]] = defaultdict(list)
+    for episode in record.episodes:
+        groups[kind_of(episode)].append(episode)
+    chosen = [episode for group in groups.values() for episode in _evenly(group, n_each)]
+    index = []
+    with _NewFolder(folder / VIDEOS) as new:
+        for episode, film, is_repeated in _run_again(loaded, plan, record, chosen):
+            kind = kind_of(episode)
+            name = f"{kind}/{_file_name(episode)}.mp4"
+            (new / kind).mkdir(exist_ok=True)
+            frames = [_video_frame(episode, film, step) for step in range(len(film.images))]
+            write_video(new / name, frames + frames[-1:] * _HELD_FRAMES, VIDEO_FPS)
+            index.append(
+                {
+                    "file": name,
+                    "outcome": kind,
+                    "what_happened": in_words(episode),
+                    "task_id": episode.task_id,
+                    "trial": episode.trial,
+                    "seed": episode.seed,
+                    "instruction": episode.instruction,
+                    "demonstration": episode.demonstration,
+                    "ends_as_recorded": is_repeated,
+                }
+            )
+        counts = {kind: len(groups[kind]) for kind in KINDS}
+        write_json(new / "index.json", {"episodes_by_outcome": counts, "videos": index}, indent=1)
+        write_text(new / "index.html", _page(record, counts, index))
+    return folder / VIDEOS / "index.html"
+
+
+class _NewFolder:
+    """Makes a folder under another name, which takes its place if the block ends without an error."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._temporary = path, path.with_name(f".{path.name}.part")
+
+    def __enter__(self) -> Path:
+        shutil.rmtree(self._temporary, ignore_errors=True)
+        self._temporary.mkdir(parents=True)
+        return self._temporary
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        if kind is not None:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+            return
+        shutil.rmtree(self._path, ignore_errors=True)
+        self._temporary.rename(self._path)
+
+
+def _run_again(
+    loaded: LoadedPolicy, plan: EvaluationPlan, record: EvaluationRecord, chosen: Iterable[EpisodeResult]
+) -> Iterator[FilmedEpisode]:
+    """Runs episodes again as they were run, and films them; those of a task one after the other."""
+    by_task: dict[int, dict[int, EpisodeResult]] = defaultdict(dict)
+    for episode in chosen:
+        by_task[episode.task_id][episode.trial] = episode
+    evaluation = Evaluation(*loaded, plan, record.step, render_size=RENDER_SIZE)
+    with evaluation, without_rollout_progress():
+        for task_id, wanted in by_task.items():
+            for outcome in evaluation.run(task_id, filmed=wanted):
+                if outcome.film is None:
+                    continue
+                recorded, again = wanted[outcome.result.trial], outcome.result
+                is_repeated = (again.success, again.grasped_object, again.object_containers) == (
+                    recorded.success,
+                    recorded.grasped_object,
+                    recorded.object_containers,
+                )
+                yield FilmedEpisode(recorded, outcome.film, is_repeated)
+
+
+def _evenly(episodes: Sequence[EpisodeResult], n: int) -> list[EpisodeResult]:
+    """At most n of them, evenly spread."""
+    places = np.linspace(0, len(episodes) - 1, min(n, len(episodes))).round().astype(int)
+    return [episodes[place] for place in places.tolist()]
+
+
+def _file_name(episode: EpisodeResult) -> str:
+    """Task, trial and instruction, without a suffix."""
+    words = re.sub(r"[^a-z0-9]+", "-", episode.instruction.lower()).strip("-")
+    return f"task_{episode.task_id:03d}_trial_{episode.trial}_{words[:_MAX_SLUG].strip('-')}"
+
+
+def _video_frame(episode: EpisodeResult, film: Film, step: int) -> NDArray[np.uint8]:
+    """An image of an episode with its demonstration, instruction and step, of even height and width."""
+    size = RENDER_SIZE
+    columns = [to_image(film.images[step])]
+    if film.demonstration is not None:
+        half = (size - GAP) // 2
+        shown = [
+            to_image(image).resize((half, half), Image.Resampling.BICUBIC) for image in film.demonstration
+        ]
+        columns.insert(0, down(shown))
+    top = across(columns)
+    is_last = step == len(film.images) - 1
+    text = in_words(episode) if is_last else f"step {step} of {len(film.images) - 1}"
+    words = caption(f"“{episode.instruction}”\n{text}", top.width, 14, n_lines=5)
+    frame = np.asarray(down([top, words]))
+    return frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
+
+
+def _page(record: EvaluationRecord, counts: dict[str, int], index: Sequence[dict[str, object]]) -> str:
+    n_episodes = len(record.episodes)
+    parts = [
+        "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>",
+        f"<title>{html.escape(record.experiment)}, step {record.step}</title>",
+        "<style>body{font-family:sans-serif;margin:2em;max-width:80em}figure{display:inline-block;"
+        "margin:.5em;width:24em;vertical-align:top}video{width:100%}figcaption{font-size:.85em}</style></head>",
+        f"<body><h1>{html.escape(record.experiment)}, step {record.step:,}</h1>",
+        f"<p>{n_episodes} episodes of {html.escape(record.tasks)}; {record.success_rate:.1%} succeeded. At "
+        "the left, first and last image of the demonstration, if there is one.</p>",
+    ]
+    for kind, title in KINDS.items():
+        parts.append(f"<h2>{title}: {counts[kind]} ({counts[kind] / n_episodes:.1%})</h2>")
+        for video in index:
+            if video["outcome"] != kind:
+                continue
+            remark = "" if video["ends_as_recorded"] else " <em>Ended otherwise than recorded.</em>"
+            text = {name: html.escape(str(value)) for name, value in video.items()}
+            parts.append(
+                f"<figure><video controls loop muted preload='metadata' src='{text['file']}'></video>"
+                f"<figcaption>“{text['instruction']}” {text['what_happened']} (Task {text['task_id']}, trial "
+                f"{text['trial']}.){remark}</figcaption></figure>"
+            )
+    return "\n".join([*parts, "</body></html>"]) + "\n"

@@ -1,0 +1,302 @@
+"""Beside a record: where the policy looked, videos by outcome; any number of processes and demonstrations."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from lerobot_deltaco.commands import evaluate as evaluate_command
+from lerobot_deltaco.common.run_folder import RunError, checkpoints
+from lerobot_deltaco.evaluation import processes
+from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
+from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
+from lerobot_deltaco.evaluation.films import KINDS, check_explainable, kind_of, write_videos
+from lerobot_deltaco.evaluation.plan import EvaluationPlan
+from lerobot_deltaco.evaluation.processes import EvaluationError, default_processes, run_tasks
+from lerobot_deltaco.evaluation.record import EpisodeResult, read_record, record_path
+
+CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "small_a_correspondence"
+STEP = 12_000
+TASKS = "24,26,35"
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    return load_policy(CHECKPOINT)
+
+
+def command(out, *options, tasks=TASKS):
+    evaluate_command.main([str(CHECKPOINT), "--tasks", tasks, "--trials", "2", "--out", str(out), *options])
+    return read_record(record_path(out, STEP))
+
+
+# A checkpoint without its run
+
+
+def test_a_checkpoint_alone_is_evaluated_into_another_folder(tmp_path, capsys):
+    record = command(tmp_path, "--processes", "1")
+    assert (record.experiment, record.run_seed, record.step) == ("small_a_correspondence", 0, STEP)
+    assert not (CHECKPOINT / "evaluations").exists()
+    with pytest.raises(SystemExit):
+        evaluate_command.main([str(CHECKPOINT), "--tasks", TASKS])
+    assert "is a checkpoint, not the folder of a training run" in capsys.readouterr().err
+
+
+def test_its_step_is_that_of_its_folder_or_of_its_weights(tmp_path):
+    assert [item.step for item in checkpoints(CHECKPOINT)] == [STEP]
+    copy = shutil.copytree(CHECKPOINT, tmp_path / "000700" / "pretrained_model")
+    assert [item.step for item in checkpoints(copy)] == [700]
+    damaged = shutil.copytree(CHECKPOINT, tmp_path / "damaged")
+    (damaged / "model.safetensors").write_bytes(b"0" * 50)
+    with pytest.raises(RunError, match=r"model.safetensors is damaged"):
+        checkpoints(damaged)
+
+
+# Processes
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"instruction": "Put the jar in the green bin."},  # demonstrations take turns over all tasks
+        {"counterfactual": "instruction"},
+        {"counterfactual": "demo", "trials": 1},
+    ],
+    ids=str,
+)
+def test_episodes_are_the_same_with_any_number_of_processes(loaded, settings):
+    plan = EvaluationPlan(TASKS, **{"trials": 2, **settings})
+    expected = evaluate(*loaded, plan, STEP)
+    with Evaluation(*loaded, plan, STEP) as evaluation:
+        assert [outcome.result for outcome in run_tasks(evaluation, 2)] == expected
+
+
+def test_the_record_is_the_same_with_any_number_of_processes(tmp_path):
+    one, three = (
+        command(tmp_path / str(number), "--processes", str(number), tasks="24,26,35") for number in (1, 3)
+    )
+    assert replace(one, seconds=0, command="") == replace(three, seconds=0, command="")
+    texts = [
+        [
+            line
+            for line in record_path(tmp_path / name, STEP).read_text().splitlines()
+            if '"seconds"' not in line
+        ]
+        for name in ("1", "3")
+    ]
+    assert [line for line in texts[0] if '"command"' not in line] == [
+        line for line in texts[1] if '"command"' not in line
+    ]
+
+
+def test_tasks_may_be_run_in_any_order(loaded):
+    plan = EvaluationPlan(TASKS, trials=1, counterfactual="instruction")
+    expected = evaluate(*loaded, plan, STEP)
+    with Evaluation(*loaded, plan, STEP) as evaluation:
+        found = {task_id: evaluation.run(task_id)[0].result for task_id in reversed(evaluation.task_ids)}
+    assert [found[episode.task_id] for episode in expected] == expected
+
+
+def test_an_error_in_a_process_is_the_commands(loaded):
+    # Task 0 has no demonstration in the checkpoint.
+    with (
+        Evaluation(*loaded, EvaluationPlan("0,24", trials=1), STEP) as evaluation,
+        pytest.raises(ValueError, match="There is no demonstration of the task"),
+    ):
+        run_tasks(evaluation, 2)
+
+
+def test_a_process_that_dies_is_reported(loaded, monkeypatch):
+    import os
+
+    monkeypatch.setattr(processes.Evaluation, "run", lambda self, task_id: os._exit(9))
+    with (
+        Evaluation(*loaded, EvaluationPlan(TASKS, trials=1), STEP) as evaluation,
+        pytest.raises(EvaluationError, match="fewer --processes"),
+    ):
+        run_tasks(evaluation, 2)
+
+
+def test_the_default_is_all_cores_or_this_runs_share(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    assert default_processes("cpu") == 3
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    assert default_processes("cpu") >= 1
+    assert default_processes("cuda") == 1
+    with pytest.raises(ValueError, match="Only a policy on the CPU.*on 'cuda'"):
+        processes.check_processes(2, "cuda")
+    with pytest.raises(ValueError, match="at least 1. Got 0"):
+        processes.check_processes(0, "cpu")
+
+
+@pytest.mark.parametrize("option", ["--processes=0", "--n-demonstrations=0", "--videos=-1", "--explain=-1"])
+def test_numbers_that_are_too_small_are_refused(tmp_path, capsys, option):
+    with pytest.raises(SystemExit):
+        command(tmp_path, option)
+    assert f"{option.partition('=')[0]} must be at least" in capsys.readouterr().err
+
+
+# Numbers of demonstrations
+
+
+def test_the_number_of_demonstrations_is_overridden_and_recorded(tmp_path, capsys):
+    record = command(tmp_path, "--n-demonstrations", "1", "--processes", "1", tasks="24")
+    assert record.policy["n_demonstrations"] == 1
+    with pytest.raises(SystemExit):
+        command(tmp_path / "more", "--n-demonstrations", "2", tasks="24")
+    error = capsys.readouterr().err
+    assert "`n_demonstrations` is 2, but there is a smaller number" in error
+    assert "--n-demonstrations to at most 1" in error
+    with pytest.raises(SystemExit):
+        evaluate_command.main([str(CHECKPOINT), "--tasks", "24", "--n-demonstrations", "2"])
+    assert "other demonstrations" in capsys.readouterr().err
+
+
+def test_several_demonstrations_are_taken_from_a_dataset(tmp_path):
+    from lerobot_deltaco.data.collection import collect
+    from lerobot_deltaco.data.collection_plan import CollectionPlan
+
+    root = tmp_path / "demonstrations"
+    collect(root, CollectionPlan("24", 3), 1)
+    record = command(
+        tmp_path,
+        *("--n-demonstrations", "3", "--processes", "1"),
+        *("--policy.demo_repo_id", "test/data", "--policy.demo_root", str(root)),
+        tasks="24",
+    )
+    assert record.policy["n_demonstrations"] == 3
+    assert [episode.demonstration_episodes for episode in record.episodes] == [[0, 1, 2]] * 2
+
+
+# Images and videos
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """A folder with a record, two explanations and a video of each kind of outcome."""
+    out = tmp_path_factory.mktemp("filmed")
+    record = command(out, "--processes", "1")
+    evaluate_command.main(
+        [
+            str(CHECKPOINT),
+            "--tasks",
+            TASKS,
+            "--trials",
+            "2",
+            "--out",
+            str(out),
+            "--explain",
+            "2",
+            "--videos",
+            "1",
+        ]
+    )
+    assert read_record(record_path(out, STEP)) == record  # which was there, and is not made again
+    return out / "evaluations" / f"{STEP:07d}", record
+
+
+def test_explanations_are_images_of_episodes_spread_over_the_set(filmed):
+    folder, record = filmed
+    images = sorted((folder / "explanations").iterdir())
+    assert [path.name[:16] for path in images] == ["task_024_trial_0", "task_035_trial_1"]
+    for path in images:
+        pixels = np.asarray(Image.open(path))
+        assert pixels.shape[1] == 688  # the demonstration's two images, and the scene
+        for color in ((255, 0, 200), (0, 220, 255)):  # rings at the grasp and at the release
+            assert (pixels[-150:] == color).all(axis=-1).any()
+
+
+def test_a_map_that_was_not_learned_is_not_drawn(filmed, loaded):
+    # The release is the instruction's: the attention for it is untrained.
+    assert loaded.policy.goals.locator.release_source != "demo"
+    folder, _ = filmed
+    pixels = np.asarray(Image.open(next((folder / "explanations").iterdir()))).astype(int)
+    last_of_demonstration = pixels[40:240, 240:448]
+    bluish = last_of_demonstration[..., 2] - last_of_demonstration[..., 0]
+    assert np.median(bluish) < 20
+
+
+def test_videos_are_sorted_by_outcome_with_an_index(filmed):
+    folder, record = filmed
+    index = json.loads((folder / "videos" / "index.json").read_text())
+    counts = {kind: sum(kind_of(item) == kind for item in record.episodes) for kind in KINDS}
+    assert index["episodes_by_outcome"] == counts
+    assert len(index["videos"]) == sum(count > 0 for count in counts.values())
+    page = (folder / "videos" / "index.html").read_text()
+    recorded = {(item.task_id, item.trial): item for item in record.episodes}
+    for item in index["videos"]:
+        assert item["ends_as_recorded"]
+        assert kind_of(recorded[item["task_id"], item["trial"]]) == item["outcome"]
+        assert item["file"].startswith(f"{item['outcome']}/task_{item['task_id']:03d}")
+        assert item["file"] in page
+        with av.open(str(folder / "videos" / item["file"])) as video:
+            frames = list(video.decode(video=0))
+        assert len(frames) == 31 + 10
+        assert frames[0].width > frames[0].height  # the demonstration beside the scene
+
+
+def test_a_run_that_ends_otherwise_is_said_to(filmed, loaded, tmp_path):
+    _, record = filmed
+    other = [replace(episode, success=not episode.success) for episode in record.episodes]
+    record = replace(record, episodes=other)
+    page = write_videos(tmp_path, loaded, EvaluationPlan(TASKS, trials=2), record, 1)
+    assert "Ended otherwise than recorded" in page.read_text()
+    index = json.loads(page.with_name("index.json").read_text())
+    assert not any(item["ends_as_recorded"] for item in index["videos"])
+
+
+def test_what_is_typed_is_no_markup(filmed, loaded, tmp_path):
+    _, record = filmed
+    sentence = "<script>alert(1)</script> & more"
+    episodes = [replace(item, instruction=sentence) for item in record.episodes[:1]]
+    page = write_videos(
+        tmp_path, loaded, EvaluationPlan(TASKS, trials=2), replace(record, episodes=episodes), 1
+    ).read_text()
+    assert "<script>" not in page
+    assert "&lt;script&gt;" in page
+
+
+def test_a_policy_without_goals_is_not_explained(loaded, monkeypatch):
+    monkeypatch.setattr(loaded.policy.config, "demo_encoder", "attention")
+    with pytest.raises(ValueError, match=r"`demo_encoder=attention`\) finds no places"):
+        check_explainable(loaded)
+
+
+def episode(**changes):
+    plain = EpisodeResult(
+        task_id=24,
+        trial=0,
+        seed=0,
+        instruction="",
+        demonstration=None,
+        success=False,
+        objects=[24, 1, 2],
+        object_containers=[-1, -1, -1],
+        container_quadrants=[[0, 0], [1, 1]],
+        target_object=0,
+        target_container=0,
+        grasped_object=0,
+        right_object=True,
+        right_container=False,
+    )
+    return replace(plain, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind"),
+    [
+        ({"success": True, "object_containers": [0, -1, -1]}, "success"),
+        ({"grasped_object": -1, "right_object": False}, "nothing_grasped"),
+        ({"grasped_object": 1, "right_object": False}, "wrong_object"),
+        ({"object_containers": [1, -1, -1]}, "wrong_container"),
+        ({}, "dropped"),
+    ],
+)
+def test_episodes_are_sorted_by_what_came_of_them(changes, kind):
+    assert kind_of(episode(**changes)) == kind
