@@ -1,6 +1,7 @@
 """LeRobot finds the installed project, and imports within it go one way."""
 
 import ast
+import re
 import subprocess
 import sys
 from importlib.metadata import distribution
@@ -14,26 +15,40 @@ LEROBOT_FILES = [*sorted((ROOT / "lerobot_deltaco").rglob("*.py")), ROOT / "lero
 DISTRIBUTION = "lerobot_policy_deltaco"
 
 
+# Both in one process: importing LeRobot takes 10 s.
+HELP = """
+import sys
+from lerobot.scripts import lerobot_eval, lerobot_train
+
+for name, main in (("train", lerobot_train.main), ("eval", lerobot_eval.main)):
+    sys.argv = [name, "--help"]
+    print(f"HELP OF {name}")
+    try:
+        main()
+    except SystemExit:
+        pass
+"""
+WITHOUT_A_MODULE = """
+import sys
+sys.modules["lerobot_deltaco.training.optimization"] = None
+from lerobot.scripts.lerobot_eval import main
+main()
+"""
+
+
 @pytest.fixture(scope="module")
 def lerobot_outputs():
-    """What LeRobot's commands print. Importing LeRobot takes 10 s, so they run at the same time."""
-    main = "from lerobot.scripts.lerobot_{0} import main; main()"
-    commands = {
-        "train --help": ["-c", main.format("train"), "--help"],
-        "eval --help": ["-c", main.format("eval"), "--help"],
-        "eval without a module": [
-            "-c",
-            "import sys; sys.modules['lerobot_deltaco.training.optimization'] = None; " + main.format("eval"),
-            "--env.type=deltaco",
-        ],
-    }
+    """What LeRobot's commands print, by command. The processes run at the same time."""
+    programs = {"help": [HELP], "eval without a module": [WITHOUT_A_MODULE, "--env.type=deltaco"]}
     processes = {
         name: subprocess.Popen(
-            [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            [sys.executable, "-c", *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
-        for name, arguments in commands.items()
+        for name, arguments in programs.items()
     }
-    return {name: process.communicate(timeout=900)[0] for name, process in processes.items()}
+    outputs = {name: process.communicate(timeout=900)[0] for name, process in processes.items()}
+    _, train, evaluate = re.split("^HELP OF .+$", outputs.pop("help"), flags=re.MULTILINE)
+    return {**outputs, "train --help": train, "eval --help": evaluate}
 
 
 def test_lerobot_requires_the_distribution_name_to_have_underscores():
