@@ -553,7 +553,7 @@ def start(root, *arguments, episodes_per_file=EPISODES_PER_FILE, max_file_size="
     )
 
 
-def wait_until(condition, seconds=60):
+def wait_until(condition, seconds=300):  # a busy machine takes its time
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "It did not come to it."
@@ -572,7 +572,7 @@ def test_an_interrupt_ends_with_a_message_and_the_next_run_goes_on(finished, tmp
     with pytest.raises(CollectionError, match="Another process is collecting into"):
         collect(tmp_path, PLAN)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes of the command
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=300)
     assert process.returncode == 130, error
     assert "Interrupted. Run the same command again to continue." in error
     assert "Traceback" not in error
@@ -589,7 +589,7 @@ def test_an_interrupt_while_the_workers_start_is_no_worse(tmp_path):
     wait_until(lambda: psutil.Process(process.pid).children() or process.poll() is not None)
     time.sleep(0.3)
     os.killpg(process.pid, signal.SIGINT)
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=300)
     assert process.returncode == 130, error
     assert "Traceback" not in error
 
@@ -611,9 +611,9 @@ def kill_until_finished(root, rng, n_kills, arguments, episodes_per_file):
             time.sleep(rng.uniform(0, 1))
             workers = psutil.Process(process.pid).children() if process.poll() is None else []
             process.kill()
-        _, error = process.communicate(timeout=120)
+        _, error = process.communicate(timeout=300)
         # Its workers do not outlive it.
-        assert not psutil.wait_procs(workers, timeout=20)[1]
+        assert not psutil.wait_procs(workers, timeout=60)[1]
         if process.returncode != -signal.SIGKILL:
             assert process.returncode == 0, error
             return n_killed
@@ -647,7 +647,7 @@ def test_a_write_that_fails_ends_with_a_message_and_the_next_run_goes_on(finishe
     # Enough for no episode, then for no data file.
     for max_file_size, n_kept in ((20_000, 0), (100_000, EPISODES_PER_FILE)):
         process = start(tmp_path, max_file_size=max_file_size)
-        _, error = process.communicate(timeout=60)
+        _, error = process.communicate(timeout=300)
         assert process.returncode == 1, error
         assert "Traceback" not in error
         assert os.strerror(errno.EFBIG) in error
@@ -665,7 +665,7 @@ def test_a_worker_that_is_killed_is_reported_and_the_next_run_goes_on(finished, 
         child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())
     ]
     workers[0].kill()
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=300)
     assert process.returncode == 1, error
     assert "A worker process ended unexpectedly" in error
     assert "Traceback" not in error

@@ -347,7 +347,7 @@ def test_missing_credentials_are_found_before_collecting(hub, tmp_path):
         (start(COLLECT, *options, environment=environment), message) for environment, message in cases
     ]
     for process, message in processes:
-        _, errors = process.communicate(timeout=120)
+        _, errors = process.communicate(timeout=300)
         assert process.returncode == 1
         (error,) = [line for line in errors.splitlines() if not line.startswith("pybullet build time")]
         assert message in error
@@ -436,7 +436,7 @@ def test_a_push_that_stops_says_what_has_arrived(copy, tmp_path):
             )
             running.append((process, hub, message, has_arrived))
         for process, hub, message, has_arrived in running:
-            _, errors = process.communicate(timeout=120)
+            _, errors = process.communicate(timeout=300)
             assert process.returncode == 1, errors
             assert message in errors.splitlines()[-1]
             assert "cannot be reached" not in errors
@@ -497,7 +497,7 @@ def test_a_token_that_may_only_read_is_named(hub, dataset, tmp_path):
             *("--root", dataset, "--repo-id", f"{USER}/forbidden"),
             environment=hub.environment(tmp_path, TOKEN),
         )
-        _, errors = process.communicate(timeout=120)
+        _, errors = process.communicate(timeout=300)
     finally:
         hub.read_only = False
     assert process.returncode == 1
