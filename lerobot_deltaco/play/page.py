@@ -177,7 +177,7 @@ def build_page(engine: Engine) -> gr.Blocks:
                 **shown_run(session.latest, latest),
             }
 
-        def told(text: str) -> Updates:
+        def shown_message(text: str) -> Updates:
             return {message: gr.update(value=text, visible=bool(text))}
 
         def changes(action: Callable[..., Session]) -> Callable[..., Updates]:
@@ -187,8 +187,8 @@ def build_page(engine: Engine) -> gr.Blocks:
                 try:
                     session = action(session, *inputs)
                 except Exception as error:  # whatever it is, the page says so and goes on
-                    return told(_explained(error))
-                return {session_state: session, **everything(session), **told("")}
+                    return shown_message(_explained(error))
+                return {session_state: session, **everything(session), **shown_message("")}
 
             return on_event
 
@@ -197,7 +197,7 @@ def build_page(engine: Engine) -> gr.Blocks:
 
             def on_event(session: Session, *inputs: Any) -> Iterator[Updates]:
                 is_first = True
-                yield told("")
+                yield shown_message("")
                 try:
                     for running in action(session, *inputs):
                         session = running
@@ -207,7 +207,7 @@ def build_page(engine: Engine) -> gr.Blocks:
                         yield everything(session) if is_first else {image: step[image], text: step[text]}
                         is_first = False
                 except Exception as error:  # whatever it is, the page says so and goes on
-                    yield told(_explained(error))
+                    yield shown_message(_explained(error))
                     return
                 yield {session_state: session, **everything(session)}
 
