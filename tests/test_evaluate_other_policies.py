@@ -238,13 +238,14 @@ def test_a_policy_fits_under_the_name_that_it_knows():
     check_policy_fits(act(cameras=["observation.images.front"]), DeltacoEnv(), RENAMING)
 
 
-def test_a_vision_language_action_model_may_lack_cameras_and_pads_the_state():
+def test_a_vision_language_action_model_may_lack_cameras_and_scales_images_and_state():
     config = make_policy_config("smolvla", device="cpu")
     names = [f"observation.images.camera{number}" for number in (1, 2, 3)]
     config.input_features = {name: PolicyFeature(FeatureType.VISUAL, (3, 256, 256)) for name in names}
     config.input_features["observation.state"] = PolicyFeature(FeatureType.STATE, (6,))
     config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (4,))}
-    check_policy_fits(config, DeltacoEnv(image_size=256), {"observation.image": names[0]})
+    for size in (224, 256):
+        check_policy_fits(config, DeltacoEnv(image_size=size), {"observation.image": names[0]})
 
 
 def test_missing_packages_and_unknown_types_are_named(run, tmp_path, monkeypatch, capsys):

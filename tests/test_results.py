@@ -1,6 +1,7 @@
 """The committed reports are what the committed records give, and what they compare was measured alike."""
 
 import json
+import shutil
 from collections import defaultdict
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import yaml
 
 from lerobot_deltaco.evaluation.record import read_record
 from lerobot_deltaco.experiments.config import SHARED, experiment_names, read_experiment
+from lerobot_deltaco.reporting.leaderboard import PAGE, ROWS_FILE, LeaderboardError, read_rows, table, updated
 from lerobot_deltaco.reporting.report import write_report
 from lerobot_deltaco.reporting.series import find_records
 
@@ -41,6 +43,8 @@ def test_records_that_are_compared_are_of_one_recipe(records):
     for path in find_records([records]):
         record = read_record(path)
         recipe = {name: value for name, value in record.policy.items() if name not in SUBJECT}
+        # Policies of other types share no recipe.
+        recipe = {} if "type" in record.policy else recipe
         shared = json.dumps([recipe, record.versions], sort_keys=True)
         recipes[record.experiment.rpartition("/")[0]].add(shared)
     assert recipes
@@ -69,3 +73,57 @@ def test_experiments_that_are_compared_are_evaluated_alike():
     for folder, configs in evaluations.items():
         values = list(configs.values())
         assert all(value == values[0] for value in values), folder
+
+
+# The leaderboard
+
+
+def test_the_leaderboard_is_what_the_records_give():
+    page = (ROOT / PAGE).read_text()
+    assert updated(page, ROOT) == page, "Write it anew: python scripts/leaderboard.py"
+
+
+def test_the_leaderboard_has_all_methods_that_were_run():
+    _, rows = read_rows(ROOT / ROWS_FILE)
+    listed = {ROOT / "results" / row.records for row in rows if row.records is not None}
+    run = {path for records in RECORDS for path in records.iterdir() if "validation" not in str(path)}
+    assert listed == run
+
+
+def test_what_was_not_run_says_so_and_comes_last():
+    lines = table(ROOT).splitlines()[2:]
+    not_run = ["| not run |" in line for line in lines]
+    assert not_run == sorted(not_run)
+    assert any("| ACT |" in line for line in lines)
+
+
+ROW = "method: a\n    given: nothing\n    command: b"
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("method: a", "rows.*given"),
+        (f"{ROW}\n    color: red", "color"),
+        (f"{ROW}\n    records: 3", "`records` of 'a' must be a string or None. Got 3"),
+        (f"{ROW}\n    records: small_a/records/oracle", "it also needs `training` and `commit`"),
+    ],
+)
+def test_a_wrong_row_is_explained(tmp_path, rows, message):
+    file = tmp_path / "rows.yaml"
+    file.write_text(f"tasks: scenario_a_test\nrows:\n  - {rows}\n")
+    with pytest.raises(LeaderboardError, match=message):
+        read_rows(file)
+
+
+def test_records_of_other_tasks_are_no_row(tmp_path):
+    copy = tmp_path / "results" / "small_a"
+    shutil.copytree(ROOT / "results/small_a/records/one_hot", copy / "records/one_hot")
+    rest = "    training: t\n    commit: c\n    records: small_a/records/one_hot\n"
+    (tmp_path / ROWS_FILE).write_text(f"tasks: all\nrows:\n  - {ROW}\n{rest}")
+    with pytest.raises(
+        LeaderboardError, match="are of the tasks 'scenario_a_test'. The leaderboard is of 'all'"
+    ):
+        table(tmp_path)
+    with pytest.raises(LeaderboardError, match="needs the lines"):
+        updated("no place", tmp_path)

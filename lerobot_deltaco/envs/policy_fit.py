@@ -39,7 +39,8 @@ def check_policy_fits(
         )
     cameras = list(policy.image_features)
     camera = rename_map.get(OBS_IMAGE, OBS_IMAGE)
-    # Vision-language-action models (which have this option) leave out cameras that are not there.
+    # Vision-language-action models (which have this option) leave out cameras that are not there, and keep
+    # the image size of what they were fine-tuned from, whatever that of the dataset was.
     can_lack_cameras = hasattr(policy, "empty_cameras")
     if camera not in cameras or (len(cameras) > 1 and not can_lack_cameras):
         called = "" if camera == OBS_IMAGE else f", which `rename_map` calls {camera}"
@@ -50,7 +51,7 @@ def check_policy_fits(
             f"environment has {OBS_IMAGE} alone{called}. Evaluate it where it was trained for{advice}."
         )
     trained_on, given = _size(policy.image_features[camera]), (env.image_size, env.image_size)
-    if trained_on != given:
+    if trained_on != given and not can_lack_cameras:
         raise ValueError(
             f"The policy was trained on images of {trained_on[0]} x {trained_on[1]} pixels, but those of the "
             f"environment have {given[0]} x {given[1]}. Set its `image_size` to {trained_on[0]}: "
