@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gym_deltaco import kinematics as kin
 from gym_deltaco.arm_meshes import BASE_MESH, LINK_MESHES
@@ -88,7 +88,7 @@ class Arm:
         self.is_open = True
         simulation.set_joint_positions(self.body, [*kin.REST_JOINTS, FINGER_OPEN, -FINGER_OPEN])
         simulation.mirror_joints(self.body, (6, 7), axis=(0, 1, 0), max_force=200.0)
-        self._drive_arm(kin.REST_JOINTS)
+        self._drive_arm(kin.REST_JOINTS.tolist())
         self._drive_fingers()
         self._read()
 
@@ -105,9 +105,10 @@ class Arm:
         if is_open != self.is_open:
             self.is_open = is_open
             self._drive_fingers()
-        for step in range(1, n_steps + 1):
-            if step <= _RAMP_STEPS:
-                self._drive_arm(start + (goal - start) * _ramp(step / _RAMP_STEPS))
+        targets = (start + (goal - start) * _RAMP[:, None]).tolist()
+        for step in range(n_steps):
+            if step < _RAMP_STEPS:
+                self._drive_arm(targets[step])
             self._simulation.step()
         self._read()
 
@@ -116,8 +117,8 @@ class Arm:
         self.joints = self._simulation.joint_positions(self.body, _ARM_JOINTS)
         self.position = kin.forward(self.joints)[0]
 
-    def _drive_arm(self, targets: NDArray[np.float64]) -> None:
-        self._simulation.drive_joints(self.body, _ARM_JOINTS, targets.tolist(), _ARM_FORCES, _ARM_GAINS)
+    def _drive_arm(self, targets: list[float]) -> None:
+        self._simulation.drive_joints(self.body, _ARM_JOINTS, targets, _ARM_FORCES, _ARM_GAINS)
 
     def _drive_fingers(self) -> None:
         width = FINGER_OPEN if self.is_open else FINGER_CLOSED
@@ -129,3 +130,6 @@ class Arm:
 def _ramp(share: float) -> float:
     """From 0 to 1, at rest at both ends, with the least acceleration: what is held shall not slip."""
     return 2 * share**2 if share < 0.5 else 1 - 2 * (1 - share) ** 2
+
+
+_RAMP = np.array([_ramp(step / _RAMP_STEPS) for step in range(1, _RAMP_STEPS + 1)])

@@ -21,6 +21,21 @@ FOREARM_ROLL_ORIGIN = (0.175, 0.0, 0.0)
 WRIST_ANGLE_ORIGIN = (0.075, 0.0, 0.0)
 WRIST_ROTATE_ORIGIN = (0.065, 0.0, 0.0)
 END_EFFECTOR_OFFSET = (0.043, 0.0, 0.0)  # from the wrist-rotate joint
+_ORIGINS = [
+    np.array(origin)
+    for origin in (
+        WAIST_ORIGIN,
+        SHOULDER_ORIGIN,
+        ELBOW_ORIGIN,
+        FOREARM_ROLL_ORIGIN,
+        WRIST_ANGLE_ORIGIN,
+        WRIST_ROTATE_ORIGIN,
+    )
+]
+_END_EFFECTOR_OFFSET = np.array(END_EFFECTOR_OFFSET)
+_IDENTITY = np.eye(3)
+_FLIP = np.diag([1.0, -1.0, -1.0])  # rolls a frame by pi about x
+_AXES = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}  # the plane that a rotation turns
 REST_JOINTS = np.array([1.57, -0.6, -0.6, 0.0, -1.57, 0.0])  # rad
 JOINT_LIMITS = np.deg2rad(
     [[-180, 180], [-108, 114], [-92, 123], [-180, 180], [-123, 100], [-180, 180]]
@@ -47,20 +62,19 @@ def forward(joints: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]
         which the gripper points, the second the one along which the fingers move.
     """
     waist, shoulder, elbow, roll, wrist, rotate = np.asarray(joints, dtype=np.float64)
-    position, rotation = BASE_POSITION.copy(), np.eye(3)
-    flip = np.diag([1.0, -1.0, -1.0])
-    for origin, turn in (
-        (WAIST_ORIGIN, _rotation("z", waist)),
-        (SHOULDER_ORIGIN, _rotation("y", shoulder)),
-        (ELBOW_ORIGIN, flip @ _rotation("y", elbow)),
-        (FOREARM_ROLL_ORIGIN, _rotation("x", roll)),
-        (WRIST_ANGLE_ORIGIN, _rotation("y", wrist)),
-        (WRIST_ROTATE_ORIGIN, flip @ _rotation("x", rotate)),
-        (END_EFFECTOR_OFFSET, np.eye(3)),
-    ):
+    position, rotation = BASE_POSITION, _IDENTITY
+    turns = (
+        _rotation("z", waist),
+        _rotation("y", shoulder),
+        _FLIP @ _rotation("y", elbow),
+        _rotation("x", roll),
+        _rotation("y", wrist),
+        _FLIP @ _rotation("x", rotate),
+    )
+    for origin, turn in zip(_ORIGINS, turns, strict=True):
         position = position + rotation @ origin
         rotation = rotation @ turn
-    return position, rotation
+    return position + rotation @ _END_EFFECTOR_OFFSET, rotation
 
 
 def inverse(position: ArrayLike, near: ArrayLike = REST_JOINTS) -> NDArray[np.float64]:
@@ -99,8 +113,8 @@ def inverse(position: ArrayLike, near: ArrayLike = REST_JOINTS) -> NDArray[np.fl
 
 def _rotation(axis: str, angle: float) -> NDArray[np.float64]:
     c, s = np.cos(angle), np.sin(angle)
-    first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
-    matrix = np.eye(3)
+    first, second = _AXES[axis]
+    matrix = _IDENTITY.copy()
     matrix[first, first] = matrix[second, second] = c
     matrix[first, second], matrix[second, first] = -s, s
     return matrix
