@@ -41,6 +41,7 @@ LOOP_FUNCTIONS = (
     "cycle",
     "_make_eval_envs",
     "eval_policy_all",
+    "submit_to_hf",
 )
 
 
@@ -90,6 +91,35 @@ def replaced_in_training_loop(functions: Mapping[str, Callable[..., Any]]) -> It
 def run_training_loop() -> None:
     """Trains with the arguments of the command line."""
     training_loop().main()
+
+
+@contextmanager
+def remote_command(command: str) -> Iterator[None]:
+    """Lets jobs that LeRobot submits while the context is open run another command than `lerobot-train`.
+
+    Args:
+        command: Name of the command in the job's image.
+
+    Raises:
+        UnsupportedLeRobotError: LeRobot submits otherwise.
+    """
+    from lerobot.jobs import hf
+
+    submit = getattr(hf, "run_job", None)
+    if submit is None or "run_job" not in _names_in(hf.submit_to_hf.__code__):
+        raise UnsupportedLeRobotError(
+            f"--job.target is supported with lerobot{SUPPORTED_LEROBOT}. The installed version "
+            f"{version('lerobot')} submits jobs in another way. Install a supported version."
+        )
+
+    def run_job(**arguments: Any) -> Any:
+        words = ["lerobot-train", *arguments["command"][1:]]
+        if arguments["command"] != words:
+            raise UnsupportedLeRobotError(f"LeRobot's job would run {arguments['command']}.")
+        return submit(**{**arguments, "command": [command, *words[1:]]})
+
+    with patch.object(hf, "run_job", run_job):
+        yield
 
 
 def step_of_videos(videos_dir: Path) -> int:

@@ -7,13 +7,14 @@ from draccus.utils import ParsingError
 from lerobot_deltaco.lerobot_internals import UnsupportedLeRobotError
 from lerobot_deltaco.policy.finite_loss import TrainingDivergedError
 from lerobot_deltaco.training.loop import reason_of, train
+from lerobot_deltaco.training.remote_job import RemoteJobError
 
 
 def main() -> None:
     """Trains. The arguments are those of `lerobot-train`."""
     try:
         train()
-    except (UnsupportedLeRobotError, TrainingDivergedError, ParsingError) as error:
+    except (UnsupportedLeRobotError, TrainingDivergedError, ParsingError, RemoteJobError) as error:
         sys.exit(f"deltaco-train: {reason_of(error)}")
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from draccus.utils import ParsingError
+from huggingface_hub import HfApi
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.policies import PreTrainedPolicy
@@ -31,6 +32,7 @@ from lerobot_deltaco.envs.policy_fit import check_policy_fits
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.sets import run_set
 from lerobot_deltaco.lerobot_internals import (
+    remote_command,
     replaced_in_training_loop,
     run_training_loop,
     step_of_videos,
@@ -39,6 +41,7 @@ from lerobot_deltaco.lerobot_internals import (
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.dataset_folders import check_dataset_folder
 from lerobot_deltaco.training.frames import FramesInMemory
+from lerobot_deltaco.training.remote_job import check_remote_job
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
 logger = logging.getLogger(__name__)
@@ -107,6 +110,7 @@ class InMemoryTraining:
         self._cycle = loop.cycle
         self._make_envs = loop._make_eval_envs
         self._evaluate = loop.eval_policy_all
+        self._submit = loop.submit_to_hf
 
     @contextmanager
     def active(self) -> Iterator[None]:
@@ -118,6 +122,7 @@ class InMemoryTraining:
             "cycle": self.batches,
             "_make_eval_envs": self.make_envs,
             "eval_policy_all": self.evaluate,
+            "submit_to_hf": self.submit,
         }
         with replaced_in_training_loop(functions):
             yield
@@ -262,6 +267,16 @@ class InMemoryTraining:
         # Rewards are not in the record.
         overall = {"avg_sum_reward": float("nan"), "pc_success": 100 * rate, "eval_s": record.seconds}
         return {"overall": overall}
+
+    def submit(self, config: TrainPipelineConfig) -> None:
+        """Submits the training to Hugging Face Jobs, where `deltaco-train` runs it.
+
+        Raises:
+            RemoteJobError: It needs something that only this machine has.
+        """
+        check_remote_job(config, lambda repo_id: HfApi().repo_exists(repo_id, repo_type="dataset"))
+        with remote_command("deltaco-train"):
+            self._submit(config)
 
     @staticmethod
     def _records(config: TrainPipelineConfig) -> bool:
