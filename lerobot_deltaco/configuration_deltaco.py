@@ -14,6 +14,7 @@ from gym_deltaco.instructions import INSTRUCTION_SPLITS
 from lerobot_deltaco.common.checks import check_choices
 from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.data.feature_names import ACTION_NAMES
+from lerobot_deltaco.lerobot_internals import log_refusals
 from lerobot_deltaco.policy.language_encoders import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS, VISION_INPUTS
 from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAdamWConfig
@@ -307,6 +308,7 @@ class DeltacoConfig(PreTrainedConfig):
     one_hot_tasks: list[str] = field(default_factory=list)
     demo_feature_dim: int | None = None
 
+    @log_refusals
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in PATHS:

@@ -7,6 +7,7 @@
 - A processor step keeps the transition that it processes in an attribute, which several threads overwrite.
 - Some of LeRobot's log messages are pages long: a traceback for each version of FFmpeg that torchcodec does
   not find, and the paths of all videos of an evaluation.
+- The parser of LeRobot's commands does not say why a configuration refuses a value.
 - LeRobot's rollout has a progress bar of its own, which several processes would write over one another.
 
 What is replaced is checked first: with an unsupported version of LeRobot, an error names those that are
@@ -21,7 +22,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from functools import partial, wraps
 from importlib.metadata import version
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -30,6 +31,8 @@ from unittest.mock import patch
 
 if TYPE_CHECKING:
     from lerobot.processor import ProcessorStep
+
+logger = logging.getLogger(__name__)
 
 SUPPORTED_LEROBOT = ">=0.6.1,<0.6.2"
 
@@ -250,3 +253,37 @@ def _without_video_paths(content: Any) -> Any:
             name: _without_video_paths(value) for name, value in content.items() if name not in _VIDEO_PATHS
         }
     return content
+
+
+# The command line
+
+
+def log_refusals[**P](check: Callable[P, None]) -> Callable[P, None]:
+    """Makes a configuration that LeRobot's parser makes log why it refuses values.
+
+    The parser ends the command with "Couldn't instantiate class DeltacoConfig", and does not say why.
+
+    Args:
+        check: Method `__post_init__` of the configuration.
+    """
+
+    @wraps(check)
+    def logged(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            check(*args, **kwargs)
+        except ValueError as error:
+            if _is_parsing():
+                logger.error("%s", error)
+            raise
+
+    return logged
+
+
+def _is_parsing() -> bool:
+    """Whether draccus, the parser of LeRobot's commands, is among the callers."""
+    frame = inspect.currentframe()
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "draccus.parsers.decoding":
+            return True
+        frame = frame.f_back
+    return False

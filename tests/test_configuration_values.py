@@ -4,8 +4,10 @@ from dataclasses import fields
 
 import draccus
 import pytest
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, parser
+from lerobot.configs.train import TrainPipelineConfig
 
+from lerobot_deltaco.commands import train as train_command
 from lerobot_deltaco.common.typed_fields import in_words, is_a, type_hints
 from lerobot_deltaco.configuration_deltaco import RANGES, DeltacoConfig
 from lerobot_deltaco.data.collection_plan import CollectionPlan
@@ -171,3 +173,38 @@ def test_values_are_of_a_type_or_not(value, kind, expected):
 def test_the_types_are_those_of_all_fields_of_ones_own():
     inherited = {field.name for field in fields(DeltacoConfig.__mro__[1])}
     assert set(OWN_FIELDS) | inherited == {field.name for field in fields(DeltacoConfig)}
+
+
+COMMAND_LINES = [
+    (["--policy.type=deltaco", "--policy.optimizer_lr=inf"], "`optimizer_lr` must be a finite number"),
+    (["--policy.type=deltaco", "--policy.temperature=1e-40"], "`temperature` must be at least 0.001"),
+    (["--env.type=deltaco", "--env.image_size=2147483648"], "`image_size` must be at most"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), COMMAND_LINES)
+def test_lerobots_command_line_names_the_field(options, message, monkeypatch, caplog):
+    """LeRobot's parser says no more than which class it cannot make."""
+
+    @parser.wrap()
+    def main(config: TrainPipelineConfig):
+        return config
+
+    monkeypatch.setattr("sys.argv", ["lerobot-train", "--dataset.repo_id=user/data", *options])
+    with pytest.raises(SystemExit):
+        main()
+    (logged,) = [record for record in caplog.records if record.name.startswith("lerobot_deltaco")]
+    assert message in logged.getMessage()
+
+
+@pytest.mark.parametrize(("options", "message"), COMMAND_LINES)
+def test_deltaco_train_ends_with_the_name_of_the_field(options, message, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["deltaco-train", "--dataset.repo_id=user/data", *options])
+    with pytest.raises(SystemExit, match=f"^deltaco-train: {message}"):
+        train_command.main()
+
+
+def test_in_python_the_exception_alone_names_the_field(caplog):
+    with pytest.raises(ValueError, match="`temperature` must be"):
+        DeltacoConfig(device="cpu", temperature=1e-40)
+    assert caplog.records == []

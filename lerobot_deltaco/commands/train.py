@@ -16,6 +16,11 @@ def main() -> None:
         train()
     except (UnsupportedLeRobotError, TrainingDivergedError, ParsingError, RemoteJobError) as error:
         sys.exit(f"deltaco-train: {reason_of(error)}")
+    except SystemExit as end:
+        # LeRobot ends the command when its parser fails, without the reason.
+        if not isinstance(end.__context__, ParsingError):
+            raise
+        sys.exit(f"deltaco-train: {reason_of(end.__context__)}")
 
 
 if __name__ == "__main__":

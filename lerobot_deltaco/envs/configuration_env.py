@@ -18,6 +18,7 @@ from lerobot_deltaco.common.checks import check_choices
 from lerobot_deltaco.common.env_ranges import ENV_RANGES
 from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.envs.vector_env import make_task_vector_envs
+from lerobot_deltaco.lerobot_internals import log_refusals
 
 
 @EnvConfig.register_subclass("deltaco")
@@ -63,6 +64,7 @@ class DeltacoEnv(EnvConfig):
     instructions_split: str = "all"
     instruction: str | None = None
 
+    @log_refusals
     def __post_init__(self) -> None:
         check_field_types(self)
         task_ids = select_tasks(self.task)

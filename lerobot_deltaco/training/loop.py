@@ -306,6 +306,9 @@ def train() -> None:
 
 def reason_of(error: BaseException) -> str:
     """What is wrong, where LeRobot's parser says only which class cannot be made."""
-    while type(error) is ParsingError and error.__cause__ is not None:
-        error = error.__cause__
+    cause: BaseException | None = error
+    while isinstance(cause, ParsingError):
+        if type(cause) is ParsingError and cause.__cause__ is not None:
+            return reason_of(cause.__cause__)
+        cause = cause.__cause__
     return str(error)
