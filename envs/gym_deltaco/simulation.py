@@ -496,7 +496,8 @@ def _texture_coordinates(colors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([(column + 0.5) / _TEXTURE_WIDTH, 1 - (row + 0.5) / _TEXTURE_HEIGHT], axis=-1)
 
 
-@functools.cache
+# Not all of thousands of random objects, which would take gigabytes in each process, at 254 kB each.
+@functools.lru_cache(maxsize=1000)
 def _visual_arrays(mesh: Mesh) -> tuple[list, list, list, list]:
     """Vertices, normals, texture coordinates and indices for PyBullet; no two faces share a vertex."""
     corners = mesh.faces.reshape(-1)
