@@ -247,6 +247,6 @@ def _dim(encoder: str) -> int:
 
 def _error(path: Path, reason: object) -> TaskFileError:
     return TaskFileError(
-        f"{path} has no embeddings of instructions that can be used ({reason}). Name a checkpoint's "
-        "tasks.safetensors, or a file that deltaco-embed wrote."
+        f"{path} cannot be used: {reason}. It must be a checkpoint's tasks.safetensors, or a file that "
+        "deltaco-embed wrote."
     )
