@@ -10,9 +10,9 @@ which is printed too; compare figures of one run.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
-import re
 import resource
 import statistics
 import subprocess
@@ -132,19 +132,23 @@ def _measure_recipe(out: Path, encoder: str) -> list[Line]:
         "dataset.root": out / "train",
         "batch_size": BATCH_SIZE,
         "steps": WARM_UP + STEPS,
-        "log_freq": 1,
         "output_dir": out / "run",
     }
     arguments = [f"--{name}={value}" for name, value in settings.items()]
-    clock, processor, said = _run("-m", _command("train"), *arguments, OMP_NUM_THREADS="1")
-    # LeRobot logs the seconds of each step: of the update, and of waiting for the batch.
-    found = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", said)
-    step = statistics.median(float(update) + float(data) for update, data in found[WARM_UP:])
-    name = f"training step of {BATCH_SIZE} samples, {encoder}, one thread"
+    times = out / "times.json"
+    # This notes the times of each step.
+    script = str(Path(__file__).with_name("processes.py"))
+    clock, processor, _ = _run(script, f"--times={times}", *arguments, OMP_NUM_THREADS="1")
+    ends = json.loads(times.read_text())[WARM_UP - 1 :]
+    step, step_cpu = (
+        statistics.median(later[which] - earlier[which] for earlier, later in itertools.pairwise(ends))
+        for which in (0, 1)
+    )
+    name = f"a step of {BATCH_SIZE} samples, {encoder}, one thread"
     lines += [
         Line(f"deltaco-train, {WARM_UP + STEPS} steps, start included", clock, processor, "s"),
-        Line(f"    {name}", step, None, "s"),
-        Line("    samples", BATCH_SIZE / step, None, "samples/s"),
+        Line(f"    {name}", step, step_cpu, "s"),
+        Line("    samples", BATCH_SIZE / step, BATCH_SIZE / step_cpu, "samples/s"),
     ]
     clock, processor, _ = _run(
         "-m", _command("evaluate"), str(out / "run"), f"--tasks={EVALUATED}", f"--trials={TRIALS}"

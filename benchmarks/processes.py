@@ -1,37 +1,44 @@
 """Training with one process and with several: `python benchmarks/processes.py [--json FILE]` prints a table.
 
 Each process has one thread and `--batch-size` samples, as `torchrun` starts `deltaco-train`. What is compared
-is samples per second over all processes, in turns, so that what else the machine does meets both. Times are
-of one machine and its load, which is printed too; compare figures of one run.
+is samples per second over all processes, in turns, so that what else the machine does meets both; and samples
+per second of the processor, which on a busy machine say more: by these, several processes on as many idle
+cores are at most so much faster. Times are of one machine and its load; compare figures of one run.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
-import re
 import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.data.collection import collect
 from lerobot_deltaco.data.collection_plan import CollectionPlan
-from lerobot_deltaco.policy.language import InstructionTable
-from lerobot_deltaco.policy.task_file import write_task_file
 
+# What takes long to import is imported where it is used: the workers of the collection import this file.
 PLAN = CollectionPlan("0-15", episodes_per_task=4)
 ENCODERS = ("attention", "correspondence")
 LANGUAGE_ENCODER = "all-MiniLM-L6-v2"
 # Steps before those that are measured: they warm up.
 WARM_UP = 5
+
+
+class Rate(NamedTuple):
+    """The speed of a training."""
+
+    clock: float  # samples/s of all processes
+    processor: float  # samples per processor second
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -43,7 +50,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=2, help="runs of each kind (%(default)s)")
     parser.add_argument("--encoders", nargs="+", choices=("cnn", *ENCODERS), default=list(ENCODERS))
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to this file")
-    options = parser.parse_args(arguments)
+    parser.add_argument("--times", type=Path, help=argparse.SUPPRESS)  # in the processes that train
+    options, rest = parser.parse_known_args(arguments)
+    if options.times:
+        _train(options.times, rest)
+        return
+    if rest:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if options.processes < 2 or options.batch_size % 16 or min(options.steps, options.rounds) < 1:
         parser.error("--processes must be at least 2, --batch-size a multiple of 16, the others at least 1.")
 
@@ -53,18 +66,27 @@ def main(arguments: list[str] | None = None) -> None:
         collect(root, PLAN, available_cores())
         embeddings = _write_embeddings(Path(folder))
         for encoder in options.encoders:
-            rates: dict[int, list[float]] = {1: [], options.processes: []}
+            rates: dict[int, list[Rate]] = {1: [], options.processes: []}
             for number in range(options.rounds):
                 for n_processes, found in rates.items():
                     output = Path(folder) / f"{encoder}_{n_processes}_{number}"
-                    found.append(_samples_per_s(root, embeddings, output, encoder, n_processes, options))
-                    load = os.getloadavg()[0]
-                    print(f"{encoder}, {n_processes} process(es): {found[-1]:.1f} samples/s, load {load:.1f}")  # noqa: T201
-            one, several = (statistics.median(found) for found in rates.values())
+                    found.append(_measure(root, embeddings, output, encoder, n_processes, options))
+                    sys.stdout.write(
+                        f"{encoder}, {n_processes} process(es): {found[-1].clock:.1f} samples/s, "
+                        f"{found[-1].processor:.1f} per processor second; load {os.getloadavg()[0]:.1f}\n"
+                    )
+                    sys.stdout.flush()
+            (one, one_cpu), (several, several_cpu) = (
+                (statistics.median(rate.clock for rate in found), max(rate.processor for rate in found))
+                for found in rates.values()
+            )
             results |= {
                 f"{encoder}: 1 process, samples/s": one,
                 f"{encoder}: {options.processes} processes, samples/s": several,
                 f"{encoder}: {options.processes} processes are faster by": several / one,
+                f"{encoder}: 1 process, samples per processor second": one_cpu,
+                f"{encoder}: {options.processes} processes, samples per processor second": several_cpu,
+                f"{encoder}: at most so much faster on idle cores": options.processes * several_cpu / one_cpu,
             }
     results |= {"load average over the last minute": os.getloadavg()[0], "cores": os.cpu_count()}
     width = max(map(len, results))
@@ -75,6 +97,11 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _write_embeddings(folder: Path) -> Path:
     """Embeddings of the instructions, so that no language model is needed."""
+    import torch
+
+    from lerobot_deltaco.policy.language import InstructionTable
+    from lerobot_deltaco.policy.task_file import write_task_file
+
     table = InstructionTable(LANGUAGE_ENCODER)
     instructions = [get_task(task_id).instruction for task_id in PLAN.task_ids]
     table.put(instructions, torch.eye(len(instructions), 384))
@@ -83,9 +110,9 @@ def _write_embeddings(folder: Path) -> Path:
     return path
 
 
-def _samples_per_s(
+def _measure(
     root: Path, embeddings: Path, output: Path, encoder: str, n_processes: int, options: argparse.Namespace
-) -> float:
+) -> Rate:
     """Samples per second of all processes together, after the first steps."""
     arguments = {
         "policy.type": "deltaco",
@@ -105,7 +132,8 @@ def _samples_per_s(
         "output_dir": output,
     }
     launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={n_processes}"]
-    command = [sys.executable, *launcher, "-m", "lerobot_deltaco.commands.train"]
+    times = output.with_suffix(".json")
+    command = [sys.executable, *launcher, __file__, "--times", str(times)]
     settings = {"OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo", "HF_HUB_OFFLINE": "1"}
     result = subprocess.run(
         [*command, *(f"--{name}={value}" for name, value in arguments.items())],
@@ -115,12 +143,33 @@ def _samples_per_s(
     )
     if result.returncode != 0:
         sys.exit(f"The training failed:\n{result.stderr[-3000:]}")
-    # LeRobot logs the seconds of each step: of the update, and of waiting for the batch.
-    found = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", result.stderr + result.stdout)
-    seconds = [float(update) + float(data) for update, data in found[WARM_UP:]]
-    if not seconds:
-        sys.exit("LeRobot's log has no times of the steps any more.")
-    return n_processes * options.batch_size / statistics.median(seconds)
+    ends = json.loads(times.read_text())[WARM_UP - 1 :]
+    clock, processor = (
+        statistics.median(later[which] - earlier[which] for earlier, later in itertools.pairwise(ends))
+        for which in (0, 1)
+    )
+    return Rate(n_processes * options.batch_size / clock, options.batch_size / processor)
+
+
+def _train(times: Path, arguments: list[str]) -> None:
+    """Trains as one of the processes. The first writes when each step ended, and its processor seconds."""
+    from lerobot.scripts import lerobot_train
+
+    from lerobot_deltaco.training.loop import InMemoryTraining
+
+    update = lerobot_train.update_policy
+    ends: list[tuple[float, float]] = []
+
+    def noted(*positional: Any, **named: Any) -> Any:
+        result = update(*positional, **named)
+        ends.append((time.perf_counter(), time.process_time()))
+        return result
+
+    sys.argv = ["deltaco-train", *arguments]
+    with patch.object(lerobot_train, "update_policy", noted), InMemoryTraining().active():
+        lerobot_train.main()
+    if os.environ.get("RANK", "0") == "0":
+        times.write_text(json.dumps(ends))
 
 
 if __name__ == "__main__":

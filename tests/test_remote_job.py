@@ -88,7 +88,7 @@ def test_a_job_runs_this_command_in_the_image_that_is_named(submit):
     [
         (
             {"image": JobConfig().image},
-            "lerobot_policy_deltaco is not installed. Build one from docker",
+            "lerobot_policy_deltaco is not installed. Build one from examples",
         ),
         ({"demo_root": "no/such"}, "no/such is a folder of this machine.*deltaco-push --root no/such"),
         ({"demo_repo_id": "me/other"}, "dataset me/other from the Hub, where it is not"),
@@ -119,7 +119,7 @@ def test_a_refusal_ends_the_command(submit):
 
 def test_the_dockerfile_installs_extras_that_exist():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    text = (ROOT / "docker/Dockerfile").read_text()
+    text = (ROOT / "examples/Dockerfile").read_text()
     (extras,) = re.findall(r"'\.\[(.+)\]'", text)
     assert set(extras.split(",")) <= set(project["optional-dependencies"])
     assert f"LEROBOT_IMAGE={JobConfig().image}" in text

@@ -14,7 +14,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot_deltaco.configuration_deltaco import PATHS, DeltacoConfig
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 
-DOCKERFILE = "docker/Dockerfile"
+DOCKERFILE = "examples/Dockerfile"
 
 
 class RemoteJobError(ValueError):
