@@ -35,11 +35,18 @@ def command(out, *options, tasks=TASKS):
     return read_record(record_path(out, STEP))
 
 
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    """A folder, and the record of the checkpoint in it, made by one process."""
+    out = tmp_path_factory.mktemp("evaluated")
+    return out, command(out, "--processes", "1")
+
+
 # A checkpoint without its run
 
 
-def test_a_checkpoint_alone_is_evaluated_into_another_folder(tmp_path, capsys):
-    record = command(tmp_path, "--processes", "1")
+def test_a_checkpoint_alone_is_evaluated_into_another_folder(evaluated, capsys):
+    _, record = evaluated
     assert (record.experiment, record.run_seed, record.step) == ("small_a_correspondence", 0, STEP)
     assert not (CHECKPOINT / "evaluations").exists()
     with pytest.raises(SystemExit):
@@ -77,22 +84,19 @@ def test_episodes_are_the_same_with_any_number_of_processes(loaded, settings):
         assert [outcome.result for outcome in run_tasks(evaluation, 2)] == expected
 
 
-def test_the_record_is_the_same_with_any_number_of_processes(tmp_path):
-    one, three = (
-        command(tmp_path / str(number), "--processes", str(number), tasks="24,26,35") for number in (1, 3)
-    )
+def test_the_record_is_the_same_with_any_number_of_processes(evaluated, tmp_path):
+    out, one = evaluated
+    three = command(tmp_path, "--processes", "3")
     assert replace(one, seconds=0, command="") == replace(three, seconds=0, command="")
     texts = [
         [
             line
-            for line in record_path(tmp_path / name, STEP).read_text().splitlines()
-            if '"seconds"' not in line
+            for line in record_path(folder, STEP).read_text().splitlines()
+            if not line.startswith((' "seconds"', ' "command"'))
         ]
-        for name in ("1", "3")
+        for folder in (out, tmp_path)
     ]
-    assert [line for line in texts[0] if '"command"' not in line] == [
-        line for line in texts[1] if '"command"' not in line
-    ]
+    assert texts[0] == texts[1]
 
 
 def test_tasks_may_be_run_in_any_order(loaded):
@@ -178,10 +182,9 @@ def test_several_demonstrations_are_taken_from_a_dataset(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory):
-    """A folder with a record, two explanations and a video of each kind of outcome."""
-    out = tmp_path_factory.mktemp("filmed")
-    record = command(out, "--processes", "1")
+def filmed(evaluated):
+    """A folder with two explanations and a video of each kind of outcome, and the record beside it."""
+    out, record = evaluated
     evaluate_command.main(
         [
             str(CHECKPOINT),
