@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
             )
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    with exit_on_error(parser, RunError, RecordError, ValueError, OSError, RuntimeError):
+    with exit_on_error(parser, RunError, RecordError, ValueError, OSError):
         for run, checkpoint in todo:
             description = describe(checkpoint)
             trained_with = {

@@ -16,7 +16,7 @@ from lerobot_deltaco.evaluation.evaluate import EpisodeOutcome, Evaluation
 from lerobot_deltaco.lerobot_internals import without_rollout_progress
 
 
-class EvaluationError(RuntimeError):
+class EvaluationError(ValueError):
     """An evaluation could not be completed; the message says why."""
 
 
