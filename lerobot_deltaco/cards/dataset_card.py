@@ -15,6 +15,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
+from huggingface_hub import DatasetCardData
+from numpy.typing import NDArray
+from PIL import Image
+
+from gym_deltaco import EPISODE_STEPS
+from gym_deltaco.atomic_files import write_text
+from gym_deltaco.env import ACTION_SCALE, PickPlaceEnv
 from gym_deltaco.sheets import (
     caption,
     down,
@@ -25,13 +32,6 @@ from gym_deltaco.sheets import (
     save_png,
     to_image,
 )
-from huggingface_hub import DatasetCardData
-from numpy.typing import NDArray
-from PIL import Image
-
-from gym_deltaco import EPISODE_STEPS
-from gym_deltaco.atomic_files import write_text
-from gym_deltaco.env import ACTION_SCALE, PickPlaceEnv
 from gym_deltaco.tasks import SCENARIOS, Task, get_task
 from lerobot_deltaco.cards.templates import env_options, render, scene_settings
 from lerobot_deltaco.data import dataset_files as files
