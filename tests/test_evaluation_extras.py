@@ -232,6 +232,8 @@ def test_videos_are_sorted_by_outcome_with_an_index(filmed):
     assert index["episodes_by_outcome"] == counts
     assert len(index["videos"]) == sum(count > 0 for count in counts.values())
     page = (folder / "videos" / "index.html").read_text()
+    sheet = Image.open(folder / "videos" / "sheet.png")
+    assert sheet.height > 300 * len(index["videos"])  # a row for each outcome
     recorded = {(item.task_id, item.trial): item for item in record.episodes}
     for item in index["videos"]:
         assert item["ends_as_recorded"]

@@ -154,8 +154,8 @@ def write_videos(
 
     Args:
         folder: Folder in which the folder of the videos is made anew: an MP4 file for each episode in a
-            folder for each of `KINDS`, `index.json` with what is known of them, and `index.html`, which
-            shows them.
+            folder for each of `KINDS`, `index.json` with what is known of them, `index.html`, which shows
+            them, and `sheet.png` with the last image of each.
         loaded: The policy.
         plan: Plan of the evaluation set.
         record: Record of the evaluation set.
@@ -169,6 +169,7 @@ def write_videos(
         groups[kind_of(episode)].append(episode)
     chosen = [episode for group in groups.values() for episode in _evenly(group, n_each)]
     index = []
+    last_images: dict[str, list[Image.Image]] = defaultdict(list)
     with _NewFolder(folder / VIDEOS) as new:
         for episode, film, is_repeated in _run_again(loaded, plan, record, chosen):
             kind = kind_of(episode)
@@ -176,6 +177,7 @@ def write_videos(
             (new / kind).mkdir(exist_ok=True)
             frames = [_video_frame(episode, film, step) for step in range(len(film.images))]
             write_video(new / name, frames + frames[-1:] * _HELD_FRAMES, VIDEO_FPS)
+            last_images[kind].append(Image.fromarray(frames[-1]))
             index.append(
                 {
                     "file": name,
@@ -192,6 +194,17 @@ def write_videos(
         counts = {kind: len(groups[kind]) for kind in KINDS}
         write_json(new / "index.json", {"episodes_by_outcome": counts, "videos": index}, indent=1)
         write_text(new / "index.html", _page(record, counts, index))
+        rows = [
+            down(
+                [
+                    caption(f"{title}: {counts[kind]} of {len(record.episodes)}", 400),
+                    across(last_images[kind]),
+                ]
+            )
+            for kind, title in KINDS.items()
+            if kind in last_images
+        ]
+        save_png(down(rows, 2 * GAP), new / "sheet.png")
     return folder / VIDEOS / "index.html"
 
 
