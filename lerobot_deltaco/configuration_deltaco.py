@@ -102,6 +102,8 @@ RANGES = MappingProxyType(
         "demo_crop_padding": (0, 1024),
         "n_demonstrations": (1, 1000),
         "goal_noise": (0, 10),
+        "depth_noise": (0, 10),
+        "depth_margin": (-10, 10),
         "locator_share": (1e-6, 1),
         "recolor_share": (0, 1),
         "frames_after_release": (0, 1_000_000),
@@ -194,6 +196,12 @@ class DeltacoConfig(PreTrainedConfig):
             `demo_encoder=correspondence`.
         goal_noise: Standard deviation of the noise on goals in training, in coordinates in which an image's
             edges are at -1 and 1; 0.04 is a pixel of 48.
+        grasp_depth: Whether goals include the depth of the grasp (`policy/goal_states.py`), which is taken
+            from the demonstration where it moves the same object.
+        depth_margin: Depth that is added to the estimate in evaluation, in standard deviations of depths over
+            the training episodes. A gripper that closes too high misses flat objects; on a robot, one that
+            goes too low may touch the table.
+        depth_noise: Standard deviation of the noise on depths in training, in standard deviations of depths.
         locator_share: Share of each batch's samples on which the policy learns to find goals.
         recolor_share: Share of training samples in which one random change of hue, saturation and brightness
             is applied to the observation and the demonstration alike, with `demo_encoder=correspondence`.
@@ -270,6 +278,9 @@ class DeltacoConfig(PreTrainedConfig):
     demo_camera: str | None = None
     n_demonstrations: int = 1
     goal_noise: float = 0.04
+    grasp_depth: bool = True
+    depth_noise: float = 0.1
+    depth_margin: float = 0.0
     locator_share: float = 0.25
     recolor_share: float = 0.0
     color_blind_tasks: str | None = None

@@ -3,7 +3,6 @@
 # No `from __future__ import annotations`: LeRobot's tests expect the annotation of `config` to be a class.
 
 import logging
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
@@ -24,7 +23,7 @@ from torch import Tensor, nn
 from lerobot_deltaco.cards.policy_card import policy_card
 from lerobot_deltaco.configuration_deltaco import BACKBONES, GOAL_SOURCES, DeltacoConfig
 from lerobot_deltaco.data.paraphrases import read_paraphrases
-from lerobot_deltaco.policy.correspondence import GoalLocator, goal_loss
+from lerobot_deltaco.policy.correspondence import GoalLocator
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder, crop_array
 from lerobot_deltaco.policy.demonstration_choice import (
     choose_episode,
@@ -41,10 +40,12 @@ from lerobot_deltaco.policy.demonstrations import (
 )
 from lerobot_deltaco.policy.finite_loss import FiniteLoss, check_weights_to_save, non_finite_weight
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures, Variants
-from lerobot_deltaco.policy.goal_conditioning import FoundGoals, GoalConditioning
+from lerobot_deltaco.policy.goal_conditioning import Demonstrations, FoundGoals, GoalConditioning
+from lerobot_deltaco.policy.goal_training import GoalBatch, GoalTrainer
 from lerobot_deltaco.policy.heads import UnitHead
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.initial_weights import initialize_demo_encoder, initialize_policy
+from lerobot_deltaco.policy.keyframes import find_keyframes
 from lerobot_deltaco.policy.language import InstructionTable
 from lerobot_deltaco.policy.losses import (
     contrastive_logits,
@@ -67,13 +68,13 @@ from lerobot_deltaco.policy.task_file import (
     TaskFile,
     check_demonstrations,
     check_features,
+    check_grasp_states,
     find_task_file,
     hub_options,
     read_task_file,
     write_task_file,
 )
 from lerobot_deltaco.policy.training_episodes import training_episodes
-from lerobot_deltaco.policy.training_goals import TrainingGoals, find_training_goals
 from lerobot_deltaco.policy.vision import load_vision_encoder
 
 logger = logging.getLogger(__name__)
@@ -122,13 +123,13 @@ class DeltacoPolicy(PreTrainedPolicy):
             self.instructions.read(Path(config.instruction_embeddings))
         self.eval_demonstrations: DemonstrationSet | None = None
         self.train_demonstrations: DemonstrationSet | None = None
-        self.train_goals: TrainingGoals | None = None
+        self.goal_trainer: GoalTrainer | None = None
         self.paraphrases = _read_paraphrases(config)
         self._train_demonstrations_are_complete = False  # whether they surely include every training episode
         self._demonstrated_as: Mapping[str, str] = {}
         self._episode_tasks = EpisodeTasks()
         if config.demo_repo_id is not None:
-            self.eval_demonstrations = self._load_demonstrations(config.demo_repo_id, config.demo_root, None)
+            self.eval_demonstrations = self._load_eval_demonstrations(config.demo_repo_id, config.demo_root)
         if config.method == "one_hot" and not config.one_hot_tasks:
             config.one_hot_tasks = self._one_hot_vocabulary()
 
@@ -192,7 +193,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         condition_dim = len(config.one_hot_tasks) if config.method == "one_hot" else 0
         if config.uses_language:
             condition_dim = config.embedding_dim
-        return GoalConditioning(GoalLocator(*GOAL_SOURCES[config.method], condition_dim), state_dim)
+        locator = GoalLocator(*GOAL_SOURCES[config.method], condition_dim)
+        return GoalConditioning(locator, state_dim, condition_dim, config.grasp_depth, config.depth_margin)
 
     def _make_frozen_encoder(self) -> FrozenFeatures | None:
         config = self.config
@@ -337,10 +339,14 @@ class DeltacoPolicy(PreTrainedPolicy):
         instructions = self._draw_instructions(tasks, generator)
         language = self._embed_instructions(instructions, device) if self.config.uses_language else None
         demonstrations = self._training_demonstrations(device)
-        assert self.train_goals is not None
+        assert self.goals is not None
+        assert self.goal_trainer is not None
+        goals = self.goal_trainer.goals
         rows = demonstrations.episode_rows(batch["episode_index"])
-        known = (rows >= 0) & self.train_goals.found[rows]
-        places = self.train_goals.places[rows]  # (batch, 2, 2)
+        known = (rows >= 0) & goals.found[rows]
+        places, depths = goals.places[rows], self.goal_trainer.depths  # (batch, 2, 2)
+        if depths is not None:
+            depths = depths[rows].nan_to_num()
         logged: dict[str, Tensor] = {}
         if self.training:
             if not self._train_demonstrations_are_complete:
@@ -348,10 +354,15 @@ class DeltacoPolicy(PreTrainedPolicy):
             recolorings = random_recolorings(n_samples, self.config.recolor_share, generator)
             n_located = max(1, round(self.config.locator_share * n_samples))
             some = torch.arange(n_located) * n_samples // n_located
-            locator_loss = self._locator_loss(batch, tasks, instructions, rows, some, recolorings, generator)
+            locator_losses = self._locator_losses(
+                batch, tasks, instructions, rows, some, recolorings, generator
+            )
             places = places + self.config.goal_noise * torch.randn(places.shape, generator=generator).to(
                 device
             )
+            if depths is not None:
+                noise = torch.randn(depths.shape, generator=generator).to(device)
+                depths = depths + self.config.depth_noise * noise
             if self.config.crop_padding:
                 shifts = random_shifts(n_samples, self.config.crop_padding, generator)
                 images = shift_images(images, shifts, self.config.crop_padding)
@@ -362,18 +373,21 @@ class DeltacoPolicy(PreTrainedPolicy):
             # in the present image stand in for them.
             found = self._find_goals(images[:, 0], tasks, [0] * n_samples)
             places = torch.where(known[:, None, None], places, found.places)
+            if depths is not None and found.depths is not None:
+                depths = torch.where(known, depths, found.depths)
         film, concat = self.conditioning_inputs(tasks, None, language)
-        loss, parts = self._imitation_loss(batch, images, film, concat, places)
+        loss, parts = self._imitation_loss(batch, images, film, concat, places, depths)
         logged |= parts
         if self.training:
             share = n_samples / n_located
-            loss = loss.index_add(0, some.to(device), share * locator_loss.sum(dim=1))
-            logged |= {"grasp_loss": locator_loss[:, 0].mean(), "release_loss": locator_loss[:, 1].mean()}
+            loss = loss.index_add(0, some.to(device), share * locator_losses.sum(dim=1))
+            names = ("grasp_loss", "release_loss", "depth_loss", "attention_loss")
+            logged |= dict(zip(names, locator_losses.mean(dim=0), strict=True))
             self.step += 1
             self._finite_loss.remember(loss, self._numbers_of(batch), self.step)
         return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
 
-    def _locator_loss(
+    def _locator_losses(
         self,
         batch: dict[str, Any],
         tasks: Sequence[str],
@@ -383,7 +397,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         recolorings: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """How well the goals of some samples are found in the first images of their episodes, (some, 2).
+        """How well the goals of some samples are found, (some, 4): see `GoalTrainer`.
 
         Args:
             batch: As in `forward`.
@@ -394,37 +408,19 @@ class DeltacoPolicy(PreTrainedPolicy):
             recolorings: Changes of the samples' colors, (batch, 3, 3), on the CPU.
             generator: Source of the draws, on the CPU.
         """
-        config, demonstrations = self.config, self.train_demonstrations
-        assert demonstrations is not None
-        assert self.train_goals is not None
-        assert self.goals is not None
-        device, padding = rows.device, config.demo_crop_padding
-        own, recolorings = rows[some.to(device)], recolorings[some]
-        some_tasks = [tasks[sample] for sample in some.tolist()]
-        plain = demonstrations.frames[own, 0].float() / 255  # (some, 3, H, W)
-        shifts = random_shifts(len(some), padding, generator)
-        plain = shift_images(plain, shifts, padding)
-        places = self.train_goals.places[own] + (shifts * 2 / config.image_size).to(device)[:, None]
-        scenes = recolor(plain, recolorings)
-        description = None
-        if config.uses_demo:
-            episodes = batch["episode_index"][some.to(device)]
-            others = demonstrations.sample_other_episodes(episodes, generator, check=False)
-            frames = demonstrations.frames[others][:, [0, -1]].float() / 255  # (some, 2, 3, H, W)
-            frames = random_crop(frames, padding, generator)
-            if config.color_blind_tasks is not None:
-                apart = random_recolorings(len(some), 1.0, generator)
-                blind = [re.search(config.color_blind_tasks, task) is not None for task in some_tasks]
-                recolorings = torch.where(torch.tensor(blind)[:, None, None], apart, recolorings)
-            frames = recolor(frames, recolorings)
-        with self._autocast(device):
-            if config.uses_demo:
-                description = self.goals.locator.describe(frames)
-            some_instructions = [instructions[sample] for sample in some.tolist()]
-            condition = self._goal_condition(some_instructions)
-            logits = self.goals.locator(scenes, plain, description, condition, generator=generator)
-        loss = goal_loss(logits, places)
-        return torch.where(self.train_goals.found[own][:, None], loss, 0.0)
+        assert self.goal_trainer is not None
+        config, here = self.config, some.to(rows.device)
+        with self._autocast(rows.device):
+            chosen = GoalBatch(
+                batch["episode_index"][here],
+                rows[here],
+                [tasks[sample] for sample in some.tolist()],
+                self._goal_condition([instructions[sample] for sample in some.tolist()]),
+                recolorings[some],
+            )
+            return self.goal_trainer.losses(
+                chosen, config.uses_demo, config.demo_crop_padding, config.color_blind_tasks, generator
+            )
 
     def _goal_condition(self, tasks: Sequence[str]) -> Tensor | None:
         """The locator's condition for tasks, (tasks, condition)."""
@@ -435,16 +431,27 @@ class DeltacoPolicy(PreTrainedPolicy):
     def _find_goals(self, scenes: Tensor, tasks: Sequence[str], trials: Sequence[int]) -> FoundGoals:
         """Finds the goals of tasks in scenes (batch, 3, H, W), by the demonstrations of these trials."""
         assert self.goals is not None
-        frames = None
+        chosen = None
         if self.config.uses_demo:
             n_each = self.config.n_demonstrations
-            each = []
+            ends, depths = [], []
             for number in range(n_each):
                 turns = [trial * n_each + number for trial in trials]
                 demonstrations, rows = self._choose_eval_demonstrations(tasks, turns)
-                each.append(demonstrations.frames[rows][:, [0, -1]].float() / 255)
-            frames = torch.stack(each, dim=1).to(scenes.device)  # (batch, demonstrations, 2, 3, H, W)
-        return self.goals.find(scenes, frames, self._goal_condition(tasks))
+                ends.append(demonstrations.frames[rows][:, [0, -1]].float() / 255)
+                depths.append(self._demonstrated_depths(demonstrations, rows))
+            chosen = Demonstrations(
+                torch.stack(ends, dim=1).to(scenes.device), torch.stack(depths, dim=1).to(scenes.device)
+            )
+        return self.goals.find(scenes, chosen, self._goal_condition(tasks))
+
+    def _demonstrated_depths(self, demonstrations: DemonstrationSet, rows: Tensor) -> Tensor:
+        """Depths of the grasps of demonstrations, (batch,); NaN where they are not known."""
+        assert self.goals is not None
+        states = demonstrations.grasp_states
+        if states is None or self.goals.depth is None:
+            return torch.full((len(rows),), torch.nan, device=rows.device)
+        return self.goals.states.depths(states[rows])
 
     def _imitation_loss(
         self,
@@ -453,9 +460,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         film: Tensor | None,
         concat: Tensor | None,
         goals: Tensor | None = None,
+        depths: Tensor | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The policy loss L_pi (equation 2) of each sample, (batch,), and its parts to log."""
-        predicted, gripper = self.model(images, film, self._concatenated(batch, concat, goals), goals)
+        predicted, gripper = self.model(images, film, self._concatenated(batch, concat, goals, depths), goals)
         action = batch[ACTION].float()
         motion, target = self._split_action(action)
         likelihood = mixture_negative_log_likelihood(
@@ -489,25 +497,26 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     def _fit_goals(self, robot_data: RobotData) -> None:
         """Finds the goals of the training episodes, and the robot's states there."""
-        demonstrations, index = self.train_demonstrations, self.config.gripper_index
-        assert demonstrations is not None
+        assert self.train_demonstrations is not None
         assert self.goals is not None
-        assert index is not None
-        frames, device = demonstrations.frames, demonstrations.frames.device
-        goals = find_training_goals(
-            frames[:, 0],
-            frames[:, -1],
-            robot_data.states.to(device),
-            robot_data.actions[:, index].to(device),
-            robot_data.spans,
+        assert self.config.gripper_index is not None
+        self.goal_trainer = GoalTrainer(
+            self.goals,
+            self.train_demonstrations,
+            robot_data,
+            self.config.gripper_index,
+            self._normalize_states,
         )
-        self.train_goals = goals
+        states, found = self.goal_trainer.goals.states[:, 0], self.goal_trainer.goals.found
+        self.train_demonstrations.grasp_states = torch.where(found[:, None], states, torch.nan)
+
+    def _normalize_states(self, states: Tensor) -> Tensor:
+        """Robot states of the dataset (n, state) as the preprocessor makes them, on the CPU."""
         normalize = NormalizerProcessorStep(
             {OBS_STATE: self.config.robot_state_feature}, self.config.normalization_mapping, self._stats
         )
-        normalized = normalize(create_transition(observation={OBS_STATE: goals.states.cpu()}))
-        states = normalized[TransitionKey.OBSERVATION][OBS_STATE].to(device)
-        self.goals.fit(goals, states)
+        normalized = normalize(create_transition(observation={OBS_STATE: states.cpu()}))
+        return normalized[TransitionKey.OBSERVATION][OBS_STATE]
 
     def _train_demo_embeddings(
         self, episodes: Tensor, tasks: Sequence[str], column: Tensor, generator: torch.Generator
@@ -596,8 +605,8 @@ class DeltacoPolicy(PreTrainedPolicy):
         images = self._images(batch)
         with self._autocast(images.device):
             task = self._episode_tasks.conditioning(tasks, lambda tasks: self.encode_task(tasks, images))
-            places = None if task.goals is None else task.goals.places
-            concatenated = self._concatenated(batch, task.concat, places)
+            places, depths = (None, None) if task.goals is None else task.goals[:2]
+            concatenated = self._concatenated(batch, task.concat, places, depths)
             motion, gripper = task.model(images, task.film, concatenated, places)
         if gripper is not None:
             gripper = torch.sigmoid(gripper.float())
@@ -695,7 +704,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         return torch.stack(images, dim=1)
 
     def _concatenated(
-        self, batch: dict[str, Any], embedding: Tensor | None, goals: Tensor | None = None
+        self,
+        batch: dict[str, Any],
+        embedding: Tensor | None,
+        goals: Tensor | None = None,
+        depths: Tensor | None = None,
     ) -> Tensor | None:
         """What is concatenated to the images' features: an embedding, the state, its way to the goals."""
         parts = [embedding] if embedding is not None else []
@@ -703,7 +716,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             parts.append(batch[OBS_STATE])
         if goals is not None:
             assert self.goals is not None
-            parts.append(self.goals.offsets(goals, batch[OBS_STATE].float()))
+            parts.append(self.goals.offsets(goals, depths, batch[OBS_STATE].float()))
         return torch.cat(parts, dim=-1) if parts else None
 
     def conditioning_inputs(
@@ -783,6 +796,15 @@ class DeltacoPolicy(PreTrainedPolicy):
         size, n_frames = self.config.image_size, self.config.n_demo_frames
         return load_demonstrations(repo_id, root, episodes, camera, size, n_frames)
 
+    def _load_eval_demonstrations(self, repo_id: str, root: str | Path | None) -> DemonstrationSet:
+        demonstrations = self._load_demonstrations(repo_id, root, None)
+        index = self.config.gripper_index
+        if self.config.locates_goals and self.config.grasp_depth and index is not None:
+            data = load_robot_data(repo_id, root, demonstrations.episodes.tolist())
+            keyframes = find_keyframes(data.states, data.actions[:, index], data.spans)
+            demonstrations.grasp_states = keyframes.grasp_states
+        return demonstrations
+
     def _one_hot_vocabulary(self) -> list[str]:
         """Task strings of the training and demonstration datasets."""
         if self._meta is None:
@@ -829,7 +851,9 @@ class DeltacoPolicy(PreTrainedPolicy):
             # With their features, the frozen encoder is not needed for them.
             features = None if self._frozen is None else self._frozen.plain(known)
             frames, episodes = known.frames.cpu(), known.episodes.cpu()
-            stored = StoredDemonstrations(frames, episodes, known.tasks, known.target_objects, features)
+            stored = StoredDemonstrations(
+                frames, episodes, known.tasks, known.target_objects, features, known.grasp_states
+            )
             contents = contents._replace(demonstrations=stored)
         write_task_file(save_directory / TASK_FILE, contents)
 
@@ -916,8 +940,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         check_demonstrations(path, contents.demonstrations, self.config.image_size, n_kept)
         # Demonstrations named on the command line come before those of the checkpoint.
         if self.eval_demonstrations is None:
-            frames, episodes, tasks, target_objects, features = contents.demonstrations
+            frames, episodes, tasks, target_objects, features, grasp_states = contents.demonstrations
             known = DemonstrationSet(frames, tasks, episodes.tolist(), target_objects)
+            if grasp_states is not None and self.config.robot_state_feature is not None:
+                check_grasp_states(path, contents.demonstrations, self.config.robot_state_feature.shape[0])
+                known.grasp_states = grasp_states
             if features is not None and self._frozen is not None:
                 check_features(path, contents.demonstrations, self.config.demo_feature_dim)
                 known.features = features[:, None].half()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F  # noqa: N812
 from lerobot.datasets import LeRobotDataset
 from small_policies import batch_of, small_policy
 
@@ -10,9 +11,12 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.calibration import MIN_EPISODES, StateToImage
 from lerobot_deltaco.policy.correspondence import GoalLocator, goal_loss, peak_places
-from lerobot_deltaco.policy.keyframes import find_keyframes, release_frames
+from lerobot_deltaco.policy.goal_states import GoalStates
+from lerobot_deltaco.policy.grasp_depth import DepthEstimator
+from lerobot_deltaco.policy.keyframes import find_keyframes, follows_gripper, release_frames
 from lerobot_deltaco.policy.networks import ConditionedPolicy, gaussian_maps
 from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
+from lerobot_deltaco.policy.training_goals import TrainingGoals
 from lerobot_deltaco.training.frames import FramesInMemory
 
 SIZE, LENGTH = 24, 7
@@ -100,8 +104,18 @@ def test_the_last_grasp_that_is_released_counts():
     assert keyframes.found.tolist() == [True, True, False]
     # One step after the command to close, and the step of the command to open.
     assert keyframes.states[:2, :, 0].tolist() == [[5, 6], [9, 9]]
+    assert keyframes.approach[:2, 0].tolist() == [2, 8]
     assert not keyframes.states[2].any()
     assert release_frames(gripper, [(0, 7), (8, 10), (11, 13)]) == [6, 9, None]
+
+
+def test_the_grippers_states_are_those_that_follow_its_commands():
+    generator = torch.Generator().manual_seed(0)
+    gripper = torch.randn(60, generator=generator).sign()
+    arm = torch.randn(60, generator=generator)
+    opening = torch.cat([gripper.new_ones(1), 0.02 + 0.5 * gripper[:-1]])
+    states = torch.stack([arm, opening, torch.full((60,), 7.0), -opening], dim=1)
+    assert follows_gripper(states, gripper, [(0, 29), (30, 59)]).tolist() == [False, True, False, True]
 
 
 # Calibration
@@ -112,7 +126,8 @@ def test_changes_alone_tell_where_states_are_in_the_image(episodes):
     last = [image_with((COLORS[task], end), ((0, 200, 0), other)) for task, _, other, end in episodes]
     images = [torch.from_numpy(np.stack(side)).permute(0, 3, 1, 2) for side in (first, last)]
     states = torch.from_numpy(np.stack([state_of(start) for _, start, _, _ in episodes]))
-    to_image = StateToImage(*images, states)
+    to_image = StateToImage(states.shape[1])
+    to_image.fit(*images, states)
     places = torch.from_numpy(np.stack([start for _, start, _, _ in episodes])).float()
     errors = (to_image(states) - places).norm(dim=1) * SIZE / 2
     assert errors.median() < 1  # px
@@ -123,7 +138,105 @@ def test_too_few_episodes_for_a_calibration_are_an_error():
     n = MIN_EPISODES - 1
     images = torch.zeros(n, 3, SIZE, SIZE, dtype=torch.uint8)
     with pytest.raises(ValueError, match=f"at least {MIN_EPISODES} episodes .* Got {n}"):
-        StateToImage(images, images, torch.zeros(n, 2))
+        StateToImage(2).fit(images, images, torch.zeros(n, 2))
+
+
+# Depths
+
+
+@pytest.fixture
+def grasps():
+    """Goals whose states depend on the place and a depth, the depths, and how states are normalized."""
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand(200, 2, 2, generator=generator) * 1.6 - 0.8
+    depths = torch.randn(200, generator=generator)
+    x, y = places.unbind(dim=2)
+    height = torch.stack([depths, torch.zeros(200)], dim=1)  # of grasps alone
+    width = torch.rand(200, 2, generator=generator) * 40  # that the gripper closes to
+    states = torch.stack([2 + x, 5 * y + 0.2 * height, 3 * height + x * y, width], dim=2)
+    approach = states[:, 0] - torch.tensor([0, 0, 2.0, 0])
+    goals = TrainingGoals(places, states, approach, torch.arange(200) % 10 > 0)
+    return goals, depths, (torch.tensor([0.5, 2, 0.1, 1]), torch.tensor([1.0, 0, -1, 0]))
+
+
+class ExactPlaces(torch.nn.Module):
+    """The inverse of how `grasps` makes states from places."""
+
+    def forward(self, states):
+        x, y, z = states[:, 0] - 2, states[:, 1], states[:, 2]
+        return torch.stack([x, (y - z * 0.2 / 3) / (5 - x * 0.2 / 3)], dim=1)
+
+
+def test_depths_say_what_places_do_not(grasps):
+    goals, depths, normalized = grasps
+    states = GoalStates(4, 2, has_depth=True)
+    states.fit(goals, *normalized, torch.tensor([True, True, True, False]))
+    states.to_image = ExactPlaces()
+    found = states.depths(goals.states[:, 0])
+    correlation = torch.corrcoef(torch.stack([found, depths]))[0, 1]
+    assert correlation > 0.98  # deeper is further along the approach
+    assert found[goals.found].std() == pytest.approx(1, abs=0.05)
+    scale, shift = normalized
+    with_depths = states(goals.places, found)
+    true = goals.states * scale + shift
+    torch.testing.assert_close(with_depths[..., :3], true[..., :3], atol=0.1, rtol=0)
+    # Without them, the grasp's height is not known.
+    error = (states(goals.places, torch.zeros(200)) - with_depths)[:, 0].abs().mean(dim=0)
+    assert error[2] > 0.1
+    assert not error[0] > 0.02
+
+
+def test_without_any_depth_there_is_none(grasps):
+    goals, _, normalized = grasps
+    flat = goals.states.clone()
+    flat[..., 2] = 1
+    flat[..., 1] = 5 * goals.places[..., 1]
+    flat[..., 3] = 1
+    states = GoalStates(4, 2, has_depth=True)
+    states.fit(goals._replace(states=flat), *normalized, torch.ones(4).bool())
+    assert not states.depth_to_state.any()
+    torch.testing.assert_close(states.depths(flat[:, 0]), torch.zeros(200))
+
+
+def test_depths_come_from_the_demonstration_as_far_as_it_can_be_trusted():
+    torch.manual_seed(0)
+    n, dim = 256, 8
+    estimator = DepthEstimator(dim, condition_dim=2, has_demonstration=True)
+    optimizer = torch.optim.Adam(estimator.parameters(), lr=1e-2)
+    generator = torch.Generator().manual_seed(0)
+
+    def samples():
+        features = torch.randn(n, dim, 6, 6, generator=generator)
+        kind = torch.arange(n) % 2  # 0: the demonstration moved the same object
+        depths = torch.randn(n, generator=generator)
+        others = torch.where(kind == 0, depths, torch.randn(n, generator=generator))
+        return features, torch.zeros(n, 2), depths, torch.randn(n, dim), others, F.one_hot(kind, 2).float()
+
+    for _ in range(150):
+        loss = estimator.losses(*samples(), generator).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    features, places, depths, descriptors, others, condition = samples()
+    found = estimator(features, places, descriptors, others, condition, looks_std=0.7)
+    same = condition[:, 0] == 1
+    assert (found - depths)[same].abs().mean() < 0.1
+    # In the mean, another object's depth counts little, and an unknown one not at all.
+    by_looks = estimator(features, places, descriptors, others * torch.nan, condition, looks_std=0.7)
+    assert by_looks.isfinite().all()
+    assert (found - by_looks)[~same].abs().mean() < 0.5 * (others - by_looks)[~same].abs().mean()
+
+
+def test_unknown_depths_leave_the_loss_finite():
+    estimator = DepthEstimator(4, 0, has_demonstration=True)
+    unknown = torch.full((3,), torch.nan)
+    generator = torch.Generator()
+    losses = estimator.losses(
+        torch.rand(3, 4, 6, 6), torch.zeros(3, 2), torch.zeros(3), torch.rand(3, 4), unknown, None, generator
+    )
+    losses.sum().backward()
+    assert losses.isfinite().all()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in estimator.parameters())
 
 
 # Recoloring
@@ -169,7 +282,8 @@ def test_what_a_descriptor_was_made_of_is_most_similar_to_it():
     description = locator.describe(torch.stack([scene, scene], dim=1))
     features = locator.trunk(scene)
     row, column = 3, 8
-    logits = locator(scene, scene, description._replace(moved=features[:, :, row, column]), None)
+    moved = features[:, :, row, column]
+    logits = locator(scene, scene, description._replace(moved=moved), None).logits
     assert logits.shape == (1, 2, SIZE // 2, SIZE // 2)
     assert logits[0, 0].argmax() == row * (SIZE // 2) + column
 
@@ -194,8 +308,8 @@ def test_goals_of_training_episodes_are_where_things_were_moved(policy, dataset,
     policy.forward({**batch_of(dataset, [0, LENGTH])})
     true = torch.from_numpy(np.stack([np.stack([start, end]) for _, start, _, end in episodes])).float()
     true = true[policy.train_demonstrations.episodes].clamp(-1, 1)
-    errors = (policy.train_goals.places - true).norm(dim=2) * SIZE / 2
-    assert policy.train_goals.found.all()
+    errors = (policy.goal_trainer.goals.places - true).norm(dim=2) * SIZE / 2
+    assert policy.goal_trainer.goals.found.all()
     assert errors.median() < 1.5  # px
 
 
@@ -208,9 +322,9 @@ def test_frames_in_memory_give_the_same_goals(policy, dataset):
     )
     assert in_memory.train_demonstrations.episodes.tolist() == list(range(60))
     rows = in_memory.train_demonstrations.episode_rows(policy.train_demonstrations.episodes)
-    torch.testing.assert_close(in_memory.train_goals.states[rows], policy.train_goals.states)
+    torch.testing.assert_close(in_memory.goal_trainer.goals.states[rows], policy.goal_trainer.goals.states)
     torch.testing.assert_close(
-        in_memory.train_goals.places[rows], policy.train_goals.places, atol=0.05, rtol=0
+        in_memory.goal_trainer.goals.places[rows], policy.goal_trainer.goals.places, atol=0.05, rtol=0
     )
 
 
@@ -270,6 +384,12 @@ def test_every_method_trains_acts_and_is_the_same_when_it_is_loaded(dataset, tmp
     loaded = DeltacoPolicy.from_pretrained(tmp_path / "saved").eval()
     loaded.reset()
     torch.testing.assert_close(loaded.select_action(observation), action)
+    if policy.config.uses_demo:
+        saved = loaded.eval_demonstrations.grasp_states
+        torch.testing.assert_close(saved, policy.eval_demonstrations.grasp_states)
+        # Those of the same dataset, read for training.
+        rows = policy.train_demonstrations.episode_rows(loaded.eval_demonstrations.episodes)
+        torch.testing.assert_close(saved, policy.goal_trainer.goals.states[rows, 0])
     card = loaded.generate_model_card("test/table", "deltaco", None, None)
     assert "| goal: where to grasp |" in card.text
 
@@ -300,6 +420,29 @@ def test_goals_are_found_in_the_first_image_of_an_episode(policy, dataset):
     assert len(calls) == 2
 
 
+def test_the_margin_is_added_to_depths(dataset):
+    found = []
+    for margin in (0.0, 0.5):
+        torch.manual_seed(0)
+        policy, _, _ = small_policy(dataset, **CORRESPONDENCE, depth_margin=margin)
+        batch = batch_of(dataset, [0, LENGTH])
+        policy.forward(batch)
+        goals = policy.eval().encode_task(tuple(batch["task"]), batch["observation.image"][:, None]).goals
+        found.append(goals.depths)
+    torch.testing.assert_close(found[1], found[0] + 0.5)
+
+
+def test_depths_can_be_left_out(dataset):
+    policy, before, _ = small_policy(dataset, **CORRESPONDENCE, grasp_depth=False)
+    batch = before(batch_of(dataset, [0, LENGTH]))
+    loss, logged = policy.forward(batch)
+    assert loss.isfinite()
+    assert logged["depth_loss"] == 0
+    goals = policy.eval().encode_task(tuple(batch["task"]), batch["observation.image"][:, None]).goals
+    assert goals.depths is None
+    assert policy.select_action(batch).shape == (2, 3)
+
+
 def test_several_demonstrations_are_combined(dataset):
     demos = {"demo_repo_id": "test/table", "demo_root": str(dataset.root)}
     torch.manual_seed(0)
@@ -322,6 +465,7 @@ def test_several_demonstrations_are_combined(dataset):
         ({"locator_share": 0.0}, "`locator_share` must be at least 1e-06"),
         ({"n_demonstrations": 0}, "`n_demonstrations` must be at least 1"),
         ({"color_blind_tasks": "("}, "`color_blind_tasks` must be a regular expression"),
+        ({"depth_margin": float("nan")}, "`depth_margin` must be a finite number"),
         ({"frames_after_release": -1}, "`frames_after_release` must be at least 0"),
     ],
 )

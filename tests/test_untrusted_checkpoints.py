@@ -118,6 +118,10 @@ def set_tensor(name, function):
     return lambda tensors, known: tensors.update({name: function(tensors[name])})
 
 
+def add_tensor(name, tensor):
+    return lambda tensors, known: tensors.update({name: tensor})
+
+
 def set_known(name, value):
     return lambda tensors, known: known.update({name: value})
 
@@ -160,6 +164,18 @@ def drop_known(name):
         (set_tensor("frames", lambda x: x[:, :, :1]), r"`frames` must be .* shape \(2, 2, 3, 16, 16\)"),
         (set_tensor("frames", lambda x: x[..., :8]), r"`frames` must be .* shape \(2, 2, 3, 16, 16\)"),
         (set_tensor("frames", lambda x: x.repeat(1, 2, 1, 1, 1)), r"`frames` must be .* \(2, 2, 3, 16, 16\)"),
+        (add_tensor("grasp_states", torch.zeros(2)), r"`grasp_states` must have the shape \(n, state\)"),
+        (add_tensor("grasp_states", torch.zeros(3, 4)), r"`grasp_states` must be .* shape \(2, 4\)"),
+        (
+            add_tensor("grasp_states", torch.zeros(2, 4).double()),
+            "`grasp_states` must be of the type float32",
+        ),
+        (add_tensor("grasp_states", torch.full((2, 4), torch.inf)), "finite, or NaN where there is no grasp"),
+        (add_tensor("grasp_states", torch.tensor([[torch.nan, 0]] * 2)), "finite, or NaN where there is"),
+        (
+            add_tensor("grasp_states", torch.zeros(2, 99)),
+            r"`grasp_states` must be .* not float32 and \(2, 99\)",
+        ),
     ],
 )
 def test_tasks_are_checked_whole_before_they_are_used(copy, change, message):

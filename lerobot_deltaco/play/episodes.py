@@ -27,6 +27,7 @@ from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, kept_frame_indices, resize_images
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals
+from lerobot_deltaco.policy.keyframes import find_keyframes
 from lerobot_deltaco.policy.language import LanguageEncoderError
 
 MAX_SEED = 2**32 - 1
@@ -64,10 +65,13 @@ class Demonstration:
     Attributes:
         title: Description for the page.
         frames: Kept images, the first and the last among them, (kept, H, W, 3), at the policy's size.
+        grasp_state: Robot state when the gripper closed, (state,); NaN if it never did, None if it is not
+            known.
     """
 
     title: str
     frames: NDArray[np.uint8]
+    grasp_state: NDArray[np.float32] | None = None
 
     @property
     def ends(self) -> NDArray[np.uint8]:
@@ -214,8 +218,11 @@ class Player:
             raise PlayError(f"{task!r} has the demonstrations 1 to {counts[task]}. Got {number!r}.")
         demonstrations = self.policy.eval_demonstrations
         assert demonstrations is not None
-        frames = demonstrations.frames[demonstrations.rows[task][number - 1]]  # (kept, 3, H, W)
-        return Demonstration(f"{task} ({number} of {counts[task]})", frames.permute(0, 2, 3, 1).cpu().numpy())
+        row = demonstrations.rows[task][number - 1]
+        frames = demonstrations.frames[row].permute(0, 2, 3, 1).cpu().numpy()
+        states = demonstrations.grasp_states
+        grasp_state = None if states is None else states[row].cpu().numpy()
+        return Demonstration(f"{task} ({number} of {counts[task]})", frames, grasp_state)
 
     def other_demonstration(
         self, view: SceneView, current: tuple[str, int] | None, rng: random.Random
@@ -284,9 +291,11 @@ class Player:
         """
         task = get_task(scene.task_id)
         with closing(_environment(scene, self._camera_size)) as env:
-            frames = []
+            frames, states, gripper = [], [], []
             for number, step in enumerate(expert_episode(env, task.index, _seed(scene)), start=1):
                 frames.append(step.observation["pixels"])
+                states.append(step.observation["agent_pos"])
+                gripper.append(float(step.action[-1]))
                 text = f"Expert, {number} of {EPISODE_STEPS} steps: {step.stage.value}"
                 if number == EPISODE_STEPS:
                     text = f"Expert. {outcome(step.info, -1)}"
@@ -295,7 +304,9 @@ class Player:
         images = torch.from_numpy(np.stack([frames[index] for index in kept])).permute(0, 3, 1, 2)
         images = resize_images(images, self.policy.config.image_size)
         title = f"{task.instruction} (by the expert, seed {scene.seed})"
-        yield Demonstration(title, images.permute(0, 2, 3, 1).numpy())
+        span = (0, len(frames) - 1)
+        keyframes = find_keyframes(torch.from_numpy(np.stack(states)), torch.tensor(gripper), [span])
+        yield Demonstration(title, images.permute(0, 2, 3, 1).numpy(), keyframes.grasp_states[0].numpy())
 
     def _batch(self, observation: dict[str, NDArray[Any]], sentence: str) -> dict[str, Any]:
         batch = preprocess_observation({name: value[None] for name, value in observation.items()})
@@ -372,6 +383,8 @@ def _demonstrated_by(
     if demonstration is not None:
         frames = torch.from_numpy(demonstration.frames).permute(0, 3, 1, 2)[None]
         policy.eval_demonstrations = DemonstrationSet(frames, [sentence], [0])
+        if demonstration.grasp_state is not None:
+            policy.eval_demonstrations.grasp_states = torch.from_numpy(demonstration.grasp_state)[None]
     try:
         yield
     finally:

@@ -11,7 +11,7 @@ import math
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from torch import Tensor
+from torch import Tensor, nn
 
 EPISODES_PER_CLUSTER = 60
 MIN_CLUSTERS, MAX_CLUSTERS = 12, 200
@@ -22,52 +22,64 @@ _REACH = 1 / 8  # of the refinement around a predicted place, as a share of the 
 _RIDGE = 1e-2
 
 
-class StateToImage:
+class StateToImage(nn.Module):
     """A map from robot states to places in the image, quadratic in the state.
 
     Places are x (to the right) and y (down), -1..1 between the image's edges.
 
     Args:
-        first: First images of episodes, (episodes, 3, H, W) uint8.
-        last: Last images of the same episodes.
-        states: States at their grasps, (episodes, state).
-
-    Raises:
-        ValueError: There are fewer than `MIN_EPISODES`.
+        state_dim: Size of the robot's state.
     """
 
-    def __init__(self, first: Tensor, last: Tensor, states: Tensor) -> None:
+    mean: Tensor
+    scale: Tensor
+    weights: Tensor
+
+    def __init__(self, state_dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(state_dim))
+        self.register_buffer("scale", torch.zeros(state_dim))
+        self.register_buffer("weights", torch.zeros(_quadratic(self.mean).shape[-1], 2))
+
+    def fit(self, first: Tensor, last: Tensor, states: Tensor) -> None:
+        """Learns the map from episodes.
+
+        Args:
+            first: First images of episodes, (episodes, 3, H, W) uint8.
+            last: Last images of the same episodes.
+            states: States at their grasps, (episodes, state).
+
+        Raises:
+            ValueError: There are fewer than `MIN_EPISODES`.
+        """
         if len(states) < MIN_EPISODES:
             raise ValueError(
                 f"Learning where grasps are in the image takes at least {MIN_EPISODES} episodes in which the "
                 f"gripper closes and opens. Got {len(states)}."
             )
         states = states.float()
-        self._mean = states.mean(dim=0)
-        std = states.std(dim=0)
-        self._scale = torch.where(std > 1e-6 * (1 + self._mean.abs()), 1 / std.clamp_min(1e-12), 0.0)
+        mean, std = states.mean(dim=0), states.std(dim=0)
+        self.mean.copy_(mean)
+        self.scale.copy_(torch.where(std > 1e-6 * (1 + mean.abs()), 1 / std.clamp_min(1e-12), 0.0))
         changes = _changes(first, last)  # (episodes, H, W)
-        x = self._normalized(states)
+        x = (states - mean) * self.scale.to(mean)
         centers, members = _clusters(x)
         # What changes in the episodes of a cluster, and not in the others, is what its states have in common.
         average = torch.stack([changes[members == k].mean(dim=0) for k in range(len(centers))])
         peaks = _peaks(_blurred(average - average.mean(dim=0)))
         linear = _robust_fit(_linear(centers), peaks)
-        coarse = _linear(x) @ linear
+        places = _linear(x) @ linear
         # Each episode's own change near the place that is expected: that is many more points.
         smooth = _blurred(changes)
-        self._weights = _padded(linear, _quadratic(x).shape[1])
-        places = coarse
+        weights = _padded(linear, len(self.weights))
         for _ in range(_ROUNDS):
-            self._weights = _robust_fit(_quadratic(x), _peaks_near(smooth, places))
-            places = _quadratic(x) @ self._weights
+            weights = _robust_fit(_quadratic(x), _peaks_near(smooth, places))
+            places = _quadratic(x) @ weights
+        self.weights.copy_(weights)
 
-    def __call__(self, states: Tensor) -> Tensor:
+    def forward(self, states: Tensor) -> Tensor:
         """Places of states: (..., state) to (..., 2)."""
-        return _quadratic(self._normalized(states.float())) @ self._weights
-
-    def _normalized(self, states: Tensor) -> Tensor:
-        return (states - self._mean) * self._scale
+        return _quadratic((states.float() - self.mean) * self.scale) @ self.weights
 
 
 def _changes(first: Tensor, last: Tensor) -> Tensor:

@@ -51,6 +51,18 @@ class Description(NamedTuple):
     attention: Tensor
 
 
+class Located(NamedTuple):
+    """Where the goals of scenes may be.
+
+    Attributes:
+        logits: Maps of the grasp and the release over places, (batch, 2, H / 2, W / 2).
+        features: Features of the scenes' places, (batch, descriptor_dim, H / 2, W / 2).
+    """
+
+    logits: Tensor
+    features: Tensor
+
+
 class GoalLocator(nn.Module):
     """Finds the grasp and the release of a task in the first image of an episode.
 
@@ -71,14 +83,14 @@ class GoalLocator(nn.Module):
         grasp_source: str,
         release_source: str,
         condition_dim: int,
-        channels: int = 32,
-        descriptor_dim: int = 32,
+        channels: int = 64,
+        descriptor_dim: int = 64,
         bottleneck: int = 3,
         condition_noise: float = 0.02,
     ) -> None:
         super().__init__()
         self.grasp_source, self.release_source = grasp_source, release_source
-        self.condition_noise = condition_noise
+        self.condition_noise, self.descriptor_dim = condition_noise, descriptor_dim
         self.trunk = _Trunk(channels, descriptor_dim)
         self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
         if "demo" in (grasp_source, release_source):
@@ -112,9 +124,8 @@ class GoalLocator(nn.Module):
         plain_scenes: Tensor,
         description: Description | None,
         condition: Tensor | None,
-        grasp_condition: Tensor | None = None,
         generator: torch.Generator | None = None,
-    ) -> Tensor:
+    ) -> Located:
         """Finds the goals.
 
         Args:
@@ -123,35 +134,28 @@ class GoalLocator(nn.Module):
             plain_scenes: The same in their own colors.
             description: Of the demonstrations; None if there are none.
             condition: (batch, condition_dim); None if there is none.
-            grasp_condition: Another condition for the grasp alone.
             generator: Source of the noise in training, on the CPU.
-
-        Returns:
-            Logits of the grasp and the release over places, (batch, 2, H / 2, W / 2).
         """
-        if grasp_condition is None:
-            grasp_condition = condition
-        if self.training and condition is not None and grasp_condition is not None:
+        if self.training and condition is not None:
             noise = torch.randn(condition.shape, generator=generator).to(condition)
-            noise = self.condition_noise * noise
-            condition, grasp_condition = condition + noise, grasp_condition + noise
-        features = self.trunk(scenes)
+            condition = condition + self.condition_noise * noise
+        features = weighed = self.trunk(scenes)
         if self.grasp_source == "condition":
-            descriptor = self.describe_condition(grasp_condition).float()
+            descriptor = self.describe_condition(condition).float()
         else:
             assert description is not None
             descriptor = description.moved
             if self.weigh is not None:
-                gate = 2 * torch.sigmoid(self.weigh(grasp_condition).float())  # (batch, descriptor_dim)
-                descriptor, features = descriptor * gate, features * gate[:, :, None, None]
+                gate = 2 * torch.sigmoid(self.weigh(condition).float())  # (batch, descriptor_dim)
+                descriptor, weighed = descriptor * gate, features * gate[:, :, None, None]
         grasp = self.log_scale.exp() * torch.einsum(
-            "bchw,bc->bhw", F.normalize(features, dim=1), F.normalize(descriptor, dim=1)
+            "bchw,bc->bhw", F.normalize(weighed, dim=1), F.normalize(descriptor, dim=1)
         )
         if self.release_source == "demo":
             assert description is not None
             condition = description.target
         assert condition is not None
-        return torch.stack([grasp, self.release(plain_scenes, condition)], dim=1)
+        return Located(torch.stack([grasp, self.release(plain_scenes, condition)], dim=1), features)
 
 
 class ReleaseNetwork(nn.Module):

@@ -54,6 +54,8 @@ class DemonstrationSet(torch.nn.Module):
     Attributes:
         features: Features of each by a frozen image encoder, (episodes, variants, features) float16; None
             unless they were asked for (`policy/frozen_features.py`).
+        grasp_states: The robot's state at each grasp, as in the dataset, (episodes, state) float32; NaN where
+            there is none. None unless the policy needs them.
     """
 
     frames: Tensor
@@ -64,6 +66,7 @@ class DemonstrationSet(torch.nn.Module):
     _ascending: Tensor
     _row_of_place: Tensor
     features: Tensor | None
+    grasp_states: Tensor | None
 
     def __init__(
         self,
@@ -81,6 +84,7 @@ class DemonstrationSet(torch.nn.Module):
         self.register_buffer("frames", frames, persistent=False)
         self.register_buffer("episodes", torch.as_tensor(episodes), persistent=False)
         self.register_buffer("features", None, persistent=False)
+        self.register_buffer("grasp_states", None, persistent=False)
         # By row: where the rows of its task begin in `order`, how many they are, and which of them it is.
         order = [row for rows in self.rows.values() for row in rows]
         place = {row: (n, len(rows)) for rows in self.rows.values() for n, row in enumerate(rows)}

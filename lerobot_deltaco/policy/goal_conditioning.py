@@ -8,97 +8,159 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.policy.correspondence import GOALS, Description, GoalLocator, peak_places
-from lerobot_deltaco.policy.training_goals import TrainingGoals
+from lerobot_deltaco.policy.correspondence import GOALS, Description, GoalLocator, goal_loss, peak_places
+from lerobot_deltaco.policy.goal_states import GoalStates
+from lerobot_deltaco.policy.grasp_depth import DepthEstimator
 
-_N_PLACE_FEATURES = 10
-_RIDGE = 1e-3
+# Standard deviation of the error of depths by looks on novel objects; depths have a standard deviation of 1.
+LOOKS_STD = 0.7
+_LEAST_ATTENTION = 1e-9
 
 
 class FoundGoals(NamedTuple):
     """Goals of the scenes of a batch, and why.
 
     Attributes:
-        places: (batch, 2, 2): grasp and release, x and y in -1..1.
+        places: Grasp and release, x and y in -1..1, (batch, 2, 2).
+        depths: Depth of each grasp, (batch,); None without depths.
         logits: Maps of both over the scene, (batch, 2, h, w).
         attention: Where the demonstrated object was and where it was put in the demonstration,
             (batch, 2, h, w); None without a demonstration.
     """
 
     places: Tensor
+    depths: Tensor | None
     logits: Tensor
     attention: Tensor | None
 
 
+class Demonstrations(NamedTuple):
+    """What goals are found by.
+
+    Attributes:
+        ends: First and last images of one or more demonstrations of each task,
+            (batch, demonstrations, 2, 3, H, W) in 0..1.
+        depths: Depths of their grasps, (batch, demonstrations); NaN where they are not known.
+        places: In training, places of their goals, (batch, demonstrations, 2, 2).
+    """
+
+    ends: Tensor
+    depths: Tensor
+    places: Tensor | None = None
+
+
 class GoalConditioning(nn.Module):
-    """A locator of goals, and where the robot's state would be at them.
+    """A locator of goals, and which state the robot has at them.
 
     Args:
         locator: Finds goals in the first images of episodes.
         state_dim: Size of the robot's state.
+        condition_dim: Size of the locator's condition, 0 for none.
+        has_depth: Whether depths of grasps are estimated.
+        depth_margin: Depth that is added to the estimates when goals are found.
     """
 
-    place_to_state: Tensor
-
-    def __init__(self, locator: GoalLocator, state_dim: int) -> None:
+    def __init__(
+        self,
+        locator: GoalLocator,
+        state_dim: int,
+        condition_dim: int,
+        has_depth: bool,
+        depth_margin: float = 0.0,
+    ) -> None:
         super().__init__()
-        self.locator = locator
-        self.register_buffer("place_to_state", torch.zeros(len(GOALS), _N_PLACE_FEATURES, state_dim))
+        self.locator, self.depth_margin = locator, depth_margin
+        self.states = GoalStates(state_dim, len(GOALS), has_depth)
+        self.depth = None
+        if has_depth:
+            has_demonstration = "demo" in (locator.grasp_source, locator.release_source)
+            self.depth = DepthEstimator(locator.descriptor_dim, condition_dim, has_demonstration)
 
-    def fit(self, goals: TrainingGoals, states: Tensor) -> None:
-        """Learns, by regression, which state the robot has when it is at a goal.
-
-        Args:
-            goals: Goals of the training episodes.
-            states: The states there, normalized as the policy's input is, (episodes, 2, state).
-        """
-        for goal in range(len(GOALS)):
-            features = _place_features(goals.places[goals.found, goal])
-            ridge = _RIDGE * len(features) * torch.eye(_N_PLACE_FEATURES, device=features.device)
-            solution = torch.linalg.solve(
-                features.T @ features + ridge, features.T @ states[goals.found, goal]
-            )
-            self.place_to_state[goal].copy_(solution)
-
-    def offsets(self, places: Tensor, state: Tensor) -> Tensor:
+    def offsets(self, places: Tensor, depths: Tensor | None, state: Tensor) -> Tensor:
         """How far the robot's state is from where it would be at its goals.
 
         Args:
-            places: (batch, 2, 2).
+            places: Places of the goals, (batch, 2, 2).
+            depths: Depth of each grasp, (batch,); None without depths.
             state: Present state, normalized, (batch, state).
 
         Returns:
             (batch, 2 * state).
         """
-        states = torch.einsum("bgf,gfs->bgs", _place_features(places), self.place_to_state)
-        return (states - state[:, None]).flatten(1)
+        return (self.states(places, depths) - state[:, None]).flatten(1)
+
+    def losses(
+        self,
+        scenes: Tensor,
+        plain_scenes: Tensor,
+        places: Tensor,
+        depths: Tensor | None,
+        demonstrations: Demonstrations | None,
+        condition: Tensor | None,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """How well the goals are found: losses of the grasp, the release, the depth and the attention.
+
+        The attention is to be where the demonstration's own goals are; without this loss, it takes thousands
+        of steps to find what was moved.
+
+        Args:
+            scenes: First images of episodes, (batch, 3, H, W) in 0..1, recolored like the demonstrations.
+            plain_scenes: The same in their own colors.
+            places: Places of the goals, (batch, 2, 2).
+            depths: Depths of the grasps, (batch,); None without depths.
+            demonstrations: One demonstration of each task; None if the locator takes none.
+            condition: Embeddings of the instructions, or one-hot tasks; None if the locator takes none.
+            generator: Source of the noise, on the CPU.
+
+        Returns:
+            (batch, 4); 0 for what there is not.
+        """
+        description = demonstrated = descriptors = None
+        attention_losses = depth_losses = torch.zeros(len(scenes), device=scenes.device)
+        if demonstrations is not None:
+            assert demonstrations.places is not None
+            description = self.locator.describe(demonstrations.ends[:, 0])
+            demonstrated, descriptors = demonstrations.depths[:, 0], description.moved
+            log_attention = description.attention.clamp_min(_LEAST_ATTENTION).log()
+            attention_losses = goal_loss(log_attention, demonstrations.places[:, 0]).sum(dim=1)
+        located = self.locator(scenes, plain_scenes, description, condition, generator)
+        if self.depth is not None:
+            assert depths is not None
+            depth_losses = self.depth.losses(
+                located.features, places[:, 0], depths, descriptors, demonstrated, condition, generator
+            )
+        losses = goal_loss(located.logits, places)  # (batch, 2)
+        return torch.cat([losses, torch.stack([depth_losses, attention_losses], dim=1)], dim=1)
 
     @torch.no_grad()
-    def find(self, scenes: Tensor, demonstrations: Tensor | None, condition: Tensor | None) -> FoundGoals:
+    def find(
+        self, scenes: Tensor, demonstrations: Demonstrations | None, condition: Tensor | None
+    ) -> FoundGoals:
         """Finds the goals of tasks in scenes.
 
         Args:
             scenes: First images of episodes, (batch, 3, H, W) in 0..1.
-            demonstrations: First and last images of one or more demonstrations of each task,
-                (batch, demonstrations, 2, 3, H, W); None if the locator takes none.
+            demonstrations: Demonstrations of each task; None if the locator takes none.
             condition: Embeddings of the instructions, or one-hot tasks; None if the locator takes none.
         """
-        description = None
+        description = demonstrated = None
         if demonstrations is not None:
-            n_each = demonstrations.shape[1]
-            each = self.locator.describe(demonstrations.flatten(0, 1))
+            n_each = demonstrations.ends.shape[1]
+            each = self.locator.describe(demonstrations.ends.flatten(0, 1))
             moved = F.normalize(each.moved, dim=1).unflatten(0, (-1, n_each)).mean(dim=1)
             target = each.target
             if target is not None:
                 target = target.unflatten(0, (-1, n_each)).mean(dim=1)
             description = Description(moved, target, each.attention[::n_each])
-        logits = self.locator(scenes, scenes, description, condition)
+            demonstrated = demonstrations.depths.nanmean(dim=1)
+        located = self.locator(scenes, scenes, description, condition)
+        places, depths = peak_places(located.logits), None
+        if self.depth is not None:
+            descriptors = None if description is None else description.moved
+            depths = self.depth(
+                located.features, places[:, 0], descriptors, demonstrated, condition, LOOKS_STD
+            )
+            depths = depths + self.depth_margin
         attention = None if description is None else description.attention
-        return FoundGoals(peak_places(logits), logits, attention)
-
-
-def _place_features(places: Tensor) -> Tensor:
-    """Powers of x and y up to the third: (..., 2) to (..., 10)."""
-    x, y = places.unbind(dim=-1)
-    ones = torch.ones_like(x)
-    return torch.stack([ones, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], dim=-1)
+        return FoundGoals(places, depths, located.logits, attention)

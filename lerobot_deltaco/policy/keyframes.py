@@ -8,6 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+_APPROACH = 2  # frames before the gripper closes
+_FOLLOWING = 0.8  # correlation of a state with the gripper's command, above which it is the gripper's
+
 
 class Keyframes(NamedTuple):
     """The robot's states at the keyframes of episodes.
@@ -15,11 +18,18 @@ class Keyframes(NamedTuple):
     Attributes:
         states: States in which the gripper has closed and is about to open, (episodes, 2, state), as in the
             dataset. Zeros where there are none.
+        approach: States shortly before the gripper closes, (episodes, state).
         found: Whether an episode has them, (episodes,) bool.
     """
 
     states: Tensor
+    approach: Tensor
     found: Tensor
+
+    @property
+    def grasp_states(self) -> Tensor:
+        """The states in which the gripper has closed, (episodes, state); NaN where there are none."""
+        return torch.where(self.found[:, None], self.states[:, 0], torch.nan)
 
 
 def find_keyframes(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Keyframes:
@@ -42,22 +52,41 @@ def find_keyframes(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, i
         opening = closing = _last_opening(closed, span)
         if opening is None or closing is None:
             found.append(False)
-            frames.append((span[0], span[0]))
+            frames.append((span[0], span[0], span[0]))
             continue
         while closing > span[0] and closed[closing - 1]:
             closing -= 1
         found.append(True)
         # One step later, the command to close has been carried out.
-        frames.append((min(closing + 1, opening), opening))
+        frames.append((min(closing + 1, opening), opening, max(closing - _APPROACH, span[0])))
     is_found = torch.tensor(found, device=states.device)
-    at = states[torch.tensor(frames, device=states.device)].float()  # (episodes, 2, state)
-    return Keyframes(torch.where(is_found[:, None, None], at, 0.0), is_found)
+    at = states[torch.tensor(frames, device=states.device)].float()  # (episodes, 3, state)
+    at = torch.where(is_found[:, None, None], at, 0.0)
+    return Keyframes(at[:, :2], at[:, 2], is_found)
 
 
 def release_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[int | None]:
     """The frame of each episode in which the gripper opens for the last time; None without any."""
     closed = _is_closed(gripper)
     return [_last_opening(closed, span) for span in spans]
+
+
+def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Tensor:
+    """Which dimensions of the robot's state tell how far the gripper is open, (state,) bool.
+
+    They are those that follow the gripper's commands, a step later.
+
+    Args:
+        states: Robot states of all frames, (frames, state).
+        gripper: Commands to the gripper in all frames, (frames,).
+        spans: First and last frame of each episode.
+    """
+    frames = torch.cat([torch.arange(first, last) for first, last in spans]).to(states.device)
+    after, command = states[frames + 1].double(), gripper[frames].double()[:, None]
+    after, command = after - after.mean(dim=0), command - command.mean()
+    covariance = (after * command).mean(dim=0)
+    scale = after.square().mean(dim=0).sqrt() * command.square().mean().sqrt()
+    return covariance.abs() > _FOLLOWING * scale.clamp_min(1e-12)
 
 
 def _is_closed(gripper: Tensor) -> list[bool]:

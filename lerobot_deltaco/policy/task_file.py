@@ -28,7 +28,8 @@ _DOWNLOAD_OPTIONS = ("revision", "cache_dir", "token", "local_files_only", "forc
 LENGTH_TOLERANCE = 1e-3
 _EMBEDDINGS, _LENGTHS = "embeddings", "lengths"
 _FRAMES, _EPISODES, _FEATURES = "frames", "episodes", "features"
-_NAMES = (_EMBEDDINGS, _LENGTHS, _FRAMES, _EPISODES, _FEATURES)
+_GRASP_STATES = "grasp_states"
+_NAMES = (_EMBEDDINGS, _LENGTHS, _FRAMES, _EPISODES, _FEATURES, _GRASP_STATES)
 
 
 class TaskFileError(ValueError):
@@ -43,6 +44,8 @@ class StoredDemonstrations(NamedTuple):
     tasks: list[str]  # of each demonstration
     target_objects: list[int] | None  # index of the object that each moves; None if it is not known
     features: Tensor | None = None  # (demonstrations, features) float32, by a frozen image encoder
+    # The robot's state at each grasp, (demonstrations, state) float32; NaN where there is none.
+    grasp_states: Tensor | None = None
 
 
 class TaskFile(NamedTuple):
@@ -84,10 +87,12 @@ def write_task_file(path: Path, contents: TaskFile) -> None:
         "instructions": json.dumps(contents.instructions),
     }
     if contents.demonstrations is not None:
-        frames, episodes, tasks, target_objects, features = contents.demonstrations
+        frames, episodes, tasks, target_objects, features, grasp_states = contents.demonstrations
         tensors |= {_FRAMES: frames.cpu().contiguous(), _EPISODES: episodes.cpu().contiguous()}
         if features is not None:
             tensors[_FEATURES] = features.float().cpu().contiguous()
+        if grasp_states is not None:
+            tensors[_GRASP_STATES] = grasp_states.float().cpu().contiguous()
         known["tasks"] = json.dumps(tasks)
         known["target_objects"] = json.dumps(target_objects)
     if contents.lengths is not None:
@@ -168,6 +173,22 @@ def check_features(path: Path, demonstrations: StoredDemonstrations, feature_dim
         _check(path, _FEATURES, demonstrations.features, torch.float32, shape)
 
 
+def check_grasp_states(path: Path, demonstrations: StoredDemonstrations, state_dim: int) -> None:
+    """Checks that the grasps of a file are those of a policy's robot.
+
+    Args:
+        path: The file.
+        demonstrations: Demonstrations of the file, with grasps.
+        state_dim: Size of the robot's state.
+
+    Raises:
+        TaskFileError: They are of another size.
+    """
+    assert demonstrations.grasp_states is not None
+    shape = (len(demonstrations.tasks), state_dim)
+    _check(path, _GRASP_STATES, demonstrations.grasp_states, torch.float32, shape)
+
+
 def _demonstrations(
     path: Path, tensors: Mapping[str, Tensor], known: Mapping[str, str]
 ) -> StoredDemonstrations:
@@ -192,8 +213,16 @@ def _demonstrations(
         _check(path, _FEATURES, features, torch.float32, (len(tasks), features.shape[1]))
         if not bool(features.isfinite().all()):
             raise _error(path, f"`{_FEATURES}` must be finite")
+    grasp_states = tensors.get(_GRASP_STATES)
+    if grasp_states is not None:
+        if grasp_states.ndim != 2:
+            shape = tuple(grasp_states.shape)
+            raise _error(path, f"`{_GRASP_STATES}` must have the shape (n, state), not {shape}")
+        _check(path, _GRASP_STATES, grasp_states, torch.float32, (len(tasks), grasp_states.shape[1]))
+        if not bool((grasp_states.isfinite().all(dim=1) | grasp_states.isnan().all(dim=1)).all()):
+            raise _error(path, f"`{_GRASP_STATES}` must be finite, or NaN where there is no grasp")
     target_objects = _target_objects(path, known, len(tasks))
-    return StoredDemonstrations(frames, episodes, tasks, target_objects, features)
+    return StoredDemonstrations(frames, episodes, tasks, target_objects, features, grasp_states)
 
 
 def _target_objects(path: Path, known: Mapping[str, str], n_demonstrations: int) -> list[int] | None:

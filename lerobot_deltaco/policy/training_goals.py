@@ -21,11 +21,13 @@ class TrainingGoals(NamedTuple):
     Attributes:
         places: Grasp and release in the first camera's image, x and y in -1..1, (episodes, 2, 2).
         states: The robot's states there, (episodes, 2, state), as in the dataset.
+        approach: The robot's states shortly before the grasps, (episodes, state).
         found: Whether the gripper closed and opened in an episode, (episodes,) bool; else the rest is 0.
     """
 
     places: Tensor
     states: Tensor
+    approach: Tensor
     found: Tensor
 
     def to(self, device: torch.device | str) -> TrainingGoals:
@@ -34,15 +36,21 @@ class TrainingGoals(NamedTuple):
 
 
 def find_training_goals(
-    first: Tensor, last: Tensor, states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]
+    to_image: StateToImage,
+    first: Tensor,
+    last: Tensor,
+    states: Tensor,
+    gripper: Tensor,
+    spans: Sequence[tuple[int, int]],
 ) -> TrainingGoals:
     """Finds the goals of episodes without a calibrated camera.
 
     Args:
+        to_image: Map from states to places, which is fitted to the episodes.
         first: First images of the episodes, (episodes, 3, H, W) uint8.
-        last: Their last images.
+        last: Last images of the episodes, (episodes, 3, H, W) uint8.
         states: Robot states of all frames, (frames, state).
-        gripper: The gripper's commands in all frames, (frames,).
+        gripper: Commands to the gripper in all frames, (frames,).
         spans: First and last frame of each episode.
 
     Raises:
@@ -56,6 +64,7 @@ def find_training_goals(
             int((~found).sum()),
             len(found),
         )
-    to_image = StateToImage(first[found], last[found], keyframes.states[found, 0])
+    to_image.fit(first[found], last[found], keyframes.states[found, 0])
     places = to_image(keyframes.states).clamp(-1, 1)
-    return TrainingGoals(torch.where(found[:, None, None], places, 0.0), keyframes.states, found)
+    places = torch.where(found[:, None, None], places, 0.0)
+    return TrainingGoals(places, keyframes.states, keyframes.approach, found)

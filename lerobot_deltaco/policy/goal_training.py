@@ -1,0 +1,140 @@
+"""Training of goals: those of the training episodes, and the loss of finding them by other demonstrations."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lerobot_deltaco.policy.calibration import StateToImage
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet, RobotData
+from lerobot_deltaco.policy.goal_conditioning import Demonstrations, GoalConditioning
+from lerobot_deltaco.policy.keyframes import follows_gripper
+from lerobot_deltaco.policy.networks import random_shifts, shift_images
+from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
+from lerobot_deltaco.policy.training_goals import TrainingGoals, find_training_goals
+
+
+class GoalBatch(NamedTuple):
+    """Samples on which goals are learned to be found.
+
+    Attributes:
+        episodes: Index of each sample's episode in the dataset, (batch,).
+        rows: Row of that episode among the demonstrations, (batch,).
+        tasks: Task string of each sample.
+        condition: Embeddings of the instructions, or one-hot tasks, (batch, condition); None without them.
+        recolorings: Change of each sample's colors, (batch, 3, 3), on the CPU.
+    """
+
+    episodes: Tensor
+    rows: Tensor
+    tasks: Sequence[str]
+    condition: Tensor | None
+    recolorings: Tensor
+
+
+class GoalTrainer:
+    """Teaches a policy to find the goals of its training episodes.
+
+    Args:
+        conditioning: What is taught; its states at goals are fitted at once.
+        demonstrations: The training episodes.
+        robot_data: States and actions of the robot in them.
+        gripper_index: The gripper's dimension of the action.
+        normalize: Normalizes robot states (n, state) as the policy's input, by scaling and shifting each
+            dimension.
+
+    Raises:
+        ValueError: There are too few episodes in which the gripper closes and opens.
+    """
+
+    def __init__(
+        self,
+        conditioning: GoalConditioning,
+        demonstrations: DemonstrationSet,
+        robot_data: RobotData,
+        gripper_index: int,
+        normalize: Callable[[Tensor], Tensor],
+    ) -> None:
+        self._conditioning, self._demonstrations = conditioning, demonstrations
+        frames, device = demonstrations.frames, demonstrations.frames.device
+        states = robot_data.states.to(device)
+        gripper = robot_data.actions[:, gripper_index].to(device)
+        to_image = conditioning.states.to_image
+        if to_image is None:
+            to_image = StateToImage(states.shape[1]).to(device)
+        self.goals: TrainingGoals = find_training_goals(
+            to_image,
+            frames[:, 0],
+            frames[:, -1],
+            states,
+            gripper,
+            robot_data.spans,
+        )
+        zero_and_one = torch.stack([torch.zeros(states.shape[1]), torch.ones(states.shape[1])])
+        shift, end = normalize(zero_and_one).to(device)
+        is_arm = ~follows_gripper(states, gripper, robot_data.spans)
+        conditioning.states.fit(self.goals, end - shift, shift, is_arm)
+        self.depths: Tensor | None = None  # of the episodes' grasps, (episodes,); NaN where there is none
+        if conditioning.depth is not None:
+            depths = conditioning.states.depths(self.goals.states[:, 0])
+            self.depths = torch.where(self.goals.found, depths, torch.nan)
+
+    def losses(
+        self,
+        batch: GoalBatch,
+        uses_demonstrations: bool,
+        crop_padding: int,
+        color_blind_tasks: str | None,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """How well the goals of samples are found in the first images of their episodes.
+
+        Args:
+            batch: The samples.
+            uses_demonstrations: Whether they are found by a demonstration, which is another episode.
+            crop_padding: Largest random shift of scenes and demonstrations, px.
+            color_blind_tasks: Regular expression that is found in the tasks in which color does not count.
+            generator: Source of the draws, on the CPU.
+
+        Returns:
+            Losses of the grasp, the release, the depth and the attention, (batch, 4); 0 where an episode has
+            no goals.
+        """
+        known, own = self._demonstrations, batch.rows
+        plain = known.frames[own, 0].float() / 255  # (batch, 3, H, W)
+        plain, places = self._shifted(plain, self.goals.places[own], crop_padding, generator)
+        scenes = recolor(plain, batch.recolorings)
+        demonstrations = others = None
+        if uses_demonstrations:
+            others = known.sample_other_episodes(batch.episodes, generator, check=False)
+            ends = known.frames[others][:, [0, -1]].float() / 255  # (batch, 2, 3, H, W)
+            ends, their_places = self._shifted(ends, self.goals.places[others], crop_padding, generator)
+            recolorings = batch.recolorings
+            if color_blind_tasks is not None:
+                apart = random_recolorings(len(own), 1.0, generator)
+                blind = [re.search(color_blind_tasks, task) is not None for task in batch.tasks]
+                recolorings = torch.where(torch.tensor(blind)[:, None, None], apart, recolorings)
+            ends = recolor(ends, recolorings)
+            unknown = torch.full((len(own),), torch.nan, device=own.device)
+            demonstrated = unknown if self.depths is None else self.depths[others]
+            demonstrations = Demonstrations(ends[:, None], demonstrated[:, None], their_places[:, None])
+        depths = None if self.depths is None else self.depths[own].nan_to_num()
+        losses = self._conditioning.losses(
+            scenes, plain, places, depths, demonstrations, batch.condition, generator
+        )
+        found = self.goals.found[own] if others is None else self.goals.found[own] & self.goals.found[others]
+        return torch.where(found[:, None], losses, 0.0)
+
+    @staticmethod
+    def _shifted(
+        images: Tensor, places: Tensor, padding: int, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Shifts images (batch, ..., H, W) and places in them (batch, n, 2) by up to `padding` px."""
+        shifts = random_shifts(len(images), padding, generator)
+        height, width = images.shape[-2:]
+        moved = (shifts * 2 / torch.tensor([width, height])).to(places.device)  # (batch, 2)
+        return shift_images(images, shifts, padding), places + moved[:, None]

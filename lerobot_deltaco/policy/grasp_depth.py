@@ -1,0 +1,121 @@
+"""Estimates how deep to grasp, from what the demonstration did and from what the scene looks like.
+
+Depths are those of `policy/goal_states.py`. Where the demonstration moved the same object, its depth is the
+right one. Where it moved another object of that color or shape, looks say more. So two estimates are
+averaged, weighted by the inverse of their variances. The error of demonstrations is learned, from the kind of
+instruction and from how similar both objects look. The error of looks on novel objects cannot be learned: on
+training objects, there is hardly any.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from lerobot_deltaco.policy.networks import features_at
+
+_HIDDEN_DIM = 64
+_BOTTLENECK = 3
+_MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0
+_NOISE = 0.02  # on each number of the condition in training, as in the locator
+
+
+class DepthEstimator(nn.Module):
+    """Estimates the depth of a grasp.
+
+    Args:
+        descriptor_dim: Size of the features of a place.
+        condition_dim: Size of the embedding of the instruction, 0 for none.
+        has_demonstration: Whether there is a demonstration.
+    """
+
+    def __init__(self, descriptor_dim: int, condition_dim: int, has_demonstration: bool) -> None:
+        super().__init__()
+        self.by_looks = nn.Sequential(
+            nn.Linear(descriptor_dim, _HIDDEN_DIM), nn.ReLU(inplace=True), nn.Linear(_HIDDEN_DIM, 1)
+        )
+        self.kind = self.demonstration_error = None
+        if has_demonstration:
+            if condition_dim:
+                self.kind = nn.Sequential(nn.Linear(condition_dim, _BOTTLENECK), nn.Tanh())
+            n_inputs = 1 + (_BOTTLENECK if condition_dim else 0)
+            self.demonstration_error = nn.Sequential(
+                nn.Linear(n_inputs, 16), nn.ReLU(inplace=True), nn.Linear(16, 1)
+            )
+
+    def losses(
+        self,
+        features: Tensor,
+        places: Tensor,
+        depths: Tensor,
+        descriptors: Tensor | None,
+        demonstrated: Tensor | None,
+        condition: Tensor | None,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """The loss of each sample, (batch,).
+
+        Args:
+            features: Features of the scenes' places, (batch, descriptor_dim, h, w).
+            places: Places of the grasps, (batch, 2).
+            depths: Depths of the grasps, (batch,).
+            descriptors: Features of what the demonstrations moved, (batch, descriptor_dim).
+            demonstrated: Depths of the demonstrations, (batch,); NaN where they are not known.
+            condition: Embeddings of the instructions, (batch, condition_dim).
+            generator: Source of the noise, on the CPU.
+        """
+        here = features_at(features, places[:, None])[:, 0]  # (batch, descriptor_dim)
+        losses = 0.5 * (self.by_looks(here.detach())[:, 0].float() - depths).square()
+        if demonstrated is not None:
+            if condition is not None:
+                condition = condition + _NOISE * torch.randn(condition.shape, generator=generator).to(
+                    condition
+                )
+            assert descriptors is not None
+            log_std = self._log_std(here, descriptors, condition)
+            known = ~demonstrated.isnan()
+            error = torch.where(known, demonstrated - depths, 0.0) * torch.exp(-log_std)
+            losses = losses + known * (0.5 * error.square() + log_std)
+        return losses
+
+    def forward(
+        self,
+        features: Tensor,
+        places: Tensor,
+        descriptors: Tensor | None,
+        demonstrated: Tensor | None,
+        condition: Tensor | None,
+        looks_std: float,
+    ) -> Tensor:
+        """Estimates depths, (batch,).
+
+        Args:
+            features: See `losses`.
+            places: See `losses`.
+            descriptors: See `losses`.
+            demonstrated: See `losses`.
+            condition: See `losses`.
+            looks_std: Standard deviation of the error of looks, on novel objects.
+        """
+        here = features_at(features, places[:, None])[:, 0]
+        by_looks = self.by_looks(here.detach())[:, 0].float()
+        if demonstrated is None:
+            return by_looks
+        assert descriptors is not None
+        demonstrated_variance = torch.exp(2 * self._log_std(here, descriptors, condition))
+        weight = looks_std**2 / (looks_std**2 + demonstrated_variance)
+        weight = torch.where(demonstrated.isnan(), 0.0, weight)
+        return weight * demonstrated.nan_to_num() + (1 - weight) * by_looks
+
+    def _log_std(self, here: Tensor, descriptors: Tensor, condition: Tensor | None) -> Tensor:
+        """Logarithm of the standard deviation of the demonstrations' error, (batch,).
+
+        It looks at features without changing them: they are to say what an object is.
+        """
+        assert self.demonstration_error is not None
+        inputs = [F.cosine_similarity(here, descriptors, dim=1).detach().float()[:, None]]
+        if self.kind is not None:
+            inputs.append(self.kind(condition).float())
+        log_std = self.demonstration_error(torch.cat(inputs, dim=1))[:, 0].float()
+        return _MIN_LOG_STD + (_MAX_LOG_STD - _MIN_LOG_STD) * torch.sigmoid(log_std)
