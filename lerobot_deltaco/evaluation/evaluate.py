@@ -223,8 +223,8 @@ class Evaluation:
             film = None
             if trial in filmed:
                 ends = self._demonstration_ends(demonstrated)
-                goals = found[0] if found else None
-                film = Film(recorded.film(index), recorded.observed[index], ends, _of_sample(goals, index))
+                goals = None if not found or found[0] is None else found[0].of_sample(index)
+                film = Film(recorded.film(index), recorded.observed[index], ends, goals)
             rewards = data["reward"][index]
             result = _result(recorded, index, trial, seed, sampler.demonstration, demonstrated)
             outcomes.append(EpisodeOutcome(result, float(rewards.sum()), float(rewards.max()), film))
@@ -472,15 +472,6 @@ def _noted_goals(policy: DeltacoPolicy) -> Iterator[list[FoundGoals | None]]:
 
     with patch.object(policy, "encode_task", noted):
         yield found
-
-
-def _of_sample(goals: FoundGoals | None, sample: int) -> FoundGoals | None:
-    """The goals of one sample of a batch, as a batch of one."""
-    if goals is None:
-        return None
-    one = slice(sample, sample + 1)
-    attention = None if goals.attention is None else goals.attention[one]
-    return FoundGoals(goals.places[one], goals.logits[one], attention)
 
 
 def _result(

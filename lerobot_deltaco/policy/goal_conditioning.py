@@ -33,6 +33,13 @@ class FoundGoals(NamedTuple):
     logits: Tensor
     attention: Tensor | None
 
+    def of_sample(self, sample: int) -> FoundGoals:
+        """The goals of one sample of the batch, as a batch of one."""
+        one = slice(sample, sample + 1)
+        depths = None if self.depths is None else self.depths[one]
+        attention = None if self.attention is None else self.attention[one]
+        return FoundGoals(self.places[one], depths, self.logits[one], attention)
+
 
 class Demonstrations(NamedTuple):
     """What goals are found by.
