@@ -154,7 +154,7 @@ def grasps():
     height = torch.stack([depths, torch.zeros(200)], dim=1)  # of grasps alone
     width = torch.rand(200, 2, generator=generator) * 40  # that the gripper closes to
     states = torch.stack([2 + x, 5 * y + 0.2 * height, 3 * height + x * y, width], dim=2)
-    approach = states[:, 0] - torch.tensor([0, 0, 2.0, 0])
+    approach = states[:, 0] - torch.tensor([0, 0.2, 3, 0])
     goals = TrainingGoals(places, states, approach, torch.arange(200) % 10 > 0)
     return goals, depths, (torch.tensor([0.5, 2, 0.1, 1]), torch.tensor([1.0, 0, -1, 0]))
 

@@ -4,9 +4,8 @@ A place in an image leaves one number open: how far along the camera's ray it is
 the object, and a flat object of an unknown kind looks like a tall one that is farther away. A demonstration
 says it: the robot's state when its gripper closed.
 
-Depth: that number, along the direction in which the states at grasps vary together around what their places
-predict; in standard deviations over the training episodes, 0 on average. Greater is further along the way on
-which grasps are approached: in the benchmark, lower.
+Depth: how far the state at a grasp is along the way on which the robot approaches, from what the place
+predicts; in standard deviations over the training episodes, 0 on average. In the benchmark, greater is lower.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from lerobot_deltaco.policy.training_goals import TrainingGoals
 _N_PLACE_FEATURES = 10
 _N_DEPTH_FEATURES = 3  # of the first of those: 1, x, y
 _RIDGE = 1e-5
-_ROUNDS = 3
 # Spread of a normalized state around what places predict, below which it does not count.
 _MIN_SPREAD = 1e-3
 _MAX_REST = 4.0  # beyond which, in that spread, it is an accident
@@ -82,19 +80,8 @@ class GoalStates(nn.Module):
         spread = 1.4826 * rest.abs().median(dim=0).values
         # A joint that only vibrates counts no more than one that reaches.
         self.rest_scale.copy_(torch.where(is_arm & (spread > _MIN_SPREAD), 1 / spread.clamp_min(1e-12), 0.0))
-        self.depth_to_state.zero_()
-        if not self.rest_scale.any():
-            return
-        scaled = self._scaled(rest)
-        direction = torch.linalg.svd(scaled, full_matrices=False).Vh[0]
-        # Deeper is further along the approach.
-        direction = direction * (last_moves.mean(dim=0) * self.rest_scale * direction).sum().sign()
-        depths = scaled @ direction
-        for _ in range(_ROUNDS):
-            depths = depths / depths.std()
-            some = features[:, :_N_DEPTH_FEATURES]
-            self.depth_to_state.copy_(_ridge_regression(some * depths[:, None], rest * is_arm))
-            depths = self._project(rest, features)
+        self.depth_to_state.copy_(_ridge_regression(features[:, :_N_DEPTH_FEATURES], last_moves * is_arm))
+        self.depth_to_state.mul_(self._project(rest, features).std())
 
     def depths(self, states: Tensor) -> Tensor:
         """Depths of grasps.
