@@ -5,7 +5,6 @@
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,10 +20,16 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from lerobot_deltaco.cards.policy_card import policy_card
-from lerobot_deltaco.configuration_deltaco import BACKBONES, GOAL_SOURCES, DeltacoConfig
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.data.paraphrases import read_paraphrases
-from lerobot_deltaco.policy.correspondence import GoalLocator
-from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder, crop_array
+from lerobot_deltaco.network_factory import (
+    make_demo_encoder,
+    make_frozen_encoder,
+    make_goal_conditioning,
+    make_language_head,
+    make_policy_network,
+)
+from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, crop_array
 from lerobot_deltaco.policy.demonstration_choice import (
     choose_episode,
     choose_eval_demonstrations,
@@ -39,10 +44,8 @@ from lerobot_deltaco.policy.demonstrations import (
     load_robot_data,
 )
 from lerobot_deltaco.policy.finite_loss import FiniteLoss, check_weights_to_save, non_finite_weight
-from lerobot_deltaco.policy.frozen_features import FrozenFeatures, Variants
-from lerobot_deltaco.policy.goal_conditioning import Demonstrations, FoundGoals, GoalConditioning
+from lerobot_deltaco.policy.goal_conditioning import Demonstrations, FoundGoals
 from lerobot_deltaco.policy.goal_training import GoalBatch, GoalTrainer
-from lerobot_deltaco.policy.heads import UnitHead
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.initial_weights import initialize_demo_encoder, initialize_policy
 from lerobot_deltaco.policy.keyframes import find_keyframes
@@ -55,7 +58,7 @@ from lerobot_deltaco.policy.losses import (
     mixture_negative_log_likelihood,
 )
 from lerobot_deltaco.policy.memory import keep_freed_memory
-from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop, random_shifts, shift_images
+from lerobot_deltaco.policy.networks import random_crop, random_shifts, shift_images
 from lerobot_deltaco.policy.paraphrases import Paraphrases
 from lerobot_deltaco.policy.processor_files import check_processor_files
 from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
@@ -75,7 +78,6 @@ from lerobot_deltaco.policy.task_file import (
     write_task_file,
 )
 from lerobot_deltaco.policy.training_episodes import training_episodes
-from lerobot_deltaco.policy.vision import load_vision_encoder
 
 logger = logging.getLogger(__name__)
 
@@ -133,37 +135,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         if config.method == "one_hot" and not config.one_hot_tasks:
             config.one_hot_tasks = self._one_hot_vocabulary()
 
-        self._frozen = self._make_frozen_encoder()
-        film, concat, encoder_loss = config.conditioning
-        demo_dim = config.demo_dim or 0
-        dims = {
-            "none": 0,
-            "demo": demo_dim,
-            "language": config.embedding_dim,
-            "demo+language": demo_dim + config.embedding_dim,
-            "language_or_demo": config.embedding_dim,
-            "one_hot": len(config.one_hot_tasks),
-        }
-        backbone = BACKBONES[config.backbone]
-        state_dim = config.robot_state_feature.shape[0] if config.robot_state_feature else 0
-        action_dim = config.action_feature.shape[0]
-        self.model = ConditionedPolicy(
-            n_cameras=len(config.image_features),
-            film_dim=dims[film],
-            # With goals: how far the state is from each of them.
-            concat_dim=dims[concat] + state_dim * (1 + config.n_goals),
-            motion_dim=action_dim - (config.gripper_index is not None),
-            has_gripper=config.gripper_index is not None,
-            channels=backbone.channels,
-            stem_stride=backbone.stem_stride,
-            motion_modes=config.motion_modes,
-            n_goals=config.n_goals,
-        )
-        self.demo_encoder = (
-            self._make_demo_encoder() if config.uses_demo and not config.locates_goals else None
-        )
-        self.goals = self._make_goal_conditioning(state_dim) if config.locates_goals else None
-        self.language_head = self._make_language_head()
+        self._frozen = make_frozen_encoder(config)
+        self.model = make_policy_network(config)
+        self.demo_encoder = make_demo_encoder(config)
+        self.goals = make_goal_conditioning(config)
+        self.language_head = make_language_head(config)
         if config.initial_weights == "authors":
             initialize_policy(self.model)
             if isinstance(self.demo_encoder, ArrayEncoder):
@@ -176,62 +152,6 @@ class DeltacoPolicy(PreTrainedPolicy):
                     network.compile()
         self._folded = FoldedPolicy(self.model)
         self._finite_loss = FiniteLoss()
-
-    def _make_demo_encoder(self) -> nn.Module:
-        config = self.config
-        if config.demo_encoder == "pretrained":
-            assert config.demo_feature_dim is not None
-            assert config.demo_dim is not None
-            return UnitHead(config.demo_feature_dim, config.demo_head, config.demo_dim)
-        if config.demo_encoder == "attention":
-            return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
-        size, stride = config.image_size, BACKBONES[config.backbone].demo_stride
-        return ArrayEncoder(size, size, config.demo_rows, config.demo_columns, config.embedding_dim, stride)
-
-    def _make_goal_conditioning(self, state_dim: int) -> GoalConditioning:
-        config = self.config
-        condition_dim = len(config.one_hot_tasks) if config.method == "one_hot" else 0
-        if config.uses_language:
-            condition_dim = config.embedding_dim
-        locator = GoalLocator(*GOAL_SOURCES[config.method], condition_dim)
-        return GoalConditioning(locator, state_dim, condition_dim, config.grasp_depth, config.depth_margin)
-
-    def _make_frozen_encoder(self) -> FrozenFeatures | None:
-        config = self.config
-        if not config.uses_demo or config.demo_encoder != "pretrained":
-            return None
-        load = partial(
-            load_vision_encoder,
-            config.vision_encoder,
-            config.vision_encoder_weights,
-            config.vision_image_size,
-            config.vision_input,
-        )
-        variants = Variants(
-            config.n_demo_frames,
-            config.demo_rows,
-            config.demo_variants,
-            config.demo_crop_padding,
-            config.demo_crop == "array",
-            config.demo_frames_between == "spread",
-            config.seed,
-        )
-        folder = None if config.demo_features_dir is None else Path(config.demo_features_dir)
-        frozen = FrozenFeatures(load, variants, folder)
-        if config.demo_feature_dim is None:
-            config.demo_feature_dim = frozen.encoder.feature_dim
-            config.check_demo_dim()
-        return frozen
-
-    def _make_language_head(self) -> UnitHead | None:
-        """Layers behind the language encoder; MCIL brings both modalities into one space by them."""
-        config = self.config
-        hidden_dims = config.language_head
-        if config.method == "mcil" and hidden_dims is None:
-            hidden_dims = [config.embedding_dim]
-        if hidden_dims is None or not config.uses_language:
-            return None
-        return UnitHead(config.embedding_dim, hidden_dims, config.embedding_dim)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """All weights. The language encoder is frozen, and not among them."""

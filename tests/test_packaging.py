@@ -105,6 +105,7 @@ FORBIDDEN = {
         "lerobot_deltaco.modeling_deltaco",
         "lerobot_deltaco.policy.language",
     },
+    "lerobot_deltaco/network_factory.py": {"lerobot_deltaco.modeling_deltaco"},
     "lerobot_deltaco/evaluation": {"lerobot_deltaco.reporting", "lerobot_deltaco.training"},
     "lerobot_deltaco/policy/networks.py": {"lerobot", "lerobot_deltaco"},
     "lerobot_deltaco/policy/losses.py": {"lerobot", "lerobot_deltaco"},
