@@ -8,7 +8,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 from torch.utils.data import default_collate
 
-from lerobot_deltaco import modeling_deltaco
+from lerobot_deltaco import network_factory
 from lerobot_deltaco.policy import language
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS
 
@@ -52,7 +52,7 @@ class FakeVisionEncoder:
 
 def use_fake_vision_encoder(monkeypatch):
     """Puts it in the place of all frozen image encoders."""
-    monkeypatch.setattr(modeling_deltaco, "load_vision_encoder", FakeVisionEncoder)
+    monkeypatch.setattr(network_factory, "load_vision_encoder", FakeVisionEncoder)
 
 
 def write_dataset(root, episodes):

@@ -21,7 +21,7 @@ from lerobot_deltaco.evaluation.processes import EvaluationError, default_proces
 from lerobot_deltaco.evaluation.record import EpisodeResult, read_record, record_path
 
 CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "small_a_correspondence"
-STEP = 12_000
+STEP = 8_000
 TASKS = "24,26,35"
 
 

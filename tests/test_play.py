@@ -104,7 +104,7 @@ def goals_at(column, row, size=24):
     maps = torch.full((1, 2, size, size), -20.0)
     maps[0, :, row, column] = 20
     places = torch.tensor([[[(column + 0.5) / size * 2 - 1, (row + 0.5) / size * 2 - 1]] * 2])
-    return FoundGoals(places, maps, maps.flatten(2).softmax(dim=2).view_as(maps))
+    return FoundGoals(places, None, maps, maps.flatten(2).softmax(dim=2).view_as(maps))
 
 
 def pinkness(image, x, y):
