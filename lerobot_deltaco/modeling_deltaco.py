@@ -324,7 +324,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             tasks: Task string of each sample.
             instructions: Instruction of each sample, in whatever words.
             rows: Rows of the samples' episodes among the demonstrations, (batch,).
-            some: Which samples, on the CPU.
+            some: Indices of the samples, on the CPU.
             recolorings: Changes of the samples' colors, (batch, 3, 3), on the CPU.
             generator: Source of the draws, on the CPU.
         """
@@ -407,7 +407,7 @@ class DeltacoPolicy(PreTrainedPolicy):
 
         Args:
             demonstrations: Demonstrations, which include every episode of the training.
-            robot_data: What the robot did in them, for `demo_encoder=correspondence`.
+            robot_data: States and actions of the robot in them, for `demo_encoder=correspondence`.
         """
         self.train_demonstrations = demonstrations
         self._train_demonstrations_are_complete = True

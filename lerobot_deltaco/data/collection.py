@@ -211,7 +211,7 @@ def collect(root: Path, plan: CollectionPlan, n_workers: int = 1, append: bool =
 
     Args:
         root: The dataset's folder: new, empty, or that of an interrupted collection with the same plan.
-        plan: What to collect.
+        plan: Tasks, episodes and settings of the dataset.
         n_workers: Number of processes; the dataset does not depend on it.
         append: Whether to add to a finished dataset.
 
@@ -415,8 +415,8 @@ def make_job(
 
     Args:
         root: The dataset's folder.
-        plan: What the dataset gets.
-        base: What is added to, if anything.
+        plan: Plan of the episodes that the dataset gets.
+        base: Dataset that is added to, if any.
         collected: The episodes of the plan that are collected in this folder; all by default.
     """
     base = base or _Base([], 0, 0, 0, {}, [], {})

@@ -57,7 +57,7 @@ class CollectionPlan:
             choosing settings), or indices and ranges.
         episodes_per_task: Number of successful episodes of each task, at least 1.
         seed: Seed of the whole collection, at least 0.
-        split: What the episodes are for: "train" or "validation", whose scenes never coincide. None is that
+        split: Purpose of the episodes: "train" or "validation", whose scenes never coincide. None is that
             of the data set, or "validation" for test and validation tasks and "train" for all else.
         ambiguity: "container" or "object", the paper's schemes i and ii.
         noise: Standard deviation of the noise on the expert's motions, at least 0.

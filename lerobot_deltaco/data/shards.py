@@ -35,8 +35,8 @@ class Shard:
     """A range of a plan's episodes: one of several that are equal, give or take an episode.
 
     Args:
-        number: Which one, 1..count.
-        count: How many there are.
+        number: Number of this shard, 1..count.
+        count: Number of shards.
     """
 
     number: int
@@ -96,8 +96,8 @@ def collect_shard(root: Path, plan: CollectionPlan, shard: Shard, n_workers: int
 
     Args:
         root: The folder of the dataset that the shards are joined into. It is not touched.
-        plan: What the whole dataset consists of.
-        shard: Which episodes of it are collected.
+        plan: Plan of the whole dataset.
+        shard: Share of its episodes that is collected.
         n_workers: Number of processes.
 
     Returns:
@@ -132,7 +132,7 @@ def join_shards(root: Path, plan: CollectionPlan, n_workers: int = 1) -> Summary
 
     Args:
         root: The dataset's folder: new, empty, or that of an interrupted collection with the same plan.
-        plan: What the dataset consists of.
+        plan: Plan of the whole dataset.
         n_workers: Number of processes.
 
     Returns:

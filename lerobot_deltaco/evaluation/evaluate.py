@@ -58,7 +58,7 @@ class EpisodeOutcome(NamedTuple):
     """An episode, with what its record does not have.
 
     Attributes:
-        result: What is recorded.
+        result: Episode as it is recorded.
         sum_reward: Sum of the rewards.
         max_reward: Greatest of the rewards.
         film: The episode in images; None unless it was asked for.
@@ -342,8 +342,8 @@ class InstructionSampler:
         task: The scenes' task.
         own: The instructions of the task itself, one for each episode, in whatever words.
         task_ids: Tasks of which a counterfactual one is chosen.
-        counterfactual: Which of both is another task's.
-        seed: Of the choice.
+        counterfactual: Cue that is another task's.
+        seed: Seed of the choice.
         uses_demo: Whether the policy takes demonstrations.
         demonstrated: Task strings of which there are demonstrations; None if that is not known.
     """

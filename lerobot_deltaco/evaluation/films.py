@@ -53,7 +53,7 @@ class FilmedEpisode(NamedTuple):
     """An episode that was run again.
 
     Attributes:
-        result: What is recorded of it.
+        result: Episode as it is recorded.
         film: The episode in images.
         is_repeated: Whether it ended as recorded. On another processor, it may end otherwise.
     """

@@ -40,14 +40,14 @@ class EpisodeResult:
 
     Args:
         task_id: The scene's task, which decides success.
-        trial: Which episode of its task in this evaluation set, from 0.
+        trial: Number of the episode among those of its task in this evaluation set, from 0.
         seed: Seed of the environment's reset.
         instruction: Instruction that the policy received.
         demonstration: Task string of the demonstration that the policy received; None without one.
         success: Whether the scene's task succeeded, at any step.
         objects: Indices of the objects that stand in the scene, three of them.
-        object_containers: Where each of them lies at the end: 0 green, 1 red.
-        container_quadrants: Where the green and the red container stand, (2, 2): i, 0 right and 1 left, and
+        object_containers: Container of each of them at the end: 0 green, 1 red.
+        container_quadrants: Places of the green and the red container, (2, 2): i, 0 right and 1 left, and
             j, 0 back and 1 front. It decides what a position word of another task would mean in this scene.
         target_object: The object that the scene's task asks for.
         target_container: The container that the scene's task asks for.

@@ -42,7 +42,7 @@ def run_set(
         preprocessor: Preprocessor of the policy.
         postprocessor: Postprocessor of the policy.
         plan: Episodes to run.
-        experiment: What was trained, for the record; runs of one name differ in their seeds alone.
+        experiment: Name of what was trained, for the record; runs of one name differ in their seeds alone.
         run_seed: Seed of the training run, for the record.
         command: Command line, for the record.
         processes: Number of processes that share the episodes.

@@ -43,7 +43,7 @@ class Description(NamedTuple):
         moved: Features of what was moved, (batch, descriptor_dim).
         target: Features of where it was put, and that place, (batch, descriptor_dim + 2); None if the locator
             takes that from the condition.
-        attention: Where both are in the demonstrations, (batch, 2, h, w); each map sums to 1.
+        attention: Maps of both places over the demonstrations, (batch, 2, h, w); each map sums to 1.
     """
 
     moved: Tensor
@@ -67,9 +67,9 @@ class GoalLocator(nn.Module):
     """Finds the grasp and the release of a task in the first image of an episode.
 
     Args:
-        grasp_source: What says which thing is to be grasped: "demo", its description, or "condition", an
+        grasp_source: Source of what is to be grasped: "demo", its description, or "condition", an
             embedding of the instruction or the task's one-hot.
-        release_source: What says where it is to go; the same.
+        release_source: Source of where it is to go; the same.
         condition_dim: Size of the condition, 0 for none. With a condition, it also weighs the channels of
             what a demonstration describes.
         channels: Number of channels of the maps, which have half the side of the image.
@@ -132,7 +132,7 @@ class GoalLocator(nn.Module):
             scenes: First images of episodes, (batch, 3, H, W) in 0..1; in training, recolored like the
                 demonstrations.
             plain_scenes: The same in their own colors.
-            description: Of the demonstrations; None if there are none.
+            description: Description of the demonstrations; None without them.
             condition: (batch, condition_dim); None if there is none.
             generator: Source of the noise in training, on the CPU.
         """

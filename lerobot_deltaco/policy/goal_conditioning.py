@@ -24,7 +24,7 @@ class FoundGoals(NamedTuple):
         places: Grasp and release, x and y in -1..1, (batch, 2, 2).
         depths: Depth of each grasp, (batch,); None without depths.
         logits: Maps of both over the scene, (batch, 2, h, w).
-        attention: Where the demonstrated object was and where it was put in the demonstration,
+        attention: Maps of where the object was and where it was put in the demonstration,
             (batch, 2, h, w); None without a demonstration.
     """
 

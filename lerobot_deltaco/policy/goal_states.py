@@ -60,8 +60,8 @@ class GoalStates(nn.Module):
         Args:
             goals: Goals of the training episodes, which were found by `to_image` if there is one.
             scale: The policy's input is `scale * state + shift`, (state,).
-            shift: See `scale`.
-            is_arm: Which dimensions of the state do not tell how far the gripper is open, (state,) bool. At a
+            shift: Shift of each dimension, (state,).
+            is_arm: Dimensions of the state that do not tell how far the gripper is open, (state,) bool. At a
                 grasp, that depends on the object's width, and says nothing about the depth.
         """
         states = goals.states * scale + shift  # (episodes, goals, state)

@@ -40,7 +40,7 @@ class GoalTrainer:
     """Teaches a policy to find the goals of its training episodes.
 
     Args:
-        conditioning: What is taught; its states at goals are fitted at once.
+        conditioning: Networks that are taught; their states at goals are fitted at once.
         demonstrations: The training episodes.
         robot_data: States and actions of the robot in them.
         gripper_index: The gripper's dimension of the action.

@@ -91,11 +91,11 @@ class DepthEstimator(nn.Module):
         """Estimates depths, (batch,).
 
         Args:
-            features: See `losses`.
-            places: See `losses`.
-            descriptors: See `losses`.
-            demonstrated: See `losses`.
-            condition: See `losses`.
+            features: Features of the scenes' places, (batch, descriptor_dim, h, w).
+            places: Places of the grasps, (batch, 2).
+            descriptors: Features of what the demonstrations moved, (batch, descriptor_dim).
+            demonstrated: Depths of the demonstrations, (batch,); NaN where they are not known.
+            condition: Embeddings of the instructions, (batch, condition_dim).
             looks_std: Standard deviation of the error of looks, on novel objects.
         """
         here = features_at(features, places[:, None])[:, 0]

@@ -52,7 +52,7 @@ class Curve:
     """The success of an experiment over its training.
 
     Args:
-        experiment: Its name.
+        experiment: Name of the experiment.
         steps: Ascending.
         rates: (steps, seeds), 0..1.
     """

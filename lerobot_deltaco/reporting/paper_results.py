@@ -41,9 +41,9 @@ class PaperResult(NamedTuple):
     """A row of one of the paper's tables 1 to 3 (results), 8 (ablations) or 9 (ambiguity).
 
     Attributes:
-        label: What the row is called in tables and images.
+        label: Name of the row in tables and images.
         rate: Success rate as the paper reports it (`statistics.paper_rate`), 0..1.
-        sd: Its standard deviation over three seeds, 0..1.
+        sd: Standard deviation of the rate over three seeds, 0..1.
     """
 
     label: str

@@ -38,10 +38,10 @@ class EvaluationSet:
     """A record without its episodes, of which a large report has hundreds of thousands.
 
     Args:
-        path: Where the whole record is.
+        path: Path of the whole record.
         record: Without episodes.
-        task_ids: Of the tasks that were evaluated, ascending.
-        result: How many of its episodes succeeded.
+        task_ids: Indices of the tasks that were evaluated, ascending.
+        result: Share of the episodes that succeeded.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class Series:
     """The evaluation sets of an experiment, all with or without the same counterfactual.
 
     Args:
-        experiment: Its name.
+        experiment: Name of the experiment.
         counterfactual: none, demo or instruction.
         runs: For each seed of training, for each step, what came of it.
     """
@@ -127,7 +127,7 @@ class Report:
 
     Args:
         series: Those with at least one step that counts, in the order of the tables.
-        notes: What was left out, and what to mind; a sentence each.
+        notes: Caveats and what was left out; a sentence each.
     """
 
     series: list[Series]

@@ -29,7 +29,7 @@ class PaperRate(NamedTuple):
     Attributes:
         rate: Mean over the best evaluation sets of the mean over seeds.
         sd: Mean over the best evaluation sets of the standard deviation over seeds; None of a single seed.
-        best: Which evaluation sets are the best, ascending. Their number is 10, or fewer if there are fewer.
+        best: Indices of the best evaluation sets, ascending: 10, or fewer if there are fewer.
     """
 
     rate: float
@@ -65,7 +65,7 @@ class Proportion:
 
     Args:
         count: In how many of them it was so.
-        total: How many there are; with 0, rate and interval are None.
+        total: Number of episodes; with 0, rate and interval are None.
     """
 
     count: int
@@ -87,7 +87,7 @@ def wilson_interval(count: int, total: int, confidence: float = 0.95) -> tuple[f
 
     Args:
         count: In how many episodes it was so.
-        total: Of how many, at least 1.
+        total: Number of episodes, at least 1.
         confidence: That the interval covers the true share, 0..1.
 
     Returns:
@@ -117,8 +117,8 @@ class BreakdownRow(NamedTuple):
     """What happened in the episodes of a group of tasks.
 
     Attributes:
-        kind: How their object is asked for: name, color, shape, or "all".
-        word: How their container is asked for: color_word (green, red), position_word (front, back, left,
+        kind: Kind of words for their object: name, color, shape, or "all".
+        word: Kind of word for their container: color_word (green, red), position_word (front, back, left,
             right), or "all".
         outcomes: For each of `OUTCOMES`, in how many episodes it came about.
     """
@@ -196,8 +196,8 @@ def followed(episodes: Sequence[EpisodeResult], counterfactual: Counterfactual) 
     which demonstration and instruction ask for different ones, and either can be followed.
 
     Args:
-        episodes: Of an evaluation set.
-        counterfactual: What was another task's. The other cue belongs to the scene's task in whatever words.
+        episodes: Episodes of an evaluation set.
+        counterfactual: Cue that was another task's; the other cue belongs to the scene's task, in any words.
 
     Returns:
         Counts by aspect, among which episodes, and cue.

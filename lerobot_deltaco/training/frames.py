@@ -40,7 +40,7 @@ class FramesInMemory:
 
     Args:
         dataset: The dataset; its `episodes` are those that are held.
-        device: Where batches are wanted, and frames are held if they fit.
+        device: Device of the batches, and of the frames if they fit.
         image_size: Height and width to which images are scaled, None for their own.
 
     Raises:
@@ -115,7 +115,7 @@ class FramesInMemory:
             camera: Key of the images.
             image_size: Height and width to which they are scaled.
             n_demo_frames: Frames of a demonstration.
-            episodes: Which of the episodes; all by default.
+            episodes: Indices of the episodes; all by default.
         """
         episodes = list(self.spans) if episodes is None else list(episodes)
         rows = torch.stack([kept_frame_indices(*self.spans[episode], n_demo_frames) for episode in episodes])

@@ -23,7 +23,7 @@ class TaskBatchSampler:
         upsampled: Tasks that get a share of each batch; none by default.
         upsampled_share: That share of `tasks_per_batch`, which must be a whole number of tasks.
         seed: Seed of the order.
-        use: Which frames are drawn, (frames,) bool; all by default.
+        use: Whether each frame may be drawn, (frames,) bool; all by default.
         n_processes: Number of processes that take batches in turn; an epoch has whole turns.
 
     Raises:
