@@ -87,7 +87,8 @@ def test_the_leaderboard_has_all_methods_that_were_run():
     _, rows = read_rows(ROOT / ROWS_FILE)
     listed = {ROOT / "results" / row.records for row in rows if row.records is not None}
     run = {path for records in RECORDS for path in records.iterdir() if "validation" not in str(path)}
-    assert listed == run
+    assert run <= listed  # which may have further evaluations of them
+    assert all(path.is_dir() for path in listed)
 
 
 def test_what_was_not_run_says_so_and_comes_last():
