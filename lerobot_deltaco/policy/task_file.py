@@ -205,24 +205,27 @@ def _demonstrations(
         shape = tuple(frames.shape)
         raise _error(path, f"`{_FRAMES}` must have the shape (n, 2 or more, 3, h, w), not {shape}")
     _check(path, _FRAMES, frames, torch.uint8, (len(tasks), frames.shape[1], 3, *frames.shape[3:]))
-    features = tensors.get(_FEATURES)
-    if features is not None:
-        if features.ndim != 2:
-            shape = tuple(features.shape)
-            raise _error(path, f"`{_FEATURES}` must have the shape (n, features), not {shape}")
-        _check(path, _FEATURES, features, torch.float32, (len(tasks), features.shape[1]))
-        if not bool(features.isfinite().all()):
-            raise _error(path, f"`{_FEATURES}` must be finite")
-    grasp_states = tensors.get(_GRASP_STATES)
+    features = _rows(path, tensors, _FEATURES, "features", len(tasks))
+    if features is not None and not bool(features.isfinite().all()):
+        raise _error(path, f"`{_FEATURES}` must be finite")
+    grasp_states = _rows(path, tensors, _GRASP_STATES, "state", len(tasks))
     if grasp_states is not None:
-        if grasp_states.ndim != 2:
-            shape = tuple(grasp_states.shape)
-            raise _error(path, f"`{_GRASP_STATES}` must have the shape (n, state), not {shape}")
-        _check(path, _GRASP_STATES, grasp_states, torch.float32, (len(tasks), grasp_states.shape[1]))
-        if not bool((grasp_states.isfinite().all(dim=1) | grasp_states.isnan().all(dim=1)).all()):
+        is_known, is_none = grasp_states.isfinite().all(dim=1), grasp_states.isnan().all(dim=1)
+        if not bool((is_known | is_none).all()):
             raise _error(path, f"`{_GRASP_STATES}` must be finite, or NaN where there is no grasp")
     target_objects = _target_objects(path, known, len(tasks))
     return StoredDemonstrations(frames, episodes, tasks, target_objects, features, grasp_states)
+
+
+def _rows(path: Path, tensors: Mapping[str, Tensor], name: str, columns: str, n_rows: int) -> Tensor | None:
+    """A table with a row of numbers for each demonstration; None if the file has none."""
+    rows = tensors.get(name)
+    if rows is None:
+        return None
+    if rows.ndim != 2:
+        raise _error(path, f"`{name}` must have the shape (n, {columns}), not {tuple(rows.shape)}")
+    _check(path, name, rows, torch.float32, (n_rows, rows.shape[1]))
+    return rows
 
 
 def _target_objects(path: Path, known: Mapping[str, str], n_demonstrations: int) -> list[int] | None:
