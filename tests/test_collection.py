@@ -13,7 +13,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -24,6 +23,7 @@ import pandas as pd
 import psutil
 import pyarrow.parquet as pq
 import pytest
+from in_process_collection import collect_in_process, remember_episodes
 from lerobot.datasets import LeRobotDataset
 from PIL import Image
 
@@ -38,7 +38,7 @@ from lerobot_deltaco.commands.collect import main
 from lerobot_deltaco.data import collection, collection_plan
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import CollectionError, collect
-from lerobot_deltaco.data.collection_plan import DATA_SETS, CollectionPlan, collect_episode
+from lerobot_deltaco.data.collection_plan import DATA_SETS, CollectionPlan
 from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, STAGING, verify_dataset
 from lerobot_deltaco.data.integrity import DIGESTS_FILE
 
@@ -61,51 +61,13 @@ def env():
 @pytest.fixture(scope="module")
 def remembered(env):
     """`collect_episode`, which simulates each episode only once in this module."""
-    episodes = {}
-
-    def collect_remembered(_, plan, task_id, number):
-        key = plan.seed, plan.split, plan.noise, task_id, number
-        if key not in episodes:
-            episodes[key] = collect_episode(env, plan, task_id, number)
-        return episodes[key]
-
-    return collect_remembered
-
-
-class InProcess(Executor):
-    """Does the workers' jobs at once, in this process."""
-
-    def submit(self, function, /, *arguments):
-        future = Future()
-        try:
-            future.set_result(function(*arguments))
-        except Exception as error:
-            future.set_exception(error)
-        return future
+    return remember_episodes(env)
 
 
 @pytest.fixture
 def in_process(monkeypatch, remembered):
-    """Lets collections run in this process, so that faults can be injected into every part of them.
-
-    Returns:
-        The episodes that were collected: (task, number).
-    """
-    collected = []
-
-    def collect_and_count(env, plan, task_id, number):
-        collected.append((task_id, number))
-        return remembered(env, plan, task_id, number)
-
-    def executor(job, n_workers):
-        worker = collection._Worker(job, None, files.data_schema(job.plan.features))
-        monkeypatch.setattr(collection, "_worker", worker)
-        return InProcess()
-
-    monkeypatch.setattr(collection, "collect_episode", collect_and_count)
-    monkeypatch.setattr(collection, "_executor", executor)
-    monkeypatch.setattr(collection, "EPISODES_PER_FILE", EPISODES_PER_FILE)
-    return collected
+    """Lets collections run in this process. Returns the episodes that were collected: (task, number)."""
+    return collect_in_process(monkeypatch, remembered, EPISODES_PER_FILE)
 
 
 @pytest.fixture(scope="module")

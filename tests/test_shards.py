@@ -2,17 +2,16 @@
 
 import json
 import shutil
-from concurrent.futures import Executor, Future
 from dataclasses import replace
 
 import pytest
+from in_process_collection import collect_in_process, remember_episodes
 
 from gym_deltaco.env import PickPlaceEnv
 from lerobot_deltaco.commands.collect import main
 from lerobot_deltaco.data import collection
-from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import CollectionError, collect
-from lerobot_deltaco.data.collection_plan import CollectionPlan, collect_episode
+from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.finished_dataset import STAGING, verify_dataset
 from lerobot_deltaco.data.shards import Shard, collect_shard, join_shards, shards_folder
 
@@ -22,51 +21,18 @@ EPISODES_PER_FILE = 3
 ARGUMENTS = ["--tasks", "90,4", "--episodes-per-task", "10", "--workers", "1"]
 
 
-class InProcess(Executor):
-    """Does the workers' jobs at once, in this process."""
-
-    def submit(self, function, /, *arguments):
-        future = Future()
-        try:
-            future.set_result(function(*arguments))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
 @pytest.fixture(scope="module")
 def remembered():
     """`collect_episode`, which simulates each episode only once in this module."""
-    episodes, env = {}, PickPlaceEnv()
-
-    def collect_remembered(_, plan, task_id, number):
-        key = plan.seed, task_id, number
-        if key not in episodes:
-            episodes[key] = collect_episode(env, plan, task_id, number)
-        return episodes[key]
-
-    yield collect_remembered
+    env = PickPlaceEnv()
+    yield remember_episodes(env)
     env.close()
 
 
 @pytest.fixture
 def in_process(remembered, monkeypatch):
     """Lets collections run in this process. Returns the episodes that were collected: (task, number)."""
-    collected = []
-
-    def collect_and_count(env, plan, task_id, number):
-        collected.append((task_id, number))
-        return remembered(env, plan, task_id, number)
-
-    def executor(job, n_workers):
-        worker = collection._Worker(job, None, files.data_schema(job.plan.features))
-        monkeypatch.setattr(collection, "_worker", worker)
-        return InProcess()
-
-    monkeypatch.setattr(collection, "collect_episode", collect_and_count)
-    monkeypatch.setattr(collection, "_executor", executor)
-    monkeypatch.setattr(collection, "EPISODES_PER_FILE", EPISODES_PER_FILE)
-    return collected
+    return collect_in_process(monkeypatch, remembered, EPISODES_PER_FILE)
 
 
 @pytest.fixture
