@@ -1,4 +1,7 @@
-"""Experiments as YAML files. Each overrides what its folder shares, which overrides what all share."""
+"""Experiments as YAML files. Each overrides what its folder shares, which overrides what all share.
+
+A folder's shared file may extend that of another folder: `extends: small_a`.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from typing import Any
 import yaml
 
 SHARED = "shared.yaml"
+EXTENDS = "extends"
 _SECTIONS = ("data", "demonstrations", "policy", "training", "evaluation")
 
 
@@ -74,7 +78,7 @@ def read_experiment(folder: Path, name: str, settings: Sequence[str] = ()) -> Ex
             f"There is no experiment {name!r} in {folder}. There are {', '.join(experiment_names(folder))}."
         )
     merged: dict[str, Any] = {}
-    for path in (folder / SHARED, file.parent / SHARED, file):
+    for path in (folder / SHARED, *_shared_files(folder, file.parent), file):
         if path.is_file():
             merged = _merged(merged, _read(path))
     for setting in settings:
@@ -83,8 +87,34 @@ def read_experiment(folder: Path, name: str, settings: Sequence[str] = ()) -> Ex
     return ExperimentConfig(name, **sections, start_from=merged.get("start_from"))
 
 
+def _shared_files(folder: Path, room: Path) -> list[Path]:
+    """The shared files of a folder of experiments, after those that it extends.
+
+    Raises:
+        ExperimentConfigError: The folder that one extends has no shared file, or extends the first.
+    """
+    files: list[Path] = []
+    path = room / SHARED
+    while path.is_file():
+        files.insert(0, path)
+        name = _content(path).get(EXTENDS)
+        if name is None:
+            break
+        path = folder / str(name) / SHARED
+        if not path.is_file() or path in files:
+            problem = "extends itself" if path in files else "does not exist"
+            raise ExperimentConfigError(f"{files[0]} extends {name!r}: {path} {problem}.")
+    return files
+
+
+def _content(path: Path) -> dict[str, Any]:
+    return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+
+
 def _read(path: Path) -> dict[str, Any]:
-    content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    content = _content(path)
+    if path.name == SHARED:
+        content.pop(EXTENDS, None)
     unknown = set(content) - {*_SECTIONS, "start_from"}
     if unknown:
         raise ExperimentConfigError(
