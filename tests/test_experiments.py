@@ -95,6 +95,26 @@ def test_rows_share_what_their_folders_say(tmp_path):
     assert (config.training, config.data, config.evaluation) == ({"steps": 5}, {"tasks": "4"}, {})
 
 
+def test_a_folder_extends_another(tmp_path):
+    shared = {
+        "": "policy: {seed: 1, dtype: float32}\ntraining: {steps: 5}\n",
+        "one": "policy: {seed: 2}\ndata: {tasks: '4'}\n",
+        "two": "extends: one\ntraining: {steps: 3}\n",
+        "three": "extends: two\npolicy: {method: mcil}\n",
+    }
+    for name, text in shared.items():
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / "shared.yaml").write_text(text)
+    (tmp_path / "three" / "config.yaml").write_text("policy: {method: one_hot}\n")
+    config = read_experiment(tmp_path, "three/config")
+    assert config.policy == {"seed": 2, "dtype": "float32", "method": "one_hot"}
+    assert (config.training, config.data) == ({"steps": 3}, {"tasks": "4"})
+    for name, message in (("three", "extends itself"), ("four", "does not exist")):
+        (tmp_path / "one" / "shared.yaml").write_text(f"extends: {name}\n")
+        with pytest.raises(ExperimentConfigError, match=f"extends '{name}'.*{message}"):
+            read_experiment(tmp_path, "three/config")
+
+
 def test_unknown_rows_and_sections_are_refused(tmp_path):
     with pytest.raises(ExperimentConfigError, match="no experiment 'scenario_c/deltaco'.*scenario_a/deltaco"):
         read_experiment(FOLDER, "scenario_c/deltaco")

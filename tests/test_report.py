@@ -25,7 +25,7 @@ from lerobot_deltaco.evaluation.record import (
     write_record,
 )
 from lerobot_deltaco.reporting.novelty import novelty, scenario_of
-from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS, TITLES, in_order, label_of
+from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS, TITLES, in_order, label_of, paper_result
 from lerobot_deltaco.reporting.report import FILES, write_report
 from lerobot_deltaco.reporting.series import ReportError, counted, find_records, make_report
 from lerobot_deltaco.reporting.statistics import (
@@ -335,9 +335,19 @@ def test_the_authors_numbers():
     assert PAPER_RESULTS["ablations/clip_mlp_1"].rate < PAPER_RESULTS["ablations/clip_mlp_2"].rate
     groups = Counter(name.partition("/")[0] for name in PAPER_RESULTS)
     assert groups == {"scenario_a": 15, "scenario_b": 5, "ambiguity_object": 3, "ablations": 11}
-    assert {*groups, "small_a"} == set(TITLES)
+    assert {*groups, "quick_a", "quick_b", "quick_ambiguity", "small_a"} == set(TITLES)
     assert all(0 < item.sd < item.rate < 1 for item in PAPER_RESULTS.values())
     assert label_of("mine/my_method") == "my method"
+
+
+def test_an_experiment_that_repeats_a_row_of_the_paper_has_its_name_place_and_rate():
+    assert paper_result("quick_a/cosine_loss") == PAPER_RESULTS["ablations/cosine_loss"]
+    assert paper_result("quick_b/deltaco") == PAPER_RESULTS["scenario_b/deltaco"]
+    assert paper_result("quick_a/minilm_l3") is paper_result("small_a/deltaco") is None
+    assert label_of("quick_ambiguity/demo_only") == "demo only"
+    names = ["quick_a/cosine_loss", "quick_a/minilm_l3", "quick_a/bc_z", "quick_a/deltaco", "quick_b/oracle"]
+    in_the_papers_order = [names[3], names[2], names[0], names[1], names[4]]
+    assert sorted(names, key=in_order) == in_the_papers_order
 
 
 # Records
@@ -688,7 +698,7 @@ def test_the_text(runs, tmp_path):
     # Every table is whole.
     for table in re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE):
         assert len({line.count("|") for line in table.splitlines()}) == 1
-    assert set(re.findall(r"!\[.+\]\((.+)\)", text)) == {"curves.png"}
+    assert set(re.findall(r"!\[.+\]\((.+)\)", text)) == {"curves.png", "beside_paper.png"}
 
 
 def test_the_text_says_what_differs_from_the_papers_architecture(tmp_path):
@@ -744,7 +754,7 @@ def test_a_new_report_replaces_the_old_one(runs, tmp_path):
         path.unlink()
     write_report([runs / "scenario_a_deltaco_0"], tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    regular = {"rates.csv", "curves.png", "differences.csv", "novelty.csv", "objects.csv"}
+    regular = {"rates.csv", "curves.png", "beside_paper.png", "differences.csv", "novelty.csv", "objects.csv"}
     assert names == {*FILES, "mine.txt"} - regular
 
 

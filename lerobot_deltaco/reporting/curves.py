@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_deltaco.reporting.paper_results import LEVELS, PAPER_RESULTS, label_of
+from lerobot_deltaco.reporting.paper_results import LEVELS, label_of, paper_result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -109,7 +109,7 @@ def _draw_panel(ax: Axes, curves: Sequence[Curve], authors_levels: bool) -> None
                 curve.steps, mean, line, color=color, marker=marker, markersize=3.5, linewidth=2, label=label
             )
         highest = max(highest, (mean + sd).max())
-        published = PAPER_RESULTS.get(curve.experiment)
+        published = paper_result(curve.experiment)
         if authors_levels and published is not None:
             ax.axhline(published.rate, color=color, linewidth=1, linestyle=_DASHED, alpha=0.8)
             highest, has_levels = max(highest, published.rate), True

@@ -90,6 +90,14 @@ _PERCENT: dict[str, tuple[str, float, float]] = {
     "ablations/film_everything": ("FiLM everything", 22.4, 2.3),
 }
 
+# Experiments at a smaller scale, by what their names begin with, and where the paper's rows are that they repeat.
+_REPEATED: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "quick_a": ("scenario_a", "ablations"),
+        "quick_b": ("scenario_b",),
+        "quick_ambiguity": ("ambiguity_object",),
+    }
+)
 # What experiments whose names begin so have in common.
 TITLES: Mapping[str, str] = MappingProxyType(
     {
@@ -97,6 +105,9 @@ TITLES: Mapping[str, str] = MappingProxyType(
         "scenario_b": "Scenario B: novel colors and shapes",
         "ambiguity_object": "Ambiguity scheme (ii): identical objects",
         "ablations": "Ablations, in scenario A",
+        "quick_a": "Scenario A in 8,000 steps, not the paper's architecture",
+        "quick_b": "Scenario B in 8,000 steps, not the paper's architecture",
+        "quick_ambiguity": "Ambiguity scheme (ii) in 8,000 steps, not the paper's architecture",
         "small_a": "Scenario A at a small scale, not the paper's architecture",
     }
 )
@@ -105,9 +116,14 @@ PAPER_RESULTS: Mapping[str, PaperResult] = MappingProxyType(
 )
 
 
+def paper_result(experiment: str) -> PaperResult | None:
+    """The paper's result of an experiment, or of the one that it repeats at a smaller scale; None without."""
+    return PAPER_RESULTS.get(_paper_row(experiment))
+
+
 def label_of(experiment: str) -> str:
     """What an experiment is called in tables and images: the paper's name for it, else its own."""
-    published = PAPER_RESULTS.get(experiment)
+    published = paper_result(experiment)
     return experiment.rpartition("/")[2].replace("_", " ") if published is None else published.label
 
 
@@ -115,9 +131,17 @@ def in_order(experiment: str) -> tuple[int, str, int, str]:
     """A key that sorts experiments as they stand above, and others after those with which they belong."""
     comparison = experiment.rpartition("/")[0]
     titles, names = list(TITLES), list(PAPER_RESULTS)
+    row = _paper_row(experiment)
     return (
         titles.index(comparison) if comparison in titles else len(titles),
         comparison,
-        names.index(experiment) if experiment in names else len(names),
+        names.index(row) if row in names else len(names),
         experiment,
     )
+
+
+def _paper_row(experiment: str) -> str:
+    """The experiment's name among the paper's rows, if it repeats one; else its own name."""
+    comparison, _, name = experiment.rpartition("/")
+    rows = (f"{folder}/{name}" for folder in _REPEATED.get(comparison, ()))
+    return next((row for row in rows if row in PAPER_RESULTS), experiment)

@@ -12,6 +12,7 @@ from typing import Any
 
 from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.object_sets import find_label
+from lerobot_deltaco.reporting.beside_paper import PaperComparison, draw_beside_paper
 from lerobot_deltaco.reporting.curves import Curve, draw_curves
 from lerobot_deltaco.reporting.novelty import (
     DESCRIPTIONS,
@@ -25,9 +26,9 @@ from lerobot_deltaco.reporting.paper_results import (
     LEVELS,
     NOTE,
     PAPER_OPTIONS,
-    PAPER_RESULTS,
     TITLES,
     label_of,
+    paper_result,
 )
 from lerobot_deltaco.reporting.series import Report, Series, counted, find_records, make_report
 from lerobot_deltaco.reporting.statistics import (
@@ -48,8 +49,10 @@ from lerobot_deltaco.reporting.task_bootstrap import Estimate, mean_rate, paired
 
 REPORT_FILE = "report.md"
 CURVES_IMAGE = "curves.png"
+BESIDE_PAPER_IMAGE = "beside_paper.png"
 FILES = (
     CURVES_IMAGE,
+    BESIDE_PAPER_IMAGE,
     "curves.csv",
     "rates.csv",
     "breakdown.csv",
@@ -99,11 +102,31 @@ def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = Fals
             for name, group in report.comparisons.items()
         ]
         contents[CURVES_IMAGE] = draw_curves(panels, authors_levels)
+        compared = _beside_paper(report)
+        if compared:
+            contents[BESIDE_PAPER_IMAGE] = draw_beside_paper(compared)
     if report.counterfactual:
         contents["counterfactual.csv"] = _csv(_counterfactual_rows(report))
     contents[REPORT_FILE] = _markdown(report).encode()
     _write_files(out, contents)
     return report
+
+
+def _beside_paper(report: Report) -> list[tuple[str, list[PaperComparison]]]:
+    """Titles and rows of the comparisons that have rows of the paper."""
+    panels = []
+    for name, group in report.comparisons.items():
+        rows = [
+            PaperComparison(
+                label_of(series.experiment),
+                mean_rate(series.last_task_rates),
+                paper_result(series.experiment),
+            )
+            for series in group
+        ]
+        if any(row.published is not None for row in rows):
+            panels.append((_title(name), rows))
+    return panels
 
 
 # The CSV files. Rates are shares, 0..1.
@@ -113,7 +136,7 @@ def _rate_rows(report: Report) -> list[dict[str, Any]]:
     rows = []
     for series in report.regular:
         paper, last = paper_rate(series.rates), series.last
-        published = PAPER_RESULTS.get(series.experiment)
+        published = paper_result(series.experiment)
         rows.append(
             {
                 "experiment": series.experiment,
@@ -286,6 +309,13 @@ def _markdown(report: Report) -> str:
             f"![Success rates over training steps]({CURVES_IMAGE})\n\n"
             "Lines are means over seeds, bands one standard deviation to both sides. Nothing is smoothed.\n"
         )
+        if _beside_paper(report):
+            sections.append(
+                "## Beside the paper\n\n"
+                f"![Success rates and the paper's]({BESIDE_PAPER_IMAGE})\n\n"
+                "Ours are of the last step, with intervals of 95 % by bootstrap over tasks; the authors' are "
+                f"with their standard deviation over seeds, and {NOTE}: compare the order, not the values.\n"
+            )
     if report.counterfactual:
         sections.append(_counterfactual_section(report.counterfactual))
     notes = [f"- {note}" for note in report.notes] or ["Nothing."]
@@ -445,7 +475,7 @@ def _success_and_object(outcomes: Mapping[str, Proportion]) -> str:
 
 
 def _rate_cells(series: Series) -> list[str]:
-    paper, published = paper_rate(series.rates), PAPER_RESULTS.get(series.experiment)
+    paper, published = paper_rate(series.rates), paper_result(series.experiment)
     return [
         label_of(series.experiment),
         ", ".join(map(str, series.seeds)),
