@@ -335,17 +335,17 @@ def test_the_authors_numbers():
     assert PAPER_RESULTS["ablations/clip_mlp_1"].rate < PAPER_RESULTS["ablations/clip_mlp_2"].rate
     groups = Counter(name.partition("/")[0] for name in PAPER_RESULTS)
     assert groups == {"scenario_a": 15, "scenario_b": 5, "ambiguity_object": 3, "ablations": 11}
-    assert {*groups, "quick_a", "quick_b", "quick_ambiguity", "small_a"} == set(TITLES)
+    assert {*groups, "small_a", "small_b", "small_ambiguity"} == set(TITLES)
     assert all(0 < item.sd < item.rate < 1 for item in PAPER_RESULTS.values())
     assert label_of("mine/my_method") == "my method"
 
 
 def test_an_experiment_that_repeats_a_row_of_the_paper_has_its_name_place_and_rate():
-    assert paper_result("quick_a/cosine_loss") == PAPER_RESULTS["ablations/cosine_loss"]
-    assert paper_result("quick_b/deltaco") == PAPER_RESULTS["scenario_b/deltaco"]
-    assert paper_result("quick_a/minilm_l3") is paper_result("small_a/deltaco") is None
-    assert label_of("quick_ambiguity/demo_only") == "demo only"
-    names = ["quick_a/cosine_loss", "quick_a/minilm_l3", "quick_a/bc_z", "quick_a/deltaco", "quick_b/oracle"]
+    assert paper_result("small_a/cosine_loss") == PAPER_RESULTS["ablations/cosine_loss"]
+    assert paper_result("small_b/deltaco") == PAPER_RESULTS["scenario_b/deltaco"]
+    assert paper_result("small_a/minilm_l3") is None
+    assert label_of("small_ambiguity/demo_only") == "demo only"
+    names = ["small_a/cosine_loss", "small_a/minilm_l3", "small_a/bc_z", "small_a/deltaco", "small_b/oracle"]
     in_the_papers_order = [names[3], names[2], names[0], names[1], names[4]]
     assert sorted(names, key=in_order) == in_the_papers_order
 

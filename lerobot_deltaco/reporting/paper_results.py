@@ -93,9 +93,9 @@ _PERCENT: dict[str, tuple[str, float, float]] = {
 # Experiments at a smaller scale, by what their names begin with, and where the rows stand that they repeat.
 _REPEATED: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "quick_a": ("scenario_a", "ablations"),
-        "quick_b": ("scenario_b",),
-        "quick_ambiguity": ("ambiguity_object",),
+        "small_a": ("scenario_a", "ablations"),
+        "small_b": ("scenario_b",),
+        "small_ambiguity": ("ambiguity_object",),
     }
 )
 # What experiments whose names begin so have in common.
@@ -105,10 +105,9 @@ TITLES: Mapping[str, str] = MappingProxyType(
         "scenario_b": "Scenario B: novel colors and shapes",
         "ambiguity_object": "Ambiguity scheme (ii): identical objects",
         "ablations": "Ablations, in scenario A",
-        "quick_a": "Scenario A in 8,000 steps, not the paper's architecture",
-        "quick_b": "Scenario B in 8,000 steps, not the paper's architecture",
-        "quick_ambiguity": "Ambiguity scheme (ii) in 8,000 steps, not the paper's architecture",
         "small_a": "Scenario A at a small scale, not the paper's architecture",
+        "small_b": "Scenario B at a small scale, not the paper's architecture",
+        "small_ambiguity": "Ambiguity scheme (ii) at a small scale, not the paper's architecture",
     }
 )
 PAPER_RESULTS: Mapping[str, PaperResult] = MappingProxyType(
