@@ -1,13 +1,14 @@
 """The committed reports are what the committed records give, and what they compare was measured alike."""
 
-import json
 import shutil
 from collections import defaultdict
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import yaml
 
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.record import read_record
 from lerobot_deltaco.experiments.config import SHARED, experiment_names, read_experiment
 from lerobot_deltaco.reporting.leaderboard import PAGE, ROWS_FILE, LeaderboardError, read_rows, table, updated
@@ -17,8 +18,9 @@ from lerobot_deltaco.reporting.series import find_records
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ROOT / "experiments"
 RECORDS = sorted(ROOT.glob("results/*/records"))
-# What an experiment is about. All else is the recipe, which those that are compared share.
-SUBJECT = {"method", "film", "concat", "encoder_loss", "language_encoder", "seed"}
+# What an experiment is about, besides the options that its own file sets. All else is the recipe, which those that
+# are compared share.
+SUBJECT = {"method", "film", "concat", "encoder_loss", "language_encoder", "demo_feature_dim", "seed"}
 
 
 def test_there_are_results():
@@ -37,18 +39,36 @@ def test_the_committed_report_is_what_the_records_give(records, tmp_path):
             assert (committed / path.name).is_file()
 
 
+def own_options(experiment):
+    """The options that an experiment's own file sets: what it is about."""
+    path = EXPERIMENTS / f"{experiment}.yaml"
+    content = yaml.safe_load(path.read_text()) if path.is_file() else {}
+    return set(content.get("policy", {}))
+
+
 @pytest.mark.parametrize("records", RECORDS, ids=lambda path: path.parent.name)
 def test_records_that_are_compared_are_of_one_recipe(records):
-    recipes = defaultdict(set)
+    defaults = {field.name: field.default for field in fields(DeltacoConfig)}
+    recipes = defaultdict(list)
     for path in find_records([records]):
         record = read_record(path)
-        recipe = {name: value for name, value in record.policy.items() if name not in SUBJECT}
         # Policies of other types share no recipe.
-        recipe = {} if "type" in record.policy else recipe
-        shared = json.dumps([recipe, record.versions], sort_keys=True)
-        recipes[record.experiment.rpartition("/")[0]].add(shared)
+        recipe = {} if "type" in record.policy else record.policy
+        about = SUBJECT | own_options(record.experiment)
+        versions = {name: version for name, version in record.versions.items() if name != "language_encoder"}
+        recipes[record.experiment.rpartition("/")[0]].append((recipe, about, versions))
     assert recipes
-    assert all(len(different) == 1 for different in recipes.values())
+    for compared in recipes.values():
+        reference, _, versions = compared[0]
+        for recipe, about, others in compared:
+            assert others == versions
+            # Options that are newer than a record had their default.
+            differing = {
+                name
+                for name in {*recipe, *reference}
+                if recipe.get(name, defaults[name]) != reference.get(name, defaults[name])
+            }
+            assert differing <= about | compared[0][1]
 
 
 @pytest.mark.parametrize("name", experiment_names(EXPERIMENTS))
