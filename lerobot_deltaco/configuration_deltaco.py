@@ -70,6 +70,7 @@ BACKBONES = MappingProxyType(
 CORRESPONDENCE = "correspondence"
 DEMO_ENCODERS = ("cnn", "attention", CORRESPONDENCE, "pretrained")
 GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
+MODALITIES = ("demo", "instruction")
 DEMO_CROPS = ("array", "frame")
 FRAMES_BETWEEN = ("spread", "any")
 INITIAL_WEIGHTS = ("authors", "torch")
@@ -105,6 +106,8 @@ RANGES = MappingProxyType(
         "depth_noise": (0, 10),
         "depth_margin": (-10, 10),
         "locator_share": (1e-6, 1),
+        "demo_dropout": (0, 1),
+        "instruction_dropout": (0, 1),
         "recolor_share": (0, 1),
         "frames_after_release": (0, 1_000_000),
         "demos_per_task": (0, 10_000),
@@ -203,6 +206,11 @@ class DeltacoConfig(PreTrainedConfig):
             goes too low may touch the table.
         depth_noise: Standard deviation of the noise on depths in training, in standard deviations of depths.
         locator_share: Share of each batch's samples on which the policy learns to find goals.
+        demo_dropout: Share of the samples for finding goals that have no demonstration in training, with
+            `method=deltaco` and `demo_encoder=correspondence`. A policy that has learned without can do
+            without (`leave_out`).
+        instruction_dropout: The same for the instruction; no sample is without both.
+        leave_out: Modality that is left out in evaluation: demo or instruction; None for none.
         recolor_share: Share of training samples in which one random change of hue, saturation and brightness
             is applied to the observation and the demonstration alike, with `demo_encoder=correspondence`.
         color_blind_tasks: Regular expression that is found in the instructions of tasks in which color does
@@ -282,6 +290,9 @@ class DeltacoConfig(PreTrainedConfig):
     depth_noise: float = 0.1
     depth_margin: float = 0.0
     locator_share: float = 0.25
+    demo_dropout: float = 0.0
+    instruction_dropout: float = 0.0
+    leave_out: str | None = None
     recolor_share: float = 0.0
     color_blind_tasks: str | None = None
     frames_after_release: int | None = None
@@ -347,6 +358,8 @@ class DeltacoConfig(PreTrainedConfig):
         check_choices(
             self, **{name: ablations[name] for name in ablations if getattr(self, name) is not None}
         )
+        if self.leave_out is not None:
+            check_choices(self, leave_out=MODALITIES)
         if self.gripper_weight is None:
             self.gripper_weight = GRIPPER_LOSSES[self.gripper_loss]
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
@@ -372,6 +385,7 @@ class DeltacoConfig(PreTrainedConfig):
             )
         self._check_upsampling()
         self._check_conditioning()
+        self._check_dropout()
         self._check_pretrained()
 
     def _check_upsampling(self) -> None:
@@ -390,6 +404,25 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 "`upsampled_tasks` get a share of the tasks of a batch: `tasks_per_batch` must be at least "
                 f"2. Got {self.tasks_per_batch}."
+            )
+
+    def _check_dropout(self) -> None:
+        dropouts = {"demo": self.demo_dropout, "instruction": self.instruction_dropout}
+        if any(dropouts.values()) and not (self.locates_goals and self.method == "deltaco"):
+            raise ValueError(
+                "`demo_dropout` and `instruction_dropout` need `method=deltaco` and "
+                f"`demo_encoder={CORRESPONDENCE}`. Set them to 0, or choose these. Got {self.method!r} and "
+                f"{self.demo_encoder!r}."
+            )
+        if sum(dropouts.values()) >= 1:
+            raise ValueError(
+                "`demo_dropout` and `instruction_dropout` must sum to less than 1, so that some samples have "
+                f"both. Got {self.demo_dropout} and {self.instruction_dropout}."
+            )
+        if self.leave_out is not None and not dropouts[self.leave_out]:
+            raise ValueError(
+                f"`leave_out` is {self.leave_out!r}, but this policy was not trained without it: "
+                f"`{self.leave_out}_dropout` is 0. Leave `leave_out` away, or train with a dropout."
             )
 
     def _check_pretrained(self) -> None:
@@ -451,6 +484,11 @@ class DeltacoConfig(PreTrainedConfig):
     def locates_goals(self) -> bool:
         """Whether the policy is given places in the image as goals, which a locator finds."""
         return self.demo_encoder == CORRESPONDENCE
+
+    @property
+    def takes_either_modality(self) -> bool:
+        """Whether the policy has learned to do without a demonstration, or without an instruction."""
+        return self.demo_dropout > 0 or self.instruction_dropout > 0
 
     @property
     def n_goals(self) -> int:

@@ -29,6 +29,7 @@ from lerobot_deltaco.network_factory import (
     make_language_head,
     make_policy_network,
 )
+from lerobot_deltaco.policy.correspondence import Given
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, crop_array
 from lerobot_deltaco.policy.demonstration_choice import (
     choose_episode,
@@ -45,7 +46,7 @@ from lerobot_deltaco.policy.demonstrations import (
 )
 from lerobot_deltaco.policy.finite_loss import FiniteLoss, check_weights_to_save, non_finite_weight
 from lerobot_deltaco.policy.goal_conditioning import Demonstrations, FoundGoals
-from lerobot_deltaco.policy.goal_training import GoalBatch, GoalTrainer
+from lerobot_deltaco.policy.goal_training import GoalBatch, GoalTrainer, draw_given
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.initial_weights import initialize_demo_encoder, initialize_policy
 from lerobot_deltaco.policy.keyframes import find_keyframes
@@ -329,7 +330,10 @@ class DeltacoPolicy(PreTrainedPolicy):
             generator: Source of the draws, on the CPU.
         """
         assert self.goal_trainer is not None
-        config, here = self.config, some.to(rows.device)
+        config, here, given = self.config, some.to(rows.device), None
+        if config.takes_either_modality:
+            drawn = draw_given(len(some), config.demo_dropout, config.instruction_dropout, generator)
+            given = Given(*(part.to(rows.device) for part in drawn))
         with self._autocast(rows.device):
             chosen = GoalBatch(
                 batch["episode_index"][here],
@@ -337,6 +341,7 @@ class DeltacoPolicy(PreTrainedPolicy):
                 [tasks[sample] for sample in some.tolist()],
                 self._goal_condition([instructions[sample] for sample in some.tolist()]),
                 recolorings[some],
+                given,
             )
             return self.goal_trainer.losses(
                 chosen, config.uses_demo, config.demo_crop_padding, config.color_blind_tasks, generator
@@ -351,8 +356,8 @@ class DeltacoPolicy(PreTrainedPolicy):
     def _find_goals(self, scenes: Tensor, tasks: Sequence[str], trials: Sequence[int]) -> FoundGoals:
         """Finds the goals of tasks in scenes (batch, 3, H, W), by the demonstrations of these trials."""
         assert self.goals is not None
-        chosen = None
-        if self.config.uses_demo:
+        chosen, left_out = None, self.config.leave_out
+        if self.config.uses_demo and left_out != "demo":
             n_each = self.config.n_demonstrations
             ends, depths = [], []
             for number in range(n_each):
@@ -363,7 +368,8 @@ class DeltacoPolicy(PreTrainedPolicy):
             chosen = Demonstrations(
                 torch.stack(ends, dim=1).to(scenes.device), torch.stack(depths, dim=1).to(scenes.device)
             )
-        return self.goals.find(scenes, chosen, self._goal_condition(tasks))
+        condition = None if left_out == "instruction" else self._goal_condition(tasks)
+        return self.goals.find(scenes, chosen, condition)
 
     def _demonstrated_depths(self, demonstrations: DemonstrationSet, rows: Tensor) -> Tensor:
         """Depths of the grasps of demonstrations, (batch,); NaN where they are not known."""

@@ -65,7 +65,9 @@ def make_goal_conditioning(config: DeltacoConfig) -> GoalConditioning | None:
     condition_dim = len(config.one_hot_tasks) if config.method == "one_hot" else 0
     if config.uses_language:
         condition_dim = config.embedding_dim
-    locator = GoalLocator(*GOAL_SOURCES[config.method], condition_dim)
+    locator = GoalLocator(
+        *GOAL_SOURCES[config.method], condition_dim, takes_either=config.takes_either_modality
+    )
     return GoalConditioning(
         locator, _state_dim(config), condition_dim, config.grasp_depth, config.depth_margin
     )

@@ -77,7 +77,7 @@ def write_dataset(root, episodes):
         for step in range(LENGTH):
             dataset.add_frame(
                 {
-                    "observation.images.top": np.full((20, 28, 3), 10 * number + step, np.uint8),
+                    "observation.images.top": np.full((20, 28, 3), (10 * number + step) % 256, np.uint8),
                     "observation.images.wrist": rng.integers(0, 255, (24, 24, 3), dtype=np.uint8),
                     "observation.state": rng.normal(size=2).astype(np.float32),
                     "action": np.array([rng.uniform(-5, 5), step % 2, rng.uniform(100, 200)], np.float32),

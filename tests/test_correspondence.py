@@ -333,27 +333,91 @@ def test_frames_until_the_release_are_those_that_are_trained_on(dataset):
     assert (use == [True] * 6 + [False]).all()
 
 
-def test_it_learns_to_find_what_a_demonstration_moved(dataset, episodes):
+LEARNS_TO_FIND = {
+    **CORRESPONDENCE,
+    "locator_share": 1.0,
+    "demo_crop_padding": 1,
+    "crop_padding": 0,
+    "recolor_share": 0.5,
+}
+
+
+def trained_to_find(dataset, n_steps, **options):
+    """A policy that has learned, on 40 of the 60 episodes, to find goals."""
     torch.manual_seed(0)
-    policy, before, _ = small_policy(
-        dataset, **CORRESPONDENCE, locator_share=1.0, demo_crop_padding=1, crop_padding=0, recolor_share=0.5
-    )
+    policy, before, _ = small_policy(dataset, **LEARNS_TO_FIND, **options)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
     rng = np.random.default_rng(0)
-    first_frames = np.arange(40) * LENGTH  # of 40 of the 60 episodes
-    for _ in range(60):
+    first_frames = np.arange(40) * LENGTH
+    for _ in range(n_steps):
         loss, _ = policy.forward(before(batch_of(dataset, rng.choice(first_frames, 16).tolist())))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     policy.eval()
     policy.eval_demonstrations = policy.train_demonstrations
+    return policy
+
+
+def share_found(policy, dataset, episodes):
+    """Shares of the grasps and of the releases that are found within 3 px, in the other 20 episodes."""
     held_out = range(40, 60)
     batch = batch_of(dataset, [episode * LENGTH for episode in held_out])
     conditioning = policy.encode_task(tuple(batch["task"]), batch["observation.image"][:, None])
     true = torch.from_numpy(np.stack([np.stack(episodes[n][1::2]) for n in held_out])).float()
     errors = (conditioning.goals.places - true).norm(dim=2) * SIZE / 2
-    assert (errors[:, 0] < 3).float().mean() > 0.85  # the right one of two things, within 3 px
+    return (errors < 3).float().mean(dim=0).tolist()
+
+
+def test_it_learns_to_find_what_a_demonstration_moved(dataset, episodes):
+    policy = trained_to_find(dataset, 60)
+    assert share_found(policy, dataset, episodes)[0] > 0.85  # the right one of two things
+
+
+def test_it_learns_to_do_without_a_demonstration_or_an_instruction(dataset, episodes):
+    policy = trained_to_find(dataset, 150, demo_dropout=0.3, instruction_dropout=0.3)
+    for leave_out in (None, "demo", "instruction"):
+        policy.config.leave_out = leave_out
+        assert share_found(policy, dataset, episodes)[0] > 0.85, leave_out
+
+
+def test_what_is_left_out_does_not_matter(dataset):
+    demos = {"demo_repo_id": "test/table", "demo_root": str(dataset.root)}
+    torch.manual_seed(0)
+    policy, _, _ = small_policy(dataset, **CORRESPONDENCE, **demos, demo_dropout=0.2, instruction_dropout=0.2)
+    policy.forward(batch_of(dataset, [0, LENGTH]))
+    policy.eval()
+    images = batch_of(dataset, [0])["observation.image"][:, None]
+
+    def goals(instruction, leave_out, episode):
+        policy.config.leave_out, policy.config.demo_episode = leave_out, episode
+        return policy.encode_task((instruction,), images).goals
+
+    red, blue = COLORS  # the tasks of the episodes 0 and 1
+    both = goals(red, None, 0)
+    by_demo, by_instruction = goals(red, "instruction", 0), goals(red, "demo", 0)
+    torch.testing.assert_close(by_demo.logits, goals(blue, "instruction", 0).logits)
+    torch.testing.assert_close(by_instruction.logits, goals(red, "demo", 1).logits)
+    assert by_instruction.attention is None
+    assert by_demo.attention is not None
+    # With both, the demonstration alone says what, and the instruction alone where.
+    torch.testing.assert_close(both.logits[:, 1], goals(red, None, 1).logits[:, 1])
+    assert not torch.equal(both.logits[:, 0], goals(red, None, 1).logits[:, 0])
+    assert not torch.equal(both.logits[:, 1], goals(blue, None, 0).logits[:, 1])
+
+
+def test_without_a_demonstration_none_is_needed(dataset, tmp_path):
+    policy, before, _ = small_policy(dataset, **CORRESPONDENCE, demo_dropout=0.5)
+    policy.forward(before(batch_of(dataset, [0, LENGTH])))
+    policy.save_pretrained(tmp_path / "saved")
+    loaded = DeltacoPolicy.from_pretrained(tmp_path / "saved").eval()
+    batch = before(batch_of(dataset, [0]))
+    observation = {name: batch[name] for name in ("observation.image", "observation.state", "task")}
+    with pytest.raises(ValueError, match="demonstration"):
+        loaded.select_action(observation)
+    loaded.config.leave_out = "demo"
+    loaded.reset()
+    assert loaded.select_action(observation).shape == (1, 3)
 
 
 @pytest.mark.parametrize("method", ["deltaco", "demo_only", "language_only", "one_hot"])
@@ -467,6 +531,10 @@ def test_several_demonstrations_are_combined(dataset):
         ({"color_blind_tasks": "("}, "`color_blind_tasks` must be a regular expression"),
         ({"depth_margin": float("nan")}, "`depth_margin` must be a finite number"),
         ({"frames_after_release": -1}, "`frames_after_release` must be at least 0"),
+        ({"demo_dropout": 0.1, "method": "demo_only"}, "`demo_dropout` and .* need `method=deltaco`"),
+        ({"demo_dropout": 0.5, "instruction_dropout": 0.5}, "must sum to less than 1"),
+        ({"leave_out": "demo", "instruction_dropout": 0.5}, "`demo_dropout` is 0"),
+        ({"leave_out": "language", "demo_dropout": 0.5}, "`leave_out` must be one of demo, instruction"),
     ],
 )
 def test_what_cannot_be_is_refused(options, message):

@@ -18,8 +18,8 @@ from lerobot_deltaco.reporting.series import find_records
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ROOT / "experiments"
 RECORDS = sorted(ROOT.glob("results/*/records"))
-# What an experiment is about, besides the options that its own file sets. All else is the recipe, which those that
-# are compared share.
+# What an experiment is about, besides the options that its own file sets. All else is the recipe, which those
+# that are compared share.
 SUBJECT = {"method", "film", "concat", "encoder_loss", "language_encoder", "demo_feature_dim", "seed"}
 
 

@@ -54,8 +54,9 @@ class StateToImage(nn.Module):
         """
         if len(states) < MIN_EPISODES:
             raise ValueError(
-                f"Learning where grasps are in the image takes at least {MIN_EPISODES} episodes in which the "
-                f"gripper closes and opens. Got {len(states)}."
+                "With `demo_encoder=correspondence`, the policy learns where grasps are in the image from at "
+                f"least {MIN_EPISODES} episodes in which the gripper closes and opens. Got {len(states)}. "
+                "Collect more, or choose another `demo_encoder`, such as 'attention'."
             )
         states = states.float()
         mean, std = states.mean(dim=0), states.std(dim=0)

@@ -51,6 +51,18 @@ class Description(NamedTuple):
     attention: Tensor
 
 
+class Given(NamedTuple):
+    """What is given of each task, for a locator that takes either: at least one of both.
+
+    Attributes:
+        demo: Whether there is a demonstration, (batch,) bool.
+        condition: Whether there is a condition, (batch,) bool.
+    """
+
+    demo: Tensor
+    condition: Tensor
+
+
 class Located(NamedTuple):
     """Where the goals of scenes may be.
 
@@ -76,6 +88,8 @@ class GoalLocator(nn.Module):
         descriptor_dim: Size of a descriptor.
         bottleneck: Number of values through which the condition weighs a descriptor.
         condition_noise: Standard deviation of the noise on each number of the condition in training.
+        takes_either: Whether a demonstration, a condition, or both describe the task. With both, the
+            demonstration says what to grasp, and the condition where to release it.
     """
 
     def __init__(
@@ -87,9 +101,13 @@ class GoalLocator(nn.Module):
         descriptor_dim: int = 64,
         bottleneck: int = 3,
         condition_noise: float = 0.02,
+        takes_either: bool = False,
     ) -> None:
         super().__init__()
+        if takes_either and (grasp_source, release_source) != ("demo", "condition"):
+            raise ValueError("A locator that takes either has the sources 'demo' and 'condition'.")
         self.grasp_source, self.release_source = grasp_source, release_source
+        self.takes_either = takes_either
         self.condition_noise, self.descriptor_dim = condition_noise, descriptor_dim
         self.trunk = _Trunk(channels, descriptor_dim)
         self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
@@ -98,25 +116,34 @@ class GoalLocator(nn.Module):
                 _convolution(6, 32, 5, 2), _convolution(32, 32), _convolution(32, 32), nn.Conv2d(32, 2, 1)
             )
         self.weigh: nn.Module | None = None
-        if grasp_source == "condition":
+        if grasp_source == "condition" or takes_either:
             self.describe_condition = nn.Sequential(
                 nn.Linear(condition_dim, 64), nn.ReLU(inplace=True), nn.Linear(64, descriptor_dim)
             )
-        elif condition_dim:
+        if grasp_source == "demo" and condition_dim:
             self.weigh = nn.Sequential(
                 nn.Linear(condition_dim, bottleneck), nn.Tanh(), nn.Linear(bottleneck, descriptor_dim)
             )
-        self.release = ReleaseNetwork(condition_dim if release_source == "condition" else descriptor_dim + 2)
+        target_dim = descriptor_dim + 2
+        if takes_either:
+            self.release = ReleaseNetwork(condition_dim + target_dim)
+        else:
+            self.release = ReleaseNetwork(condition_dim if release_source == "condition" else target_dim)
 
     def describe(self, frames: Tensor) -> Description:
         """Describes demonstrations, from their first and last images (batch, 2, 3, H, W) in 0..1."""
         weights = spatial_weights(self.attend(_channels_last(frames.flatten(1, 2))))  # (batch, 2, h, w)
         moved = (self.trunk(frames[:, 0]) * weights[:, :1]).sum(dim=(2, 3))  # (batch, descriptor_dim)
-        if self.release_source != "demo":
+        if self.release_source != "demo" and not self.takes_either:
             return Description(moved, None, weights)
         container = (self.trunk(frames[:, -1]) * weights[:, 1:]).sum(dim=(2, 3))
         place = torch.cat(mean_position(weights[:, 1:]), dim=1)  # (batch, 2)
         return Description(moved, torch.cat([container, place], dim=1), weights)
+
+    def no_description(self, n_tasks: int, device: torch.device) -> Description:
+        """What stands for the descriptions of tasks without demonstrations: zeros."""
+        zeros = torch.zeros(n_tasks, self.descriptor_dim + 2, device=device)
+        return Description(zeros[:, :-2], zeros, zeros[:, :2, None, None])
 
     def forward(
         self,
@@ -125,6 +152,7 @@ class GoalLocator(nn.Module):
         description: Description | None,
         condition: Tensor | None,
         generator: torch.Generator | None = None,
+        given: Given | None = None,
     ) -> Located:
         """Finds the goals.
 
@@ -135,6 +163,7 @@ class GoalLocator(nn.Module):
             description: Description of the demonstrations; None without them.
             condition: (batch, condition_dim); None if there is none.
             generator: Source of the noise in training, on the CPU.
+            given: What is given of each task, if the locator takes either; it ignores the rest.
         """
         if self.training and condition is not None:
             noise = torch.randn(condition.shape, generator=generator).to(condition)
@@ -147,11 +176,23 @@ class GoalLocator(nn.Module):
             descriptor = description.moved
             if self.weigh is not None:
                 gate = 2 * torch.sigmoid(self.weigh(condition).float())  # (batch, descriptor_dim)
+                if given is not None:
+                    gate = torch.where((given.demo & given.condition)[:, None], gate, 1.0)
                 descriptor, weighed = descriptor * gate, features * gate[:, :, None, None]
+            if given is not None:
+                named = self.describe_condition(condition).float()
+                descriptor = torch.where(given.demo[:, None], descriptor, named)
         grasp = self.log_scale.exp() * torch.einsum(
             "bchw,bc->bhw", F.normalize(weighed, dim=1), F.normalize(descriptor, dim=1)
         )
-        if self.release_source == "demo":
+        if given is not None:
+            assert condition is not None
+            assert description is not None
+            assert description.target is not None
+            says = given.condition[:, None]
+            target = torch.where(says, 0.0, description.target)
+            condition = torch.cat([torch.where(says, condition.float(), 0.0), target], dim=1)
+        elif self.release_source == "demo":
             assert description is not None
             condition = description.target
         assert condition is not None

@@ -8,7 +8,14 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.policy.correspondence import GOALS, Description, GoalLocator, goal_loss, peak_places
+from lerobot_deltaco.policy.correspondence import (
+    GOALS,
+    Description,
+    Given,
+    GoalLocator,
+    goal_loss,
+    peak_places,
+)
 from lerobot_deltaco.policy.goal_states import GoalStates
 from lerobot_deltaco.policy.grasp_depth import DepthEstimator
 
@@ -76,7 +83,7 @@ class GoalConditioning(nn.Module):
         depth_margin: float = 0.0,
     ) -> None:
         super().__init__()
-        self.locator, self.depth_margin = locator, depth_margin
+        self.locator, self.condition_dim, self.depth_margin = locator, condition_dim, depth_margin
         self.states = GoalStates(state_dim, len(GOALS), has_depth)
         self.depth = None
         if has_depth:
@@ -105,6 +112,7 @@ class GoalConditioning(nn.Module):
         demonstrations: Demonstrations | None,
         condition: Tensor | None,
         generator: torch.Generator,
+        given: Given | None = None,
     ) -> Tensor:
         """How well the goals are found: losses of the grasp, the release, the depth and the attention.
 
@@ -119,6 +127,7 @@ class GoalConditioning(nn.Module):
             demonstrations: One demonstration of each task; None if the locator takes none.
             condition: Embeddings of the instructions, or one-hot tasks; None if the locator takes none.
             generator: Source of the noise, on the CPU.
+            given: What is given of each task; None for all that the locator takes.
 
         Returns:
             (batch, 4); 0 for what there is not.
@@ -131,7 +140,12 @@ class GoalConditioning(nn.Module):
             demonstrated, descriptors = demonstrations.depths[:, 0], description.moved
             log_attention = description.attention.clamp_min(_LEAST_ATTENTION).log()
             attention_losses = goal_loss(log_attention, demonstrations.places[:, 0]).sum(dim=1)
-        located = self.locator(scenes, plain_scenes, description, condition, generator)
+        if given is not None:
+            assert condition is not None
+            assert demonstrated is not None
+            demonstrated = torch.where(given.demo, demonstrated, torch.nan)
+            condition = torch.where(given.condition[:, None], condition, 0.0)
+        located = self.locator(scenes, plain_scenes, description, condition, generator, given)
         if self.depth is not None:
             assert depths is not None
             depth_losses = self.depth.losses(
@@ -148,10 +162,11 @@ class GoalConditioning(nn.Module):
 
         Args:
             scenes: First images of episodes, (batch, 3, H, W) in 0..1.
-            demonstrations: Demonstrations of each task; None if the locator takes none.
-            condition: Embeddings of the instructions, or one-hot tasks; None if the locator takes none.
+            demonstrations: Demonstrations of each task; None if the locator takes none, or takes either.
+            condition: Embeddings of the instructions, or one-hot tasks; None if the locator takes none, or
+                takes either.
         """
-        description = demonstrated = None
+        description = demonstrated = given = None
         if demonstrations is not None:
             n_each = demonstrations.ends.shape[1]
             each = self.locator.describe(demonstrations.ends.flatten(0, 1))
@@ -161,7 +176,15 @@ class GoalConditioning(nn.Module):
                 target = target.unflatten(0, (-1, n_each)).mean(dim=1)
             description = Description(moved, target, each.attention[::n_each])
             demonstrated = demonstrations.depths.nanmean(dim=1)
-        located = self.locator(scenes, scenes, description, condition)
+        if self.locator.takes_either:
+            everything = torch.ones(len(scenes), dtype=torch.bool, device=scenes.device)
+            given = Given(everything & (description is not None), everything & (condition is not None))
+            if condition is None:
+                condition = torch.zeros(len(scenes), self.condition_dim, device=scenes.device)
+            if description is None:
+                description = self.locator.no_description(len(scenes), scenes.device)
+                demonstrated = torch.full((len(scenes),), torch.nan, device=scenes.device)
+        located = self.locator(scenes, scenes, description, condition, given=given)
         places, depths = peak_places(located.logits), None
         if self.depth is not None:
             descriptors = None if description is None else description.moved
@@ -169,5 +192,5 @@ class GoalConditioning(nn.Module):
                 located.features, places[:, 0], descriptors, demonstrated, condition, LOOKS_STD
             )
             depths = depths + self.depth_margin
-        attention = None if description is None else description.attention
+        attention = None if demonstrations is None or description is None else description.attention
         return FoundGoals(places, depths, located.logits, attention)

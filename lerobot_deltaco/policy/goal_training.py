@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lerobot_deltaco.policy.calibration import StateToImage
+from lerobot_deltaco.policy.correspondence import Given
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, RobotData
 from lerobot_deltaco.policy.goal_conditioning import Demonstrations, GoalConditioning
 from lerobot_deltaco.policy.keyframes import follows_gripper
@@ -27,6 +28,7 @@ class GoalBatch(NamedTuple):
         tasks: Task string of each sample.
         condition: Embeddings of the instructions, or one-hot tasks, (batch, condition); None without them.
         recolorings: Change of each sample's colors, (batch, 3, 3), on the CPU.
+        given: What is given of each sample's task; None for all that the policy takes.
     """
 
     episodes: Tensor
@@ -34,6 +36,22 @@ class GoalBatch(NamedTuple):
     tasks: Sequence[str]
     condition: Tensor | None
     recolorings: Tensor
+    given: Given | None = None
+
+
+def draw_given(
+    n_samples: int, demo_dropout: float, instruction_dropout: float, generator: torch.Generator
+) -> Given:
+    """Draws what is given of the tasks of samples, on the CPU.
+
+    Args:
+        n_samples: Number of samples.
+        demo_dropout: Share of the samples without a demonstration, 0..1.
+        instruction_dropout: Share of the samples without an instruction, 0..1; none is without both.
+        generator: Source of the draws, on the CPU.
+    """
+    draws = torch.rand(n_samples, generator=generator)
+    return Given(draws >= demo_dropout, draws < 1 - instruction_dropout)
 
 
 class GoalTrainer:
@@ -107,9 +125,12 @@ class GoalTrainer:
         known, own = self._demonstrations, batch.rows
         plain = known.frames[own, 0].float() / 255  # (batch, 3, H, W)
         plain, places = self._shifted(plain, self.goals.places[own], crop_padding, generator)
-        scenes = recolor(plain, batch.recolorings)
-        demonstrations = others = None
+        scenes, demonstrations, others = plain, None, None
         if uses_demonstrations:
+            # By an instruction alone, colors are what they are.
+            scenes = recolor(plain, batch.recolorings)
+            if batch.given is not None:
+                scenes = torch.where(batch.given.demo[:, None, None, None], scenes, plain)
             others = known.sample_other_episodes(batch.episodes, generator, check=False)
             ends = known.frames[others][:, [0, -1]].float() / 255  # (batch, 2, 3, H, W)
             ends, their_places = self._shifted(ends, self.goals.places[others], crop_padding, generator)
@@ -124,7 +145,7 @@ class GoalTrainer:
             demonstrations = Demonstrations(ends[:, None], demonstrated[:, None], their_places[:, None])
         depths = None if self.depths is None else self.depths[own].nan_to_num()
         losses = self._conditioning.losses(
-            scenes, plain, places, depths, demonstrations, batch.condition, generator
+            scenes, plain, places, depths, demonstrations, batch.condition, generator, batch.given
         )
         found = self.goals.found[own] if others is None else self.goals.found[own] & self.goals.found[others]
         return torch.where(found[:, None], losses, 0.0)
