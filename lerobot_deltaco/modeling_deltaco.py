@@ -2,7 +2,6 @@
 
 # No `from __future__ import annotations`: LeRobot's tests expect the annotation of `config` to be a class.
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -14,14 +13,20 @@ from huggingface_hub import ModelCard
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
-from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_transition
 from lerobot.utils.constants import ACTION, OBS_STATE
-from safetensors import safe_open
 from torch import Tensor, nn
 
 from lerobot_deltaco.cards.policy_card import policy_card
+from lerobot_deltaco.checkpoint_files import (
+    check_loaded_weights,
+    check_stored_frames,
+    check_weight_names,
+    demonstrations_to_store,
+    stored_demonstrations,
+    without_sources,
+)
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.data.paraphrases import read_paraphrases
+from lerobot_deltaco.goal_learning import fit_goals, learn_goals
 from lerobot_deltaco.network_factory import (
     make_demo_encoder,
     make_frozen_encoder,
@@ -29,61 +34,53 @@ from lerobot_deltaco.network_factory import (
     make_language_head,
     make_policy_network,
 )
-from lerobot_deltaco.policy.correspondence import Given
-from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, crop_array
+from lerobot_deltaco.policy.actions import join_action, policy_loss
+from lerobot_deltaco.policy.demo_encoders import ArrayEncoder
 from lerobot_deltaco.policy.demonstration_choice import (
     choose_episode,
     choose_eval_demonstrations,
     choose_training_demonstrations,
+    show_goals,
 )
 from lerobot_deltaco.policy.demonstrations import (
     Demonstrated,
     DemonstrationSet,
     RobotData,
-    kept_frame_indices,
-    load_demonstrations,
-    load_robot_data,
 )
-from lerobot_deltaco.policy.finite_loss import FiniteLoss, check_weights_to_save, non_finite_weight
-from lerobot_deltaco.policy.goal_conditioning import Demonstrations, FoundGoals
-from lerobot_deltaco.policy.goal_training import GoalBatch, GoalTrainer, draw_given
+from lerobot_deltaco.policy.finite_loss import FiniteLoss, check_weights_to_save
+from lerobot_deltaco.policy.goal_conditioning import FoundGoals
+from lerobot_deltaco.policy.goal_training import GoalTrainer
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.initial_weights import initialize_demo_encoder, initialize_policy
-from lerobot_deltaco.policy.keyframes import find_keyframes
 from lerobot_deltaco.policy.language import InstructionTable
 from lerobot_deltaco.policy.losses import (
     contrastive_logits,
     contrastive_loss,
     cosine_loss,
-    gripper_loss,
-    mixture_negative_log_likelihood,
 )
 from lerobot_deltaco.policy.memory import keep_freed_memory
-from lerobot_deltaco.policy.networks import random_crop, random_shifts, shift_images
+from lerobot_deltaco.policy.networks import random_crop
 from lerobot_deltaco.policy.paraphrases import Paraphrases
 from lerobot_deltaco.policy.processor_files import check_processor_files
-from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
+from lerobot_deltaco.policy.recoloring import random_recolorings
 from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.step_generator import step_generator
 from lerobot_deltaco.policy.task_conditioning import EpisodeTasks, TaskConditioning
 from lerobot_deltaco.policy.task_file import (
     TASK_FILE,
-    StoredDemonstrations,
     TaskFile,
-    check_demonstrations,
-    check_features,
-    check_grasp_states,
     find_task_file,
     hub_options,
     read_task_file,
     write_task_file,
 )
-from lerobot_deltaco.policy.training_episodes import training_episodes
-
-logger = logging.getLogger(__name__)
-
-# Prefix that the names of the weights of `DeltacoPolicy.model` had in version 0.1.
-OLD_MODEL_PREFIX = "policy."
+from lerobot_deltaco.task_embedding import TaskEmbedder
+from lerobot_deltaco.task_sources import (
+    one_hot_vocabulary,
+    read_eval_demonstrations,
+    read_sentences,
+    read_training_demonstrations,
+)
 
 
 class DeltacoPolicy(PreTrainedPolicy):
@@ -124,23 +121,25 @@ class DeltacoPolicy(PreTrainedPolicy):
         self.instructions = InstructionTable(config.language_encoder)
         if config.instruction_embeddings is not None:
             self.instructions.read(Path(config.instruction_embeddings))
-        self.eval_demonstrations: DemonstrationSet | None = None
         self.train_demonstrations: DemonstrationSet | None = None
         self.goal_trainer: GoalTrainer | None = None
-        self.paraphrases = _read_paraphrases(config)
+        paraphrases = read_sentences(config)
+        self.eval_demonstrations: DemonstrationSet | None = read_eval_demonstrations(config)
         self._train_demonstrations_are_complete = False  # whether they surely include every training episode
         self._demonstrated_as: Mapping[str, str] = {}
         self._episode_tasks = EpisodeTasks()
-        if config.demo_repo_id is not None:
-            self.eval_demonstrations = self._load_eval_demonstrations(config.demo_repo_id, config.demo_root)
         if config.method == "one_hot" and not config.one_hot_tasks:
-            config.one_hot_tasks = self._one_hot_vocabulary()
+            demonstrated = self.eval_demonstrations.rows if self.eval_demonstrations else ()
+            config.one_hot_tasks = one_hot_vocabulary(dataset_meta, demonstrated)
 
         self._frozen = make_frozen_encoder(config)
         self.model = make_policy_network(config)
         self.demo_encoder = make_demo_encoder(config)
         self.goals = make_goal_conditioning(config)
         self.language_head = make_language_head(config)
+        self._embedder = TaskEmbedder(
+            config, self.instructions, paraphrases, self.language_head, self.demo_encoder, self._frozen
+        )
         if config.initial_weights == "authors":
             initialize_policy(self.model)
             if isinstance(self.demo_encoder, ArrayEncoder):
@@ -153,6 +152,15 @@ class DeltacoPolicy(PreTrainedPolicy):
                     network.compile()
         self._folded = FoldedPolicy(self.model)
         self._finite_loss = FiniteLoss()
+
+    @property
+    def paraphrases(self) -> Paraphrases | None:
+        """Sentences in people's own words for task strings; None for the task strings alone."""
+        return self._embedder.paraphrases
+
+    @paraphrases.setter
+    def paraphrases(self, paraphrases: Paraphrases | None) -> None:
+        self._embedder.paraphrases = paraphrases
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """All weights. The language encoder is frozen, and not among them."""
@@ -194,7 +202,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         if self.config.uses_demo:
             demo = self._train_demo_embeddings(batch["episode_index"], tasks, column, generator)
         if self.config.uses_language:
-            known, language = self._language_embeddings(list(distinct), tasks, column, generator)
+            known, language = self._embedder.embed_training_tasks(list(distinct), tasks, column, generator)
 
         if self.config.method == "mcil":
             # The mean of the losses with the instruction's embedding and with the demonstration's.
@@ -216,36 +224,17 @@ class DeltacoPolicy(PreTrainedPolicy):
             loss = loss + self.config.encoder_loss_weight * encoder_loss
             logged["encoder_loss"] = encoder_loss.mean()
             logged["demo_accuracy"] = (logits.argmax(dim=1) == column).float().mean()
+        return self._finished(batch, loss, logged, reduction)
+
+    def _finished(
+        self, batch: dict[str, Any], loss: Tensor, logged: dict[str, Tensor], reduction: str
+    ) -> tuple[Tensor, LoggedScalars]:
+        """What `forward` returns; in training, the step is counted, and its loss kept for a check."""
         if self.training:
             self.step += 1
-            self._finite_loss.remember(loss, self._numbers_of(batch), self.step)
+            names = (ACTION, OBS_STATE) if self.config.robot_state_feature else (ACTION,)
+            self._finite_loss.remember(loss, {name: batch[name] for name in names}, self.step)
         return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
-
-    def _language_embeddings(
-        self, distinct: list[str], tasks: list[str], column: Tensor, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Embeddings of the batch's tasks, (distinct, embedding), and of the samples', (batch, embedding).
-
-        With sentences in people's own words, each sample and each task has one drawn for it.
-        """
-        if self.paraphrases is None or not self.paraphrases.drawn:
-            known = self._embed_instructions(distinct, column.device)
-            return known, known[column]
-        known = self._embed_instructions(self._draw_instructions(distinct, generator), column.device)
-        return known, self._embed_instructions(self._draw_instructions(tasks, generator), column.device)
-
-    def _draw_instructions(self, tasks: Sequence[str], generator: torch.Generator) -> list[str]:
-        """The instruction of each sample: its task string, or a sentence in people's own words."""
-        if self.paraphrases is None or not self.paraphrases.drawn or not self.config.uses_language:
-            return list(tasks)
-        # All at once, the first time.
-        self.instructions.add(self.paraphrases.drawn_sentences)
-        return self.paraphrases.draw(tasks, generator)
-
-    def _embed_instructions(self, instructions: Sequence[str], device: torch.device) -> Tensor:
-        """Embeddings of instructions, (instructions, embedding)."""
-        embeddings = self.instructions(instructions, device, unit=self.config.has_unit_language)
-        return embeddings if self.language_head is None else self.language_head(embeddings)
 
     def _goal_forward(
         self, batch: dict[str, Any], tasks: Sequence[str], generator: torch.Generator, reduction: str
@@ -255,40 +244,40 @@ class DeltacoPolicy(PreTrainedPolicy):
         The policy's network gets the goals of each sample's own episode, with noise; the locator learns, from
         other episodes' demonstrations, to find them. So neither waits for the other.
         """
-        images = self._images(batch)
+        config, images = self.config, self._images(batch)
         n_samples, device = len(images), images.device
-        instructions = self._draw_instructions(tasks, generator)
-        language = self._embed_instructions(instructions, device) if self.config.uses_language else None
+        instructions = self._embedder.draw_instructions(tasks, generator)
+        language = self._embedder.embed_instructions(instructions, device) if config.uses_language else None
         demonstrations = self._training_demonstrations(device)
-        assert self.goals is not None
         assert self.goal_trainer is not None
-        goals = self.goal_trainer.goals
         rows = demonstrations.episode_rows(batch["episode_index"])
-        known = (rows >= 0) & goals.found[rows]
-        places, depths = goals.places[rows], self.goal_trainer.depths  # (batch, 2, 2)
-        if depths is not None:
-            depths = depths[rows].nan_to_num()
-        logged: dict[str, Tensor] = {}
+        places, depths, known = self.goal_trainer.goals_of(rows)
         if self.training:
             if not self._train_demonstrations_are_complete:
                 demonstrations.check_episodes(batch["episode_index"], rows)
-            recolorings = random_recolorings(n_samples, self.config.recolor_share, generator)
-            n_located = max(1, round(self.config.locator_share * n_samples))
-            some = torch.arange(n_located) * n_samples // n_located
-            locator_losses = self._locator_losses(
-                batch, tasks, instructions, rows, some, recolorings, generator
+            recolorings = random_recolorings(n_samples, config.recolor_share, generator)
+            locator_loss = learn_goals(
+                config,
+                self.goal_trainer,
+                self._embedder,
+                batch["episode_index"],
+                rows,
+                tasks,
+                instructions,
+                recolorings,
+                generator,
+                self._autocast(device),
             )
-            places = places + self.config.goal_noise * torch.randn(places.shape, generator=generator).to(
-                device
+            images, places, depths = self.goal_trainer.vary(
+                images,
+                places,
+                depths,
+                recolorings,
+                config.goal_noise,
+                config.depth_noise,
+                config.crop_padding,
+                generator,
             )
-            if depths is not None:
-                noise = torch.randn(depths.shape, generator=generator).to(device)
-                depths = depths + self.config.depth_noise * noise
-            if self.config.crop_padding:
-                shifts = random_shifts(n_samples, self.config.crop_padding, generator)
-                images = shift_images(images, shifts, self.config.crop_padding)
-                places = places + (shifts * 2 / self.config.image_size).to(device)[:, None]
-            images = recolor(images, recolorings)
         elif not known.all():
             # Of episodes that are held back for a validation loss, no goals are known: those that are found
             # in the present image stand in for them.
@@ -297,87 +286,24 @@ class DeltacoPolicy(PreTrainedPolicy):
             if depths is not None and found.depths is not None:
                 depths = torch.where(known, depths, found.depths)
         film, concat = self.conditioning_inputs(tasks, None, language)
-        loss, parts = self._imitation_loss(batch, images, film, concat, places, depths)
-        logged |= parts
+        loss, logged = self._imitation_loss(batch, images, film, concat, places, depths)
         if self.training:
-            share = n_samples / n_located
-            loss = loss.index_add(0, some.to(device), share * locator_losses.sum(dim=1))
-            names = ("grasp_loss", "release_loss", "depth_loss", "attention_loss")
-            logged |= dict(zip(names, locator_losses.mean(dim=0), strict=True))
-            self.step += 1
-            self._finite_loss.remember(loss, self._numbers_of(batch), self.step)
-        return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
-
-    def _locator_losses(
-        self,
-        batch: dict[str, Any],
-        tasks: Sequence[str],
-        instructions: Sequence[str],
-        rows: Tensor,
-        some: Tensor,
-        recolorings: Tensor,
-        generator: torch.Generator,
-    ) -> Tensor:
-        """How well the goals of some samples are found, (some, 4): see `GoalTrainer`.
-
-        Args:
-            batch: As in `forward`.
-            tasks: Task string of each sample.
-            instructions: Instruction of each sample, in whatever words.
-            rows: Rows of the samples' episodes among the demonstrations, (batch,).
-            some: Indices of the samples, on the CPU.
-            recolorings: Changes of the samples' colors, (batch, 3, 3), on the CPU.
-            generator: Source of the draws, on the CPU.
-        """
-        assert self.goal_trainer is not None
-        config, here, given = self.config, some.to(rows.device), None
-        if config.takes_either_modality:
-            drawn = draw_given(len(some), config.demo_dropout, config.instruction_dropout, generator)
-            given = Given(*(part.to(rows.device) for part in drawn))
-        with self._autocast(rows.device):
-            chosen = GoalBatch(
-                batch["episode_index"][here],
-                rows[here],
-                [tasks[sample] for sample in some.tolist()],
-                self._goal_condition([instructions[sample] for sample in some.tolist()]),
-                recolorings[some],
-                given,
-            )
-            return self.goal_trainer.losses(
-                chosen, config.uses_demo, config.demo_crop_padding, config.color_blind_tasks, generator
-            )
-
-    def _goal_condition(self, tasks: Sequence[str]) -> Tensor | None:
-        """The locator's condition for tasks, (tasks, condition)."""
-        if self.config.method == "one_hot":
-            return self._one_hot(tasks)
-        return self._embed_instructions(tasks, self.step.device) if self.config.uses_language else None
+            loss = locator_loss.added_to(loss)
+            logged |= locator_loss.logged()
+        return self._finished(batch, loss, logged, reduction)
 
     def _find_goals(self, scenes: Tensor, tasks: Sequence[str], trials: Sequence[int]) -> FoundGoals:
         """Finds the goals of tasks in scenes (batch, 3, H, W), by the demonstrations of these trials."""
         assert self.goals is not None
-        chosen, left_out = None, self.config.leave_out
-        if self.config.uses_demo and left_out != "demo":
+        shown = condition = None
+        if self.config.uses_demo and self.config.leave_out != "demo":
             n_each = self.config.n_demonstrations
-            ends, depths = [], []
-            for number in range(n_each):
-                turns = [trial * n_each + number for trial in trials]
-                demonstrations, rows = self._choose_eval_demonstrations(tasks, turns)
-                ends.append(demonstrations.frames[rows][:, [0, -1]].float() / 255)
-                depths.append(self._demonstrated_depths(demonstrations, rows))
-            chosen = Demonstrations(
-                torch.stack(ends, dim=1).to(scenes.device), torch.stack(depths, dim=1).to(scenes.device)
-            )
-        condition = None if left_out == "instruction" else self._goal_condition(tasks)
-        return self.goals.find(scenes, chosen, condition)
-
-    def _demonstrated_depths(self, demonstrations: DemonstrationSet, rows: Tensor) -> Tensor:
-        """Depths of the grasps of demonstrations, (batch,); NaN where they are not known."""
-        assert self.goals is not None
-        states = demonstrations.grasp_states
-        if states is None or self.goals.depth is None:
-            return torch.full((len(rows),), torch.nan, device=rows.device)
-        return self.goals.states.depths(states[rows])
+            turns = [[trial * n_each + number for trial in trials] for number in range(n_each)]
+            chosen = [self._choose_eval_demonstrations(tasks, turn) for turn in turns]
+            shown = show_goals(chosen, self.goals, scenes.device)
+        if self.config.leave_out != "instruction":
+            condition = self._embedder.goal_condition(tasks, self.step.device)
+        return self.goals.find(scenes, shown, condition)
 
     def _imitation_loss(
         self,
@@ -390,21 +316,8 @@ class DeltacoPolicy(PreTrainedPolicy):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The policy loss L_pi (equation 2) of each sample, (batch,), and its parts to log."""
         predicted, gripper = self.model(images, film, self._concatenated(batch, concat, goals, depths), goals)
-        action = batch[ACTION].float()
-        motion, target = self._split_action(action)
-        likelihood = mixture_negative_log_likelihood(
-            predicted.means.float(), predicted.logits.float(), self.model.log_std.float(), motion
-        )
-        error = (predicted.mean.float() - motion).square()
-        logged = {"motion_nll": likelihood.mean(), "motion_mse": error.mean()}
-        if gripper is None:
-            return likelihood, logged
-        assert target is not None
-        assert self.config.gripper_weight is not None
-        error = gripper_loss(gripper.float(), target, self.config.gripper_loss)
-        logged["gripper_loss"] = error.mean()
-        logged["gripper_accuracy"] = ((gripper > 0) == (target > 0.5)).float().mean()
-        return likelihood + self.config.gripper_weight * error, logged
+        index, weight, kind = self.config.gripper_index, self.config.gripper_weight, self.config.gripper_loss
+        return policy_loss(predicted, gripper, self.model.log_std, batch[ACTION], index, weight, kind)
 
     def set_train_demonstrations(
         self, demonstrations: DemonstrationSet, robot_data: RobotData | None = None
@@ -422,27 +335,12 @@ class DeltacoPolicy(PreTrainedPolicy):
             self._fit_goals(robot_data)
 
     def _fit_goals(self, robot_data: RobotData) -> None:
-        """Finds the goals of the training episodes, and the robot's states there."""
+        """Finds the goals of the training episodes."""
         assert self.train_demonstrations is not None
         assert self.goals is not None
-        assert self.config.gripper_index is not None
-        self.goal_trainer = GoalTrainer(
-            self.goals,
-            self.train_demonstrations,
-            robot_data,
-            self.config.gripper_index,
-            self._normalize_states,
+        self.goal_trainer = fit_goals(
+            self.config, self.goals, self.train_demonstrations, robot_data, self._stats
         )
-        states, found = self.goal_trainer.goals.states[:, 0], self.goal_trainer.goals.found
-        self.train_demonstrations.grasp_states = torch.where(found[:, None], states, torch.nan)
-
-    def _normalize_states(self, states: Tensor) -> Tensor:
-        """Robot states of the dataset (n, state) as the preprocessor makes them, on the CPU."""
-        normalize = NormalizerProcessorStep(
-            {OBS_STATE: self.config.robot_state_feature}, self.config.normalization_mapping, self._stats
-        )
-        normalized = normalize(create_transition(observation={OBS_STATE: states.cpu()}))
-        return normalized[TransitionKey.OBSERVATION][OBS_STATE]
 
     def _train_demo_embeddings(
         self, episodes: Tensor, tasks: Sequence[str], column: Tensor, generator: torch.Generator
@@ -452,7 +350,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         if not self.training:
             # The episodes of a validation loss may be held back from the demonstrations.
             rows = demonstrations.sample_other_episodes(episodes, generator, tasks=tasks)
-            return self._encode_demo(demonstrations, rows, generator)
+            return self._embedder.embed_demonstrations(demonstrations, rows, generator, self.training)
         rows, which = choose_training_demonstrations(
             demonstrations,
             episodes,
@@ -462,25 +360,15 @@ class DeltacoPolicy(PreTrainedPolicy):
             generator,
             check=not self._train_demonstrations_are_complete,
         )
-        embeddings = self._encode_demo(demonstrations, rows, generator)
+        embeddings = self._embedder.embed_demonstrations(demonstrations, rows, generator, self.training)
         return embeddings if which is None else embeddings[which]
 
     def _training_demonstrations(self, device: torch.device) -> DemonstrationSet:
         if self.train_demonstrations is None:
-            if self._meta is None:
-                raise ValueError(
-                    "A policy is trained with the metadata of its dataset. Pass them as `dataset_meta`."
-                )
-            if self.config.tasks_per_batch:
-                logger.warning(
-                    "`tasks_per_batch` has no effect: this training loop draws samples of any tasks. Train "
-                    "with `deltaco-train`, which takes the same arguments."
-                )
-            chosen = self.config.demo_episodes or training_episodes(self._meta)
-            loaded = self._load_demonstrations(self._meta.repo_id, self._meta.root, chosen)
+            loaded, robot_data = read_training_demonstrations(self.config, self._meta)
             self.train_demonstrations = loaded.to(device)
-            if self.goals is not None:
-                self._fit_goals(load_robot_data(self._meta.repo_id, self._meta.root, chosen))
+            if robot_data is not None:
+                self._fit_goals(robot_data)
         return self.train_demonstrations
 
     # Evaluation
@@ -536,7 +424,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             motion, gripper = task.model(images, task.film, concatenated, places)
         if gripper is not None:
             gripper = torch.sigmoid(gripper.float())
-        return self._join_action(motion.mean.float(), gripper)
+        return join_action(motion.mean.float(), gripper, self.config.gripper_index)
 
     @staticmethod
     def _instructions_of(batch: dict[str, Any]) -> tuple[str, ...]:
@@ -571,9 +459,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         elif self.config.uses_demo:
             demonstrations, rows = self._choose_eval_demonstrations(tasks, trials)
             generator = torch.Generator().manual_seed(self.config.seed)
-            demo = self._encode_demo(demonstrations, rows, generator)
+            demo = self._embedder.embed_demonstrations(demonstrations, rows, generator, self.training)
         if self.config.uses_language:
-            language = self._embed_instructions(tasks, images.device)
+            language = self._embedder.embed_instructions(tasks, images.device)
         if self.config.method == "mcil":
             assert language is not None
             assert demo is not None
@@ -613,11 +501,6 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     # Training and evaluation
 
-    def _numbers_of(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The actions and states of a batch, by name."""
-        names = (ACTION, OBS_STATE) if self.config.robot_state_feature else (ACTION,)
-        return {name: batch[name] for name in names}
-
     def _images(self, batch: dict[str, Any]) -> Tensor:
         """Images of all cameras, that of the demonstrations first, (batch, cameras, 3, size, size)."""
         size = self.config.image_size
@@ -655,131 +538,23 @@ class DeltacoPolicy(PreTrainedPolicy):
             demo: Embeddings of demonstrations, (batch, embedding); None if they are not used.
             language: Embeddings of instructions, (batch, embedding); None if they are not used.
         """
-
-        def source(name: str) -> Tensor | None:
-            if name == "none":
-                return None
-            if name == "one_hot":
-                return self._one_hot(tasks)
-            used = [demo if part == "demo" else language for part in name.split("+")]
-            return torch.cat([embedding for embedding in used if embedding is not None], dim=-1)
-
-        film, concat, _ = self.config.conditioning
-        return source(film), source(concat)
-
-    def _one_hot(self, tasks: Sequence[str]) -> Tensor:
-        unknown = next((task for task in tasks if task not in self.config.one_hot_tasks), None)
-        if unknown is not None:
-            raise ValueError(
-                f"This one-hot policy does not know the task {unknown!r}. It knows the "
-                f"{len(self.config.one_hot_tasks)} tasks of its training and demonstration datasets."
-            )
-        places = {task: n for n, task in enumerate(self.config.one_hot_tasks)}
-        indices = torch.tensor([places[task] for task in tasks], device=self.step.device)
-        return F.one_hot(indices, len(places)).float()
-
-    def _encode_demo(
-        self, demonstrations: DemonstrationSet, rows: Tensor, generator: torch.Generator
-    ) -> Tensor:
-        """Unit embeddings of demonstrations, (batch, embedding)."""
-        assert self.demo_encoder is not None
-        if self._frozen is not None:
-            if self.training:
-                return self.demo_encoder(self._frozen.drawn(demonstrations, rows, generator))
-            return self.demo_encoder(self._frozen.plain(demonstrations, rows))
-        config = self.config
-        frames = demonstrations.sample_frames(
-            rows, config.n_demo_frames, generator, config.demo_frames_between == "spread"
-        )
-        if self.training and config.demo_crop_padding:
-            if config.demo_encoder == "cnn" and config.demo_crop == "array":
-                frames = crop_array(frames, config.demo_rows, config.demo_crop_padding, generator)
-            else:
-                frames = random_crop(frames, config.demo_crop_padding, generator)
-        return self.demo_encoder(frames)
-
-    def _split_action(self, action: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The motion of an action, and its gripper in 0..1 if it has one."""
-        index = self.config.gripper_index
-        if index is None:
-            return action, None
-        motion = torch.cat([action[:, :index], action[:, index + 1 :]], dim=1)
-        return motion, (action[:, index] + 1) / 2
-
-    def _join_action(self, motion: Tensor, gripper: Tensor | None) -> Tensor:
-        """The inverse of `_split_action`."""
-        index = self.config.gripper_index
-        if index is None or gripper is None:
-            return motion
-        return torch.cat([motion[:, :index], 2 * gripper[:, None] - 1, motion[:, index:]], dim=1)
+        return self._embedder.conditioning_inputs(tasks, demo, language, self.step.device)
 
     # Datasets and checkpoints
-
-    def _load_demonstrations(
-        self, repo_id: str, root: str | Path | None, episodes: Sequence[int] | None
-    ) -> DemonstrationSet:
-        camera = self.config.cameras[0]
-        size, n_frames = self.config.image_size, self.config.n_demo_frames
-        return load_demonstrations(repo_id, root, episodes, camera, size, n_frames)
-
-    def _load_eval_demonstrations(self, repo_id: str, root: str | Path | None) -> DemonstrationSet:
-        demonstrations = self._load_demonstrations(repo_id, root, None)
-        index = self.config.gripper_index
-        if self.config.locates_goals and self.config.grasp_depth and index is not None:
-            data = load_robot_data(repo_id, root, demonstrations.episodes.tolist())
-            keyframes = find_keyframes(data.states, data.actions[:, index], data.spans)
-            demonstrations.grasp_states = keyframes.grasp_states
-        return demonstrations
-
-    def _one_hot_vocabulary(self) -> list[str]:
-        """Task strings of the training and demonstration datasets."""
-        if self._meta is None:
-            raise ValueError(
-                "A one-hot policy knows the tasks of its dataset. Pass the metadata as `dataset_meta`."
-            )
-        return list(
-            dict.fromkeys(
-                [
-                    *self._meta.tasks.index,
-                    *(self.eval_demonstrations.rows if self.eval_demonstrations else ()),
-                ]
-            )
-        )
 
     def _save_pretrained(self, save_directory: Path, *args: Any, **kwargs: Any) -> None:
         self._finite_loss.check()
         check_weights_to_save(self, int(self.step))
         # LeRobot 0.6.1 may pass a `state_dict`, later versions do not; it is handed on as it comes.
-        # What was read from these files is saved with the policy, whose next user has other files.
-        sources = (
-            "demo_repo_id",
-            "demo_root",
-            "instruction_embeddings",
-            "instructions",
-            "vision_encoder_weights",
-            "demo_features_dir",
-        )
-        given = {name: getattr(self.config, name) for name in sources}
-        try:
-            for name in sources:
-                setattr(self.config, name, None)
+        with without_sources(self.config):
             super()._save_pretrained(save_directory, *args, **kwargs)
-        finally:
-            for name, value in given.items():
-                setattr(self.config, name, value)
-        if not _is_main_process():
+        if _process_rank() != 0:
             return  # versions after 0.6.1 call this on every process
         contents = self.instructions.contents()
         if self.paraphrases is not None:
             contents = contents._replace(paraphrases=self.paraphrases.known)
-        known = self.eval_demonstrations
-        if known is not None and self.config.uses_demo:
-            # With their features, the frozen encoder is not needed for them.
-            features = None if self._frozen is None else self._frozen.plain(known)
-            frames, episodes = known.frames.cpu(), known.episodes.cpu()
-            stored = StoredDemonstrations(
-                frames, episodes, known.tasks, known.target_objects, features, known.grasp_states
-            )
+        if self.eval_demonstrations is not None and self.config.uses_demo:
+            stored = demonstrations_to_store(self.eval_demonstrations, self._frozen)
             contents = contents._replace(demonstrations=stored)
         write_task_file(save_directory / TASK_FILE, contents)
 
@@ -808,19 +583,7 @@ class DeltacoPolicy(PreTrainedPolicy):
     @classmethod
     def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
         policy = super()._load_as_safetensor(model, model_file, map_location, strict)
-        with safe_open(model_file, framework="pt") as file:
-            stored = set(file.keys())
-        expected = set(policy.state_dict())
-        if stored != expected:
-            missing, unknown = sorted(expected - stored), sorted(stored - expected)
-            raise ValueError(
-                f"{model_file} does not have the weights of this policy: it lacks {missing[:3] or 'none'}, "
-                f"and has the unknown {unknown[:3] or 'none'}. The config.json beside it belongs to other "
-                "weights, or to another version."
-            )
-        name = non_finite_weight(policy)
-        if name is not None:
-            raise ValueError(f"{model_file} is damaged: the weight {name} has numbers that are not finite.")
+        check_loaded_weights(policy, model_file)
         return policy
 
     def load_state_dict(
@@ -831,12 +594,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         Raises:
             ValueError: The weights were saved by a version that named them otherwise.
         """
-        if any(name.startswith(OLD_MODEL_PREFIX) for name in state_dict):
-            raise ValueError(
-                "An earlier version of lerobot_policy_deltaco saved these weights: those of the policy's "
-                f"network are named `{OLD_MODEL_PREFIX}*`. Train the policy again, or rename them in "
-                f"model.safetensors: replace the prefix `{OLD_MODEL_PREFIX}` by `model.`."
-            )
+        check_weight_names(state_dict)
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def generate_model_card(
@@ -862,33 +620,13 @@ class DeltacoPolicy(PreTrainedPolicy):
             self.paraphrases = Paraphrases(contents.paraphrases)
         if contents.demonstrations is None:
             return
-        n_kept = len(kept_frame_indices(0, 0, self.config.n_demo_frames))
-        check_demonstrations(path, contents.demonstrations, self.config.image_size, n_kept)
+        check_stored_frames(contents.demonstrations, path, self.config)
         # Demonstrations named on the command line come before those of the checkpoint.
         if self.eval_demonstrations is None:
-            frames, episodes, tasks, target_objects, features, grasp_states = contents.demonstrations
-            known = DemonstrationSet(frames, tasks, episodes.tolist(), target_objects)
-            if grasp_states is not None and self.config.robot_state_feature is not None:
-                check_grasp_states(path, contents.demonstrations, self.config.robot_state_feature.shape[0])
-                known.grasp_states = grasp_states
-            if features is not None and self._frozen is not None:
-                check_features(path, contents.demonstrations, self.config.demo_feature_dim)
-                known.features = features[:, None].half()
+            known = stored_demonstrations(contents.demonstrations, path, self.config)
             self.eval_demonstrations = known.to(self.config.device)
-
-
-def _read_paraphrases(config: DeltacoConfig) -> Paraphrases | None:
-    if config.instructions is None:
-        return None
-    known = read_paraphrases(config.instructions)
-    drawn = read_paraphrases(config.instructions, config.instructions_split)
-    return Paraphrases(known, drawn, config.instructions_templates)
 
 
 def _process_rank() -> int:
     """Number of this process among those that train together."""
     return torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
-
-
-def _is_main_process() -> bool:
-    return _process_rank() == 0

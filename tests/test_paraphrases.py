@@ -204,7 +204,7 @@ def test_instructions_have_unit_length_unless_they_are_wanted_as_they_are(
 ):
     monkeypatch.setattr("lerobot_deltaco.policy.language.load_language_encoder", longer_encoder)
     policy, before, _ = make(**options)
-    embedded = policy._embed_instructions(TASKS, torch.device("cpu"))
+    embedded = policy._embedder.embed_instructions(TASKS, torch.device("cpu"))
     torch.testing.assert_close(embedded.norm(dim=1), torch.full((3,), float(length)))
     policy(before(batch_of(dataset, [0, 7, 20])))[0].backward()
 
@@ -223,7 +223,7 @@ def test_embeddings_of_the_first_version_stay_of_unit_length(make, monkeypatch, 
         normalize_language=False,
         instruction_embeddings=str(tmp_path / "old.safetensors"),
     )
-    embedded = policy._embed_instructions(TASKS, torch.device("cpu"))
+    embedded = policy._embedder.embed_instructions(TASKS, torch.device("cpu"))
     torch.testing.assert_close(embedded.norm(dim=1), torch.ones(3))
     policy.save_pretrained(tmp_path / "policy")
     loaded = DeltacoPolicy.from_pretrained(tmp_path / "policy")

@@ -20,6 +20,7 @@ from small_policies import (
 from lerobot_deltaco.commands import embed as embed_command
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.actions import join_action
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.step_generator import step_generator
 from lerobot_deltaco.policy.task_file import TaskFileError
@@ -170,9 +171,9 @@ def test_shared_demonstrations_are_encoded_once(make, dataset, monkeypatch):
     policy, before, _ = make(demos_per_task=2)
     encoded = []
     monkeypatch.setattr(
-        policy,
-        "_encode_demo",
-        lambda demonstrations, rows, _: encoded.append(rows) or torch.zeros(len(rows), 384),
+        policy._embedder,
+        "embed_demonstrations",
+        lambda demonstrations, rows, *_: encoded.append(rows) or torch.zeros(len(rows), 384),
     )
     policy(before(batch_of(dataset, [0, 1, 2, 3, 5, 6, 7, 15, 16, 20])))
     assert len(encoded[0]) == 4
@@ -330,7 +331,7 @@ def test_what_acts_is_what_was_trained_last(make, dataset, options):
         conditioning = policy._episode_tasks._conditioning[threading.get_ident()]
         concatenated = policy._concatenated(seen, conditioning.concat)
         motion, gripper = policy.model(policy._images(seen), conditioning.film, concatenated)
-        expected = policy._join_action(motion.mean, gripper.sigmoid())
+        expected = join_action(motion.mean, gripper.sigmoid(), policy.config.gripper_index)
         torch.testing.assert_close(acted[-1], expected, atol=1e-5, rtol=1e-4)
     assert not torch.allclose(acted[1], acted[2], atol=1e-4)
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
+from lerobot_deltaco.policy.goal_conditioning import Demonstrations, GoalConditioning
 
 
 def choose_training_demonstrations(
@@ -99,3 +100,24 @@ def choose_episode(
             f"{demonstrations.episodes.tolist()[:10]} ..."
         )
     return demonstrations, found[:1].expand(n_samples)
+
+
+def show_goals(
+    chosen: Sequence[tuple[DemonstrationSet, Tensor]], goals: GoalConditioning, device: torch.device
+) -> Demonstrations:
+    """What chosen demonstrations show of the goals of their tasks.
+
+    Args:
+        chosen: One or more demonstrations of each sample's task: each time a set, and rows of it, (batch,).
+        goals: Networks that find goals, which know the depths of states at grasps.
+        device: Device of the result.
+    """
+    ends, depths = [], []
+    for demonstrations, rows in chosen:
+        ends.append(demonstrations.frames[rows][:, [0, -1]].float() / 255)  # (batch, 2, 3, H, W)
+        states = demonstrations.grasp_states
+        if states is None or goals.depth is None:
+            depths.append(torch.full((len(rows),), torch.nan, device=rows.device))
+        else:
+            depths.append(goals.states.depths(states[rows]))
+    return Demonstrations(torch.stack(ends, dim=1).to(device), torch.stack(depths, dim=1).to(device))

@@ -101,6 +101,55 @@ class GoalTrainer:
             depths = conditioning.states.depths(self.goals.states[:, 0])
             self.depths = torch.where(self.goals.found, depths, torch.nan)
 
+    def goals_of(self, rows: Tensor) -> tuple[Tensor, Tensor | None, Tensor]:
+        """The goals of episodes.
+
+        Args:
+            rows: Rows of the episodes among the demonstrations, (batch,); -1 for others.
+
+        Returns:
+            Places of the grasp and the release, (batch, 2, 2); depths of the grasps, (batch,), or None
+            without depths; and whether the goals are known, (batch,) bool. Where they are not, the rest does
+            not count.
+        """
+        known = (rows >= 0) & self.goals.found[rows]
+        depths = None if self.depths is None else self.depths[rows].nan_to_num()
+        return self.goals.places[rows], depths, known
+
+    def vary(
+        self,
+        images: Tensor,
+        places: Tensor,
+        depths: Tensor | None,
+        recolorings: Tensor,
+        goal_noise: float,
+        depth_noise: float,
+        crop_padding: int,
+        generator: torch.Generator,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Training samples with noisy goals, as if they had been found, in images that are changed at random.
+
+        Args:
+            images: (batch, cameras, 3, H, W) in 0..1, that of the goals first.
+            places: Places of the goals, (batch, 2, 2) in -1..1.
+            depths: Depths of the grasps, (batch,); None without depths.
+            recolorings: Changes of the samples' colors, (batch, 3, 3), on the CPU.
+            goal_noise: Standard deviation of the noise of places.
+            depth_noise: Standard deviation of the noise of depths.
+            crop_padding: Largest random shift of the images, with their goals, px.
+            generator: Source of the draws, on the CPU.
+
+        Returns:
+            Images, places and depths, in the shapes of the arguments.
+        """
+        device = places.device
+        places = places + goal_noise * torch.randn(places.shape, generator=generator).to(device)
+        if depths is not None:
+            depths = depths + depth_noise * torch.randn(depths.shape, generator=generator).to(device)
+        if crop_padding:
+            images, places = self._shifted(images, places, crop_padding, generator)
+        return recolor(images, recolorings), places, depths
+
     def losses(
         self,
         batch: GoalBatch,

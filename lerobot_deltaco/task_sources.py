@@ -1,0 +1,128 @@
+"""Reads what tells a policy its tasks: the demonstrations and sentences that its configuration names."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.data.paraphrases import read_paraphrases
+from lerobot_deltaco.policy.demonstrations import (
+    DemonstrationSet,
+    RobotData,
+    load_demonstrations,
+    load_robot_data,
+)
+from lerobot_deltaco.policy.keyframes import find_keyframes
+from lerobot_deltaco.policy.paraphrases import Paraphrases
+from lerobot_deltaco.policy.training_episodes import training_episodes
+
+logger = logging.getLogger(__name__)
+
+
+def read_demonstrations(
+    config: DeltacoConfig, repo_id: str, root: str | Path | None, episodes: Sequence[int] | None
+) -> DemonstrationSet:
+    """Demonstrations as a policy sees them.
+
+    Args:
+        config: Configuration of the policy.
+        repo_id: Repository id of the dataset.
+        root: Folder of the dataset; None for LeRobot's cache.
+        episodes: Episodes to read; None for all.
+
+    Raises:
+        FileNotFoundError: There is no network, and no dataset in the folder.
+        ValueError: The dataset has no such camera or episode.
+    """
+    camera = config.cameras[0]
+    return load_demonstrations(repo_id, root, episodes, camera, config.image_size, config.n_demo_frames)
+
+
+def read_training_demonstrations(
+    config: DeltacoConfig, meta: LeRobotDatasetMetadata | None
+) -> tuple[DemonstrationSet, RobotData | None]:
+    """The demonstrations for training, which are episodes of the training dataset.
+
+    Args:
+        config: Configuration of the policy.
+        meta: Metadata of the training dataset.
+
+    Returns:
+        Demonstrations, and the robot's states and actions in them; None unless goals are located.
+
+    Raises:
+        ValueError: There are no metadata.
+    """
+    if meta is None:
+        raise ValueError("A policy is trained with the metadata of its dataset. Pass them as `dataset_meta`.")
+    if config.tasks_per_batch:
+        logger.warning(
+            "`tasks_per_batch` has no effect: this training loop draws samples of any tasks. Train "
+            "with `deltaco-train`, which takes the same arguments."
+        )
+    chosen = config.demo_episodes or training_episodes(meta)
+    demonstrations = read_demonstrations(config, meta.repo_id, meta.root, chosen)
+    data = load_robot_data(meta.repo_id, meta.root, chosen) if config.locates_goals else None
+    return demonstrations, data
+
+
+def read_eval_demonstrations(config: DeltacoConfig) -> DemonstrationSet | None:
+    """The demonstrations for evaluation, with the robot's states at grasps if depths are estimated.
+
+    Args:
+        config: Configuration of the policy.
+
+    Returns:
+        All episodes of the dataset `demo_repo_id`; None if none is named.
+
+    Raises:
+        FileNotFoundError: There is no network, and no dataset in the folder.
+        ValueError: The dataset does not have the camera.
+    """
+    repo_id, root = config.demo_repo_id, config.demo_root
+    if repo_id is None:
+        return None
+    demonstrations = read_demonstrations(config, repo_id, root, None)
+    index = config.gripper_index
+    if config.locates_goals and config.grasp_depth and index is not None:
+        data = load_robot_data(repo_id, root, demonstrations.episodes.tolist())
+        keyframes = find_keyframes(data.states, data.actions[:, index], data.spans)
+        demonstrations.grasp_states = keyframes.grasp_states
+    return demonstrations
+
+
+def read_sentences(config: DeltacoConfig) -> Paraphrases | None:
+    """Sentences in people's own words for task strings; None if `instructions` names none.
+
+    Args:
+        config: Configuration of the policy.
+    """
+    if config.instructions is None:
+        return None
+    known = read_paraphrases(config.instructions)
+    drawn = read_paraphrases(config.instructions, config.instructions_split)
+    return Paraphrases(known, drawn, config.instructions_templates)
+
+
+def one_hot_vocabulary(meta: LeRobotDatasetMetadata | None, demonstrated: Iterable[str]) -> list[str]:
+    """The tasks that a one-hot policy knows.
+
+    Args:
+        meta: Metadata of the training dataset.
+        demonstrated: Task strings of the demonstrations for evaluation.
+
+    Returns:
+        Task strings of both, each once.
+
+    Raises:
+        ValueError: There are no metadata.
+    """
+    if meta is None:
+        raise ValueError(
+            "A one-hot policy knows the tasks of its dataset. Pass the metadata as `dataset_meta`."
+        )
+    return list(dict.fromkeys([*meta.tasks.index, *demonstrated]))
