@@ -17,7 +17,8 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_deltaco.cards.policy_card import policy_card
-from lerobot_deltaco.checkpoint_files import (
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.modeling.checkpoint_files import (
     check_loaded_weights,
     check_stored_frames,
     check_weight_names,
@@ -25,14 +26,20 @@ from lerobot_deltaco.checkpoint_files import (
     stored_demonstrations,
     without_sources,
 )
-from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.goal_learning import fit_goals, learn_goals
-from lerobot_deltaco.network_factory import (
+from lerobot_deltaco.modeling.goal_learning import fit_goals, learn_goals
+from lerobot_deltaco.modeling.network_factory import (
     make_demo_encoder,
     make_frozen_encoder,
     make_goal_conditioning,
     make_language_head,
     make_policy_network,
+)
+from lerobot_deltaco.modeling.task_embedding import TaskEmbedder
+from lerobot_deltaco.modeling.task_sources import (
+    one_hot_vocabulary,
+    read_eval_demonstrations,
+    read_sentences,
+    read_training_demonstrations,
 )
 from lerobot_deltaco.policy.actions import join_action, policy_loss
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder
@@ -73,13 +80,6 @@ from lerobot_deltaco.policy.task_file import (
     hub_options,
     read_task_file,
     write_task_file,
-)
-from lerobot_deltaco.task_embedding import TaskEmbedder
-from lerobot_deltaco.task_sources import (
-    one_hot_vocabulary,
-    read_eval_demonstrations,
-    read_sentences,
-    read_training_demonstrations,
 )
 
 

@@ -8,7 +8,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 from torch.utils.data import default_collate
 
-from lerobot_deltaco import network_factory
+from lerobot_deltaco.modeling import network_factory
 from lerobot_deltaco.policy import language
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS
 

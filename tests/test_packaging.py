@@ -105,10 +105,7 @@ FORBIDDEN = {
         "lerobot_deltaco.modeling_deltaco",
         "lerobot_deltaco.policy.language",
     },
-    **{
-        f"lerobot_deltaco/{name}.py": {"lerobot_deltaco.modeling_deltaco"}
-        for name in ("network_factory", "task_embedding", "task_sources", "checkpoint_files", "goal_learning")
-    },
+    "lerobot_deltaco/modeling": {"lerobot_deltaco.modeling_deltaco", "gym_deltaco", "pybullet"},
     "lerobot_deltaco/evaluation": {"lerobot_deltaco.reporting", "lerobot_deltaco.training"},
     "lerobot_deltaco/policy/networks.py": {"lerobot", "lerobot_deltaco"},
     "lerobot_deltaco/policy/losses.py": {"lerobot", "lerobot_deltaco"},

@@ -368,7 +368,7 @@ def test_policies_train_and_act_and_their_checkpoints_need_no_encoder(
     expected = policy.select_action(told)
     policy.save_pretrained(tmp_path / "policy")
     monkeypatch.setattr(
-        "lerobot_deltaco.network_factory.load_vision_encoder", lambda *_: pytest.fail("loaded")
+        "lerobot_deltaco.modeling.network_factory.load_vision_encoder", lambda *_: pytest.fail("loaded")
     )
     loaded = DeltacoPolicy.from_pretrained(tmp_path / "policy")
     torch.testing.assert_close(loaded.select_action(told), expected, atol=1e-3, rtol=1e-3)

@@ -12,11 +12,11 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.modeling.task_embedding import TaskEmbedder
 from lerobot_deltaco.policy.correspondence import Given
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, RobotData
 from lerobot_deltaco.policy.goal_conditioning import GoalConditioning
 from lerobot_deltaco.policy.goal_training import GoalBatch, GoalTrainer, draw_given
-from lerobot_deltaco.task_embedding import TaskEmbedder
 
 _LOSSES = ("grasp_loss", "release_loss", "depth_loss", "attention_loss")
 
