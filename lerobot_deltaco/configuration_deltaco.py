@@ -146,44 +146,44 @@ class DeltacoConfig(PreTrainedConfig):
         instruction_embeddings: File with embeddings of instructions, which are then not computed: a
             checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
             language model.
-        instructions: CSV file with sentences in people's own words for the benchmark's tasks, as
-            `deltaco-instructions` fetches or checks it. In training, each sample's instruction is drawn from
-            those of its task. In evaluation, each sentence has the demonstrations of its task.
-        instructions_split: Split of the file's sentences for training: train, those that are held out for no
-            task; held_out, the last one of each task; or all.
+        instructions: CSV file with sentences that people wrote for the benchmark's tasks, as
+            `deltaco-instructions` downloads or checks it. In training, each sample's instruction is drawn
+            from the sentences of its task. In evaluation, a sentence gets the demonstrations of its task.
+        instructions_split: Split of the file's sentences for training: train, the sentences that are not held
+            out for any task; held_out, the last sentence of each task; or all.
         instructions_templates: Whether to also train on the task string itself, as often as on each sentence.
-        language_head: Sizes of the hidden layers of fully connected layers behind the language encoder, whose
-            output has unit length, such as [512]; none by default. MCIL always has such layers; the authors'
-            are [384], its default.
+        language_head: Sizes of the hidden layers of fully connected layers after the language encoder, whose
+            output has unit length, such as [512]; none by default. MCIL always has such layers; by default
+            [384], as in the authors' code.
         normalize_language: Whether to scale instructions' embeddings to unit length, as in the paper. (The
             authors' code does so only where an encoder loss compares them with demonstrations.)
-        demo_encoder: Encoder of demonstrations. cnn: the paper's. attention (ours): compares the frames at
-            each place, and attends to a few places. correspondence (ours): no embedding; what the
-            demonstration moved is looked for in the scene, the instruction says where it goes, and the policy
-            is given both places as goals. It needs a camera that does not move, a robot state, and a gripper;
-            without demonstrations (language_only, one_hot), the method's other input says what to look for.
-            pretrained: a frozen image encoder.
+        demo_encoder: Encoder of demonstrations. cnn: the paper's. attention (ours): an encoder that compares
+            the frames at each place, and attends to a few places. correspondence (ours): no embedding;
+            instead, the policy looks in the scene for the object that the demonstration moved, the
+            instruction says where it goes, and both places are goals of the policy network. This needs a
+            camera that does not move, a robot state, and a gripper; without demonstrations (language_only,
+            one_hot), the method's other input says what to look for. pretrained: a frozen image encoder.
         vision_encoder: Frozen image encoder for `demo_encoder=pretrained`: clip-vit-base-patch32,
             r3m-resnet18, r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0 (which
             the extra `offline` brings, without a network), a folder with an image model of transformers, or
             its name on the Hugging Face Hub.
         vision_encoder_weights: File with R3M's weights, which are otherwise downloaded.
         vision_image_size: Height and width to which the array of a demonstration's frames is scaled for that
-            encoder; by default, that of the images it was trained on.
-        vision_input: Format of R3M's images: published, or authors: in 0..1 instead of 0..255, and not scaled
-            to 224 pixels, as in the authors' code.
+            encoder; by default, the size of the images that it was trained on.
+        vision_input: Format of R3M's images: published, that of R3M; or authors, as in the authors' code, in
+            0..1 instead of 0..255 and not scaled to 224 pixels.
         demo_variants: Number of variants of each demonstration (random crops, and random frames between the
             ends) that a pretrained encoder encodes before training; each sample gets one of them.
         demo_features_dir: Folder that keeps those features for further trainings; none by default.
-        demo_head: Sizes of the hidden layers of fully connected layers behind a pretrained encoder, such as
+        demo_head: Sizes of the hidden layers of fully connected layers after a pretrained encoder, such as
             [256]; by default, there are no layers at all.
         demo_rows: Number of rows of the array of a demonstration's frames, m in the paper.
         demo_columns: Number of columns of that array, n in the paper. Its m n frames are the first, the last,
-            and random ones between them; the attention takes as many, without an array.
+            and random ones between them; `attention` takes as many frames, without an array.
         image_size: Height and width to which images are scaled, if they differ.
         backbone: Convolutional network: paper or strided.
-        motion_modes: Number of Gaussians of the motion's distribution. The paper has one, whose mean is
-            between two motions where either would do; of several, the likeliest acts.
+        motion_modes: Number of Gaussians of the motion's distribution. The paper has one, which averages two
+            motions that are equally good; of several, the policy takes the likeliest.
         gripper: Gripper's dimension of the action: an index, "auto" (the last one whose name contains
             "gripper", if any) or "none".
         gripper_loss: Loss of the gripper: squared_error, or cross_entropy (ours).
@@ -191,16 +191,16 @@ class DeltacoConfig(PreTrainedConfig):
         encoder_loss_weight: Weight of the encoder loss, alpha_d in the paper's equation 3.
         temperature: Temperature of the contrastive loss.
         crop_padding: Largest random shift of observations in training, in pixels; 0 for none.
-        demo_crop_padding: The same for demonstrations. Without it, the encoder overfits to a small dataset,
-            and misreads new demonstrations.
+        demo_crop_padding: Largest random shift of demonstrations in training, in pixels; 0 for none. Without
+            it, the encoder overfits to a small dataset.
         demo_camera: Name of the camera for demonstrations and goals, such as "observation.images.front". By
             default, the first.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation, with
             `demo_encoder=correspondence`.
         goal_noise: Standard deviation of the noise on goals in training, in coordinates in which an image's
             edges are at -1 and 1; 0.04 is a pixel of 48.
-        grasp_depth: Whether goals include the depth of the grasp (`policy/goal_states.py`), which is taken
-            from the demonstration where it moves the same object.
+        grasp_depth: Whether goals include the depth of the grasp (`policy/goal_states.py`), estimated from
+            the demonstration and from what the object looks like.
         depth_margin: Depth that is added to the estimate in evaluation, in standard deviations of depths over
             the training episodes. A gripper that closes too high misses flat objects; on a robot, one that
             goes too low may touch the table.
@@ -213,8 +213,8 @@ class DeltacoConfig(PreTrainedConfig):
         leave_out: Modality that is left out in evaluation: demo or instruction; None for none.
         recolor_share: Share of training samples in which one random change of hue, saturation and brightness
             is applied to the observation and the demonstration alike, with `demo_encoder=correspondence`.
-        color_blind_tasks: Regular expression that is found in the instructions of tasks in which color does
-            not count: their demonstrations are recolored apart from the scene.
+        color_blind_tasks: Regular expression for the instructions in which color does not count; the
+            demonstrations of these tasks are recolored in another way than the scene.
         frames_after_release: Number of frames after the gripper's last opening in an episode that
             `deltaco-train` trains on, instead of leaving out the last `drop_n_last_frames`; None for all.
         demo_crop: Part of a demonstration that a random crop shifts, if its frames are laid out in an array
@@ -228,14 +228,14 @@ class DeltacoConfig(PreTrainedConfig):
         demo_root: Folder of that dataset, if it is not in LeRobot's cache.
         demo_episode: Episode of that dataset to use as the demonstration of every instruction, such as a
             paraphrase or a sentence of your own.
-        demo_task: Task string whose demonstrations are used for every instruction, likewise.
+        demo_task: Task string whose demonstrations are used for every instruction.
         demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default, those
             that are trained on.
         drop_n_last_frames: Number of frames at the end of each episode that are not trained on.
         tasks_per_batch: Number of tasks in a batch of `deltaco-train`, with equally many samples of each (the
             paper: 16 tasks x 64 samples); 0 for samples of any tasks.
-        upsampled_tasks: Regular expression for `deltaco-train`: the tasks in which it is found get
-            `upsampled_share` of each batch.
+        upsampled_tasks: Regular expression for the instructions of the tasks that get `upsampled_share` of
+            each batch of `deltaco-train`.
         upsampled_share: Share of each batch for the upsampled tasks; 0.5 in the paper's scenario B.
         initial_weights: Initial weights of the networks: authors, as in the authors' code
             (`policy/initial_weights.py`); or torch, PyTorch's. By default, the authors' for the paper's
@@ -245,11 +245,11 @@ class DeltacoConfig(PreTrainedConfig):
         compile: Whether to compile the networks, which makes training on a GPU faster.
         optimizer_lr: Learning rate of Adam.
         optimizer_weight_decay: Weight decay of AdamW.
-        optimizer_l2: Weight of an L2 penalty in Adam's gradients, instead of that decay. (The authors' code:
-            1e-4; the paper names none.)
+        optimizer_l2: Weight of an L2 penalty in Adam's gradients, instead of AdamW's weight decay; 1e-4 in
+            the authors' code, none in the paper.
         scheduler_name: Schedule of the learning rate: constant, or cosine, which decays to 0.
-        scheduler_warmup_steps: Number of steps of the cosine schedule's warmup.
-        grad_clip_norm: Maximum norm of the gradient; 0 does not clip.
+        scheduler_warmup_steps: Number of warmup steps of the cosine schedule.
+        grad_clip_norm: Maximum norm of the gradient; 0 for no clipping.
     """
 
     method: str = "deltaco"

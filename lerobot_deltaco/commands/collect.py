@@ -200,9 +200,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--objects",
         metavar="SET",
-        help="objects that scenes are made of: all, scenario_a_train (no test objects) or random:N, the 24 "
-        "training objects and N - 24 random ones (by default, those of the task set: all but for "
-        "scenario_a_clean_train)",
+        help="objects that scenes are made of: all; scenario_a_train, without test objects; or random:N, the "
+        "24 training objects and N - 24 random ones (default: scenario_a_train for scenario_a_clean_train, "
+        "all otherwise)",
     )
     parser.add_argument(
         "--adversarial-probability",
@@ -210,19 +210,19 @@ def _parser() -> argparse.ArgumentParser:
         default=ADVERSARIAL_PROBABILITY,
         metavar="P",
         help="probability that a distractor is drawn from the objects that share the target's color or shape "
-        "(%(default)s)",
+        "(default: %(default)s)",
     )
     parser.add_argument(
         "--workers",
         type=int,
         default=available_cores(),
-        help="number of processes, which does not change the dataset (default: %(default)s)",
+        help="number of processes; the dataset is the same with any number (default: %(default)s)",
     )
     shards = parser.add_mutually_exclusive_group()
     shards.add_argument(
         "--shard",
         metavar="I/N",
-        help="collect only the I-th of N equal parts, into ROOT.shards/I-of-N: for N machines",
+        help="collect only the I-th of N equal parts, into ROOT.shards/I-of-N, for collecting on N machines",
     )
     shards.add_argument(
         "--join",

@@ -1,4 +1,4 @@
-"""What all commands do about errors: they end with one line and an exit status."""
+"""Error handling of all commands: they end with one line and an exit status."""
 
 from __future__ import annotations
 

@@ -308,13 +308,13 @@ def _parser() -> argparse.ArgumentParser:
         "--seed",
         type=int,
         default=plan.seed,
-        help="seed of the scenes, which the step also changes (default: %(default)s)",
+        help="evaluation seed, from which the scenes derive, along with the step (default: %(default)s)",
     )
     parser.add_argument(
         "--counterfactual",
         choices=COUNTERFACTUALS,
         default=plan.counterfactual,
-        help="give another task's demonstration or instruction (default: %(default)s)",
+        help="input that is replaced by another task's (default: %(default)s)",
     )
     parser.add_argument(
         "--ambiguity",
@@ -327,20 +327,20 @@ def _parser() -> argparse.ArgumentParser:
         "--image-size",
         type=int,
         metavar="PX",
-        help="height and width of the environment's images (by default, those of the training's)",
+        help="height and width of the environment's images (default: those of the training)",
     )
     parser.add_argument(
         "--episode-length",
         type=int,
         metavar="STEPS",
-        help="steps of an episode (by default, of the training's environment, or else the benchmark's "
-        f"{plan.episode_length})",
+        help="number of steps of an episode (default: that of the training's environment, or "
+        f"{plan.episode_length} if it had none)",
     )
     parser.add_argument(
         "--objects",
         metavar="SET",
-        help="objects that scenes are made of: all, scenario_a_train (no test objects) or random:N (by "
-        "default, those of the task set: all but for scenario_a_clean_train)",
+        help="objects that scenes are made of: all; scenario_a_train, without test objects; or random:N "
+        "(default: scenario_a_train for scenario_a_clean_train, all otherwise)",
     )
     parser.add_argument(
         "--adversarial-probability",
@@ -348,25 +348,26 @@ def _parser() -> argparse.ArgumentParser:
         default=plan.adversarial_probability,
         metavar="P",
         help="probability that a distractor is drawn from the objects that share the target's color or "
-        "shape; 0 for uniform distractors, as in the authors' evaluation in training (%(default)s)",
+        "shape; 0 for uniform distractors, as in the authors' evaluation during training (default: "
+        "%(default)s)",
     )
     parser.add_argument(
         "--instructions",
         metavar="FILE",
-        help="CSV file with sentences for the tasks, such as the one that deltaco-instructions fetches; "
-        "needs --out (by default, the benchmark's templates)",
+        help="CSV file with sentences for the tasks, such as the one that deltaco-instructions downloads; "
+        "needs --out (default: the benchmark's templates)",
     )
     parser.add_argument(
         "--instructions-split",
         choices=INSTRUCTION_SPLITS,
         default=plan.instructions_split,
-        help="which of them: held_out, the last one of each task; train, those that are held out for no task "
-        "(%(default)s)",
+        help="split of these sentences: held_out, the last one of each task; train, those not held out for "
+        "any task; or all (default: %(default)s)",
     )
     parser.add_argument(
         "--instruction",
         metavar="SENTENCE",
-        help="a sentence of your own, in whatever words, for every task; needs --out",
+        help="sentence of your own, in any words, as the instruction of every task; needs --out",
     )
     parser.add_argument(
         "--steps",
@@ -421,23 +422,23 @@ def _parser() -> argparse.ArgumentParser:
         type=int,
         default=0,
         metavar="N",
-        help="draw for N episodes where the policy looks in the demonstration and in the scene, as PNG files "
-        "beside the record",
+        help="number of episodes for which to draw where the policy looks in the demonstration and in the "
+        "scene, as PNG files beside the record",
     )
     parser.add_argument(
         "--videos",
         type=int,
         default=0,
         metavar="N",
-        help="keep videos of N episodes of each outcome (success, wrong object, nothing grasped, wrong "
-        "container, dropped) beside the record, with a page that shows them",
+        help="number of episodes of each outcome (success, wrong object, nothing grasped, wrong container, "
+        "dropped) of which to make videos beside the record, with a page that shows them",
     )
     parser.add_argument(
         "--out",
         type=Path,
         metavar="DIR",
-        help="folder to hold `evaluations`, for a second evaluation of the same steps of a single RUN_DIR "
-        "(default: RUN_DIR)",
+        help="folder in which to put the folder `evaluations`, for a second evaluation of the same steps of "
+        "a single RUN_DIR (default: RUN_DIR)",
     )
     parser.add_argument("--device", help="device, such as cpu or cuda (default: the checkpoint's)")
     return parser

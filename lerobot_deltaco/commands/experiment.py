@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _shard_options(options: argparse.Namespace) -> list[str]:
-    """What is passed on to the collections."""
+    """The options that are passed on to `deltaco-collect`."""
     return ["--join"] if options.join else [f"--shard={options.shard}"] if options.shard else []
 
 
@@ -145,8 +145,8 @@ def _parser() -> argparse.ArgumentParser:
         "--only",
         choices=(*STEPS, "report"),
         metavar="STEP",
-        help="run only this step: collect, train, evaluate or report. The steps before it must be finished. "
-        "So the jobs of a cluster can share datasets.",
+        help="run only this step: collect, train, evaluate or report; the steps before it must be finished. "
+        "With it, the jobs of a cluster can share datasets.",
     )
     shards = parser.add_mutually_exclusive_group()
     shards.add_argument(

@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         "--objects",
         default="all",
         metavar="SET",
-        help="set of objects whose random ones are drawn too: random:N, which has N - 24 of them "
+        help="set of objects, whose random objects are also drawn: random:N has N - 24 of them "
         "(default: %(default)s, which has none)",
     )
     return parser

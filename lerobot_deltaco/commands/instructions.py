@@ -1,4 +1,4 @@
-"""`deltaco-instructions`: fetches the instructions that people wrote, and checks files of instructions."""
+"""`deltaco-instructions`: downloads the instructions that people wrote, and checks files of instructions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lerobot_deltaco.data.authors_instructions import AUTHORS_URL, fetch_instruc
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Fetches instructions, or checks some, and says how many there are."""
+    """Downloads instructions, or checks a file of them, and says how many there are."""
     parser = _parser()
     options = parser.parse_args(arguments)
     with exit_on_error(parser, InstructionsError, OSError):
@@ -52,14 +52,14 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         default=Path("human_instructions.csv"),
         metavar="FILE",
-        help="where to write them (%(default)s)",
+        help="file to write (default: %(default)s)",
     )
-    parser.add_argument("--url", default=AUTHORS_URL, help="where they are (%(default)s)")
+    parser.add_argument("--url", default=AUTHORS_URL, help="address to download from (default: %(default)s)")
     parser.add_argument(
         "--bare-names",
         action="store_true",
-        help="write instructions that give objects their bare names, as the authors' code does in ambiguity "
-        "scheme (ii), instead of downloading any; use them with the split all",
+        help="instead of downloading, write instructions that name objects without color and shape, as the "
+        "authors' code does in ambiguity scheme (ii); use them with the split all",
     )
     parser.add_argument("--check", type=Path, metavar="FILE", help="only check this file")
     return parser

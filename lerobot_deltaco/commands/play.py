@@ -15,13 +15,13 @@ def main(arguments: list[str] | None = None) -> None:
     """Serves the page until it is interrupted."""
     parser = argparse.ArgumentParser(
         prog="deltaco-play",
-        description="Serves a page on which a trained policy acts in scenes, by demonstrations and "
+        description="Serves a page on which a trained policy acts in scenes, with demonstrations and "
         "instructions that you choose. Stop it with Ctrl+C.",
     )
     parser.add_argument(
         "--checkpoint",
         metavar="DIR|USER/NAME",
-        help=f"folder or Hub id of the checkpoint to begin with (the project's own, {DEFAULT_NAME})",
+        help=f"folder or Hub id of the checkpoint to begin with (default: the project's own, {DEFAULT_NAME})",
     )
     parser.add_argument(
         "--allow",
@@ -29,12 +29,11 @@ def main(arguments: list[str] | None = None) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="folder from which the page may load checkpoints, which may be named several times (the current "
-        "one)",
+        help="folder from which the page may load checkpoints; may be repeated (default: the current folder)",
     )
     parser.add_argument("--no-hub", action="store_true", help="download no checkpoints from the Hub")
-    parser.add_argument("--host", default="127.0.0.1", help="address to serve at (%(default)s)")
-    parser.add_argument("--port", type=int, default=7860, help="port to serve at (%(default)s)")
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve at (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=7860, help="port to serve at (default: %(default)s)")
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
     options = parser.parse_args(arguments)
     own = checkpoints_folder() / DEFAULT_NAME

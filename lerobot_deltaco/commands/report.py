@@ -32,8 +32,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="deltaco-report",
         description="Reports on the evaluations of training runs: success rates as in the paper, learning "
-        "curves, outcomes of the episodes, and which of demonstration and instruction the policy followed "
-        "where they differed. Runs of one experiment that differ in their seeds are combined.",
+        "curves, outcomes of the episodes, and whether the policy followed the demonstration or the "
+        "instruction where they differed. Runs of one experiment that differ in their seeds are combined.",
     )
     parser.add_argument(
         "runs",

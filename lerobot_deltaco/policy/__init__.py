@@ -1,1 +1,1 @@
-"""The parts of the policy: networks, losses, and where instructions and demonstrations come from."""
+"""The parts of the policy: networks, losses, and the sources of instructions and demonstrations."""

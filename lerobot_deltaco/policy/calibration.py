@@ -1,8 +1,8 @@
 """From robot states to places in the image, learned from what changes between an episode's two ends.
 
-Where the gripper closed around an object, the image has changed when the episode is over: the object is
-gone. So a map from states to places is found without a calibrated camera: it is the one that sends the states
-at the grasps to the places of these changes. It needs a camera that does not move.
+Where the gripper closed around an object, the image has changed at the end of the episode: the object is
+gone. The map from states to places sends the states at the grasps to the places of these changes. So no
+calibrated camera is needed, only one that does not move.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Folders of datasets that do not exist, found before LeRobot makes them.
+"""Finds missing dataset folders before LeRobot makes them.
 
 Given a folder without a dataset, LeRobot makes the folder and downloads the dataset into it. Without a
-network, a mistyped folder ends in an error of the network, and in an empty folder of that name.
+network, a mistyped folder ends in a network error and an empty folder of that name.
 """
 
 from __future__ import annotations

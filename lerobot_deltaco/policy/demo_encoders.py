@@ -129,7 +129,7 @@ def frame_array(frames: Tensor, rows: int) -> Tensor:
     """Lays the frames of demonstrations out in raster order (appendix B).
 
     Args:
-        frames: (batch, rows * columns, 3, H, W).
+        frames: Frames of demonstrations, (batch, rows * columns, 3, H, W).
         rows: Number of rows.
 
     Returns:
@@ -139,10 +139,10 @@ def frame_array(frames: Tensor, rows: int) -> Tensor:
 
 
 def crop_array(frames: Tensor, rows: int, padding: int, generator: torch.Generator) -> Tensor:
-    """Shifts each array of frames at random, as a whole: what leaves a frame comes into its neighbor.
+    """Shifts each array of frames at random, as a whole: what leaves a frame enters its neighbor.
 
     Args:
-        frames: (batch, rows * columns, 3, H, W).
+        frames: Frames of demonstrations, (batch, rows * columns, 3, H, W).
         rows: Number of rows of the array.
         padding: Greatest shift in either direction, px. What comes in at the array's edges is black.
         generator: Source of the shifts, on the CPU.

@@ -20,7 +20,7 @@ def choose_training_demonstrations(
     generator: torch.Generator,
     check: bool,
 ) -> tuple[Tensor, Tensor | None]:
-    """Draws for each sample a demonstration of its task, which is another episode than its own.
+    """Draws for each sample a demonstration of its task: an episode other than the sample's own.
 
     Args:
         demonstrations: Demonstrations to draw from.

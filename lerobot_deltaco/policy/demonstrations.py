@@ -122,8 +122,8 @@ class DemonstrationSet(torch.nn.Module):
             episodes: The samples' own, (batch,), as indices of the dataset.
             generator: Source of the draws, on the CPU.
             check: Whether to check that all of them are in the set, which waits for a GPU.
-            tasks: Task of each sample. If it is given, episodes may be missing from the set, as those that
-                `--dataset.eval_split` holds back: any episode of their task demonstrates them.
+            tasks: Task of each sample. If it is given, episodes may be missing from the set, such as those
+                that `--dataset.eval_split` holds back; then any episode of their task is drawn.
 
         Returns:
             Rows, (batch,). A task's only episode demonstrates itself.
@@ -236,7 +236,7 @@ class DemonstrationSet(torch.nn.Module):
         """Frames of demonstrations in the order of time: the first, random ones between, and the last.
 
         Args:
-            rows: (batch,).
+            rows: Rows of the demonstrations, (batch,).
             n_frames: Number of frames per demonstration, at least 2.
             generator: Source of the draws, on the CPU.
             spread: Whether one frame is drawn from each of as many equal parts of the time between the ends,

@@ -13,8 +13,8 @@ class TrainingDivergedError(FloatingPointError):
 class FiniteLoss:
     """Remembers the loss of the last training step, and checks it when the next one begins.
 
-    To look at once would let the processor wait for the GPU in the middle of a step. The loop itself waits at
-    the end of the step.
+    Checking at once would make the CPU wait for the GPU in the middle of a step. The loop itself waits at the
+    end of the step.
     """
 
     def __init__(self) -> None:
@@ -87,7 +87,7 @@ def check_weights_to_save(module: nn.Module, step: int) -> None:
 
 
 def non_finite_weight(module: nn.Module) -> str | None:
-    """The name of a weight that has a number which is not finite; None if there is none."""
+    """The name of a weight with a number that is not finite; None if there is none."""
     for name, tensor in module.state_dict().items():
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             return name

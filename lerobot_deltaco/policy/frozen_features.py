@@ -143,7 +143,7 @@ class FrozenFeatures:
         return random_crop(frames, self.variants.crop_padding, generator)
 
     def _path(self, demonstrations: DemonstrationSet, n_drawn: int) -> Path | None:
-        """Where the features of a set are kept: under a name that stands for all that they depend on."""
+        """File that keeps the features of a set; its name is a hash of all that they depend on."""
         if self._folder is None:
             return None
         digest = hashlib.sha256(self.encoder.fingerprint().encode())

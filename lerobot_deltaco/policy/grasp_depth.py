@@ -1,10 +1,10 @@
-"""Estimates how deep to grasp, from what the demonstration did and from what the scene looks like.
+"""Estimates how deep to grasp, from the depth in the demonstration and from the looks of the object.
 
-Depths are those of `policy/goal_states.py`. Where the demonstration moved the same object, its depth is the
-right one. Where it moved another object of that color or shape, looks say more. So two estimates are
-averaged, weighted by the inverse of their variances. The error of demonstrations is learned, from the kind of
-instruction and from how similar both objects look. The error of looks on novel objects cannot be learned: on
-training objects, there is hardly any.
+Depths are those of `policy/goal_states.py`. If the demonstration moved the same object, its depth is the
+right one. If it moved another object of that color or shape, the looks of the object in the scene are a
+better guide. So two estimates are averaged, weighted by the inverse of their variances. The variance of the
+estimate from the demonstration is learned, from the kind of instruction and from how similar both objects
+look. The variance of the estimate from looks is not: training objects have hardly any error to learn it from.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class DepthEstimator(nn.Module):
             descriptors: Features of what the demonstrations moved, (batch, descriptor_dim).
             demonstrated: Depths of the demonstrations, (batch,); NaN where they are not known.
             condition: Embeddings of the instructions, (batch, condition_dim).
-            looks_std: Standard deviation of the error of looks, on novel objects.
+            looks_std: Standard deviation of the error of the estimate from looks, for novel objects.
         """
         here = features_at(features, places[:, None])[:, 0]
         by_looks = self.by_looks(here.detach())[:, 0].float()
@@ -111,7 +111,7 @@ class DepthEstimator(nn.Module):
     def _log_std(self, here: Tensor, descriptors: Tensor, condition: Tensor | None) -> Tensor:
         """Logarithm of the standard deviation of the demonstrations' error, (batch,).
 
-        It looks at features without changing them: they are to say what an object is.
+        Its loss does not train the features, which have to tell objects apart.
         """
         assert self.demonstration_error is not None
         inputs = [F.cosine_similarity(here, descriptors, dim=1).detach().float()[:, None]]

@@ -1,4 +1,4 @@
-"""Fully connected layers behind a frozen encoder."""
+"""Fully connected layers after a frozen encoder."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class UnitHead(nn.Module):
 
     Args:
         feature_dim: Size of the features.
-        hidden_dims: Sizes of the hidden layers, with ReLU behind each; None for no layers at all, which
-            leaves the features' direction as it is.
+        hidden_dims: Sizes of the hidden layers, with a ReLU after each; None for no layers at all, so that
+            the features are only scaled to unit length.
         embedding_dim: Size of the embedding; without layers, that of the features.
     """
 

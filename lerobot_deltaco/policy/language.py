@@ -29,8 +29,8 @@ LanguageEncoder = Callable[[Sequence[str]], Tensor]
 def load_language_encoder(name: str) -> LanguageEncoder:
     """Loads a frozen encoder of sentences.
 
-    It gives the mean of the token embeddings; CLIP's, its own summary of a sentence. all-MiniLM-L6-v2 and
-    all-distilroberta-v1 scale it to unit length, the others do not.
+    The embedding of a sentence is the mean of its tokens' embeddings; with CLIP, it is CLIP's own embedding
+    of the sentence. all-MiniLM-L6-v2 and all-distilroberta-v1 scale it to unit length, the others do not.
 
     Args:
         name: One of `LANGUAGE_ENCODERS`.
@@ -175,8 +175,8 @@ class InstructionTable:
         """Adds the embeddings of a file.
 
         Raises:
-            TaskFileError: The file is missing, or has something in it that cannot be.
-            ValueError: It is of another language encoder.
+            TaskFileError: The file is missing, or its content is not valid.
+            ValueError: Its embeddings are of another language encoder.
         """
         self.take(read_task_file(path), path)
 
@@ -184,7 +184,7 @@ class InstructionTable:
         """Adds the embeddings of a file that has been read.
 
         Raises:
-            ValueError: They are of another language encoder.
+            ValueError: The embeddings are of another language encoder.
         """
         if contents.language_encoder != self.encoder_name:
             raise ValueError(

@@ -13,12 +13,12 @@ def gaussian_negative_log_likelihood(mean: Tensor, log_std: Tensor, target: Tens
     """-log N(target; mean, std²), summed over the dimensions of an action.
 
     Args:
-        mean: (..., dims).
-        log_std: (..., dims), to be broadcast.
-        target: (..., dims), to be broadcast.
+        mean: Mean of the Gaussian, (..., dims).
+        log_std: Logarithm of its standard deviation, (..., dims), to be broadcast.
+        target: Action to be predicted, (..., dims), to be broadcast.
 
     Returns:
-        (...).
+        Loss of each action, (...).
     """
     scaled = (target - mean) * torch.exp(-log_std)
     return (0.5 * scaled.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(dim=-1)
@@ -28,13 +28,13 @@ def mixture_negative_log_likelihood(means: Tensor, logits: Tensor, log_std: Tens
     """-log of a mixture of Gaussians at a target.
 
     Args:
-        means: (batch, modes, dims).
+        means: Means of the modes, (batch, modes, dims).
         logits: Logits of the modes, (batch, modes).
-        log_std: (dims,) or (modes, dims), the same for all samples.
-        target: (batch, dims).
+        log_std: Logarithm of the standard deviation, (dims,) or (modes, dims), the same for all samples.
+        target: Action to be predicted, (batch, dims).
 
     Returns:
-        (batch,).
+        Loss of each sample, (batch,).
     """
     each = gaussian_negative_log_likelihood(means, log_std, target[:, None])  # (batch, modes)
     return -torch.logsumexp(logits.log_softmax(dim=1) - each, dim=1)
@@ -44,12 +44,12 @@ def gripper_loss(logit: Tensor, target: Tensor, kind: str) -> Tensor:
     """Loss of the gripper, the sigmoid of a logit, against its target.
 
     Args:
-        logit: (batch,).
-        target: (batch,) in 0..1.
-        kind: "squared_error", the paper's, or "cross_entropy".
+        logit: Logit of each sample, (batch,).
+        target: Gripper command of each sample, (batch,) in 0..1.
+        kind: Loss function: "squared_error", the paper's, or "cross_entropy".
 
     Returns:
-        (batch,).
+        Loss of each sample, (batch,).
     """
     if kind == "squared_error":
         return (torch.sigmoid(logit) - target).square()
@@ -62,7 +62,7 @@ def contrastive_logits(demo: Tensor, language: Tensor, temperature: float) -> Te
     Args:
         demo: Unit embeddings of the samples' demonstrations, (batch, embedding).
         language: Unit embeddings of the distinct instructions in the batch, (tasks, embedding).
-        temperature: Divides the cosines.
+        temperature: Number by which the cosines are divided.
 
     Returns:
         (batch, tasks). The paper has one demonstration for each task, which makes this square.
@@ -74,11 +74,11 @@ def contrastive_loss(logits: Tensor, task: Tensor) -> Tensor:
     """Cross-entropy of each demonstration's own instruction among those of the batch.
 
     Args:
-        logits: (batch, tasks).
+        logits: Similarity of each demonstration to each instruction, (batch, tasks).
         task: Column of each sample's own instruction, (batch,) int64.
 
     Returns:
-        (batch,).
+        Loss of each sample, (batch,).
     """
     return F.cross_entropy(logits, task, reduction="none")
 
@@ -87,10 +87,10 @@ def cosine_loss(demo: Tensor, language: Tensor) -> Tensor:
     """1 - cosine of each demonstration and its own instruction, as in BC-Z.
 
     Args:
-        demo: Unit embeddings, (batch, embedding).
-        language: The same, of each sample's own instruction.
+        demo: Unit embeddings of the samples' demonstrations, (batch, embedding).
+        language: Unit embeddings of the samples' own instructions, (batch, embedding).
 
     Returns:
-        (batch,).
+        Loss of each sample, (batch,).
     """
     return 1 - (demo * language).sum(dim=-1)

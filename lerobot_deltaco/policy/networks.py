@@ -14,8 +14,8 @@
         |
     distribution of the motion
 
-Task embedding: a unit vector that stands for a task, made from a demonstration or an instruction. What goes
-through FiLM and what is concatenated is the caller's to choose.
+Task embedding: a unit vector that stands for a task, made from a demonstration or an instruction. The caller
+chooses what goes through FiLM and what is concatenated.
 
 The authors' code that some comments refer to: https://github.com/Alacarter/deltaco, commit a5423d8.
 """
@@ -113,9 +113,9 @@ class ConditionedPolicy(nn.Module):
         """Predicts an action.
 
         Args:
-            images: (batch, cameras, 3, H, W) in 0..1.
-            film: (batch, film_dim), None if it is 0.
-            concat: (batch, concat_dim), None if it is 0.
+            images: Images of all cameras, (batch, cameras, 3, H, W) in 0..1.
+            film: Embedding that goes through FiLM, (batch, film_dim); None if `film_dim` is 0.
+            concat: Embeddings and proprioception, (batch, concat_dim); None if `concat_dim` is 0.
             goals: Places in the first camera's image, x and y in -1..1, (batch, n_goals, 2); None if there
                 are none.
 
@@ -153,7 +153,7 @@ class ConditionedPolicy(nn.Module):
 
 
 class FilmResNet(nn.Module):
-    """Residual blocks behind a 7x7 convolution, each with FiLM.
+    """Residual blocks after a 7x7 convolution, each with FiLM.
 
     Args:
         film_dim: Size of the embedding, 0 for no FiLM.
@@ -262,7 +262,7 @@ def gaussian_maps(places: Tensor, height: int, width: int, std: float | Tensor) 
     """Maps that are 1 at a place and fall off around it.
 
     Args:
-        places: x and y in -1..1 between the edges, (batch, places, 2).
+        places: Places, x and y in -1..1 between the edges, (batch, places, 2).
         height: Number of rows.
         width: Number of columns.
         std: Standard deviation, in the same unit; one number, or those of x and y, (2,).
@@ -312,7 +312,7 @@ def random_crop(images: Tensor, padding: int, generator: torch.Generator | None 
     """Shifts each image at random by up to `padding` pixels; what comes in at the edges is black.
 
     Args:
-        images: (batch, ..., H, W). All images of a sample are shifted alike.
+        images: Images, (batch, ..., H, W). All images of a sample are shifted alike.
         padding: Largest shift in x and in y, px.
         generator: Source of the shifts, on the CPU.
 

@@ -1,4 +1,4 @@
-"""Sentences in people's own words for the tasks of a dataset, whose task strings are templates."""
+"""Sentences that people wrote for the tasks of a dataset, whose own task strings are templates."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ class Paraphrases:
             demonstrated: Task strings that have demonstrations.
 
         Returns:
-            For each sentence that is no such task string itself, the task string. A sentence that several
-            tasks share does not say which of them is meant: the first one that has a demonstration is taken.
+            For each sentence that is no such task string itself, the task string. For a sentence that several
+            tasks share, it is the first one that has a demonstration.
         """
         found = {}
         for instruction in instructions:

@@ -30,7 +30,7 @@ def check_processor_files(pretrained: str | Path, **hub_options: Any) -> None:
         hub_options: Arguments of `hf_hub_download`, such as `revision`.
 
     Raises:
-        ProcessorFileError: A file is none of a processor, or names a class of its own.
+        ProcessorFileError: A file is not that of a processor, or names a class of its own.
     """
     for name in PROCESSOR_FILES:
         path = Path(pretrained) / name

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class LoggedScalars:
-    """Read like a dictionary of floats.
+    """Scalars by name, read like a dictionary of floats.
 
     They stay on the device until one of them is read. LeRobot reads them when the step is done, so that the
     backward pass is under way before anyone waits for the forward pass.

@@ -13,7 +13,7 @@ from lerobot_deltaco.policy.goal_conditioning import FoundGoals
 
 
 class TaskConditioning(NamedTuple):
-    """Inputs of the policy's network that say the tasks of a batch, computed once per episode."""
+    """Inputs of the policy's network that specify the tasks of a batch, computed once per episode."""
 
     tasks: tuple[str, ...]
     film: Tensor | None  # (batch, film_dim)

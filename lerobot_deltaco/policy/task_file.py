@@ -57,7 +57,7 @@ class TaskFile(NamedTuple):
     demonstrations: StoredDemonstrations | None
     # The lengths of the embeddings as the encoder gives them, (instructions,); None in files of version 0.1.
     lengths: Tensor | None = None
-    # Sentences in people's own words for task strings.
+    # Sentences that people wrote for task strings.
     paraphrases: Mapping[str, Sequence[str]] = MappingProxyType({})
 
 
@@ -106,7 +106,7 @@ def read_task_file(path: Path) -> TaskFile:
     """Reads a file, and checks it whole.
 
     Raises:
-        TaskFileError: The file is missing, is no such file, or has something in it that cannot be.
+        TaskFileError: The file is missing, is no such file, or its content is not valid.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -165,7 +165,7 @@ def check_features(path: Path, demonstrations: StoredDemonstrations, feature_dim
         feature_dim: Number of the encoder's features; None if it is not known.
 
     Raises:
-        TaskFileError: They are of another number.
+        TaskFileError: Their number is another one.
     """
     assert demonstrations.features is not None
     if feature_dim is not None:
@@ -182,7 +182,7 @@ def check_grasp_states(path: Path, demonstrations: StoredDemonstrations, state_d
         state_dim: Size of the robot's state.
 
     Raises:
-        TaskFileError: They are of another size.
+        TaskFileError: The states have another size.
     """
     assert demonstrations.grasp_states is not None
     shape = (len(demonstrations.tasks), state_dim)

@@ -116,10 +116,10 @@ def load_vision_encoder(
 
     Args:
         name: One of `VISION_ENCODERS`, or an image model of transformers: a folder, or its name on the Hub.
-        weights: A file with the weights of an R3M; by default, it is downloaded.
-        image_size: Height and width of the images that it is given, px; by default, those it was made for.
-        input_kind: "published"; or "authors" for R3M as DeL-TaCo's authors call it, with images in 0..1
-            instead of 0..255, at their own size.
+        weights: File with the weights of R3M; by default, it is downloaded.
+        image_size: Height and width to which images are scaled, px; by default, those of the encoder.
+        input_kind: Format of R3M's images: "published"; or "authors", as in the code of DeL-TaCo's authors,
+            in 0..1 instead of 0..255, at their own size.
 
     Raises:
         VisionEncoderError: A package is missing, or the model can be neither found nor downloaded, or is not

@@ -90,7 +90,7 @@ _PERCENT: dict[str, tuple[str, float, float]] = {
     "ablations/film_everything": ("FiLM everything", 22.4, 2.3),
 }
 
-# Experiments at a smaller scale, by what their names begin with, and where the rows stand that they repeat.
+# Experiments at a smaller scale, by the beginning of their names, and the paper's rows that they repeat.
 _REPEATED: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "small_a": ("scenario_a", "ablations"),
