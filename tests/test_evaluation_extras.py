@@ -162,6 +162,15 @@ def test_the_number_of_demonstrations_is_overridden_and_recorded(tmp_path, capsy
     assert "other demonstrations" in capsys.readouterr().err
 
 
+def test_what_a_policy_cannot_do_without_is_not_left_out(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        evaluate_command.main([str(CHECKPOINT), "--tasks", "24", "--leave-out", "demo"])
+    assert "with something left out" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        command(tmp_path, "--leave-out", "demo", tasks="24")
+    assert "this policy was not trained without it: `demo_dropout` is 0" in capsys.readouterr().err
+
+
 def test_several_demonstrations_are_taken_from_a_dataset(tmp_path):
     from lerobot_deltaco.data.collection import collect
     from lerobot_deltaco.data.collection_plan import CollectionPlan

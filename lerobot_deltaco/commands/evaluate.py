@@ -59,11 +59,11 @@ def main(arguments: list[str] | None = None) -> None:
             parser.error(f"--out holds the records of a single run. Got {len(options.runs)} runs.")
         if options.demo_root is not None and options.demo_repo_id is None:
             parser.error("--policy.demo_root is the folder of --policy.demo_repo_id. Give both.")
-        other_demonstrations = (options.demo_repo_id, options.n_demonstrations) != (None, None)
-        if other_demonstrations and options.out is None:
+        others = (options.demo_repo_id, options.n_demonstrations, options.leave_out)
+        if others != (None, None, None) and options.out is None:
             parser.error(
-                "An evaluation with other demonstrations must not be mixed with the run's own. Name another "
-                "folder for its records with --out."
+                "An evaluation with other demonstrations, or with something left out, must not be mixed with "
+                "the run's own. Name another folder for its records with --out."
             )
         for name, minimum in (("processes", 1), ("n_demonstrations", 1), ("explain", 0), ("videos", 0)):
             number = getattr(options, name)
@@ -120,12 +120,16 @@ def _evaluate(
     folder = options.out or run
     experiment = options.experiment or description.experiment
     if description.policy_type != "deltaco":
-        for name in ("demo_repo_id", "n_demonstrations"):
+        ours = {
+            "demo_repo_id": "--policy.demo_repo_id",
+            "n_demonstrations": "--n-demonstrations",
+            "leave_out": "--leave-out",
+        }
+        for name, option in ours.items():
             if getattr(options, name) is not None:
                 raise RunError(
                     f"{run} holds a policy of the type {description.policy_type!r}, which takes no "
-                    f"demonstrations. Leave out --{'policy.' * (name == 'demo_repo_id')}"
-                    f"{name if name == 'demo_repo_id' else 'n-demonstrations'}."
+                    f"demonstrations. Leave out {option}."
                 )
     path = record_path(folder, checkpoint.step, plan.counterfactual)
     record = None
@@ -141,7 +145,7 @@ def _evaluate(
         from lerobot_deltaco.evaluation.processes import default_processes
         from lerobot_deltaco.evaluation.sets import run_set
 
-        names = ("device", "demo_repo_id", "demo_root", "n_demonstrations")
+        names = ("device", "demo_repo_id", "demo_root", "n_demonstrations", "leave_out")
         given = {name: getattr(options, name) for name in names}
         overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
         loaded = load_policy(checkpoint.folder, overrides, options.rename_map)
@@ -215,6 +219,8 @@ def _check_same_evaluation(
     if options.n_demonstrations is not None:
         made_for["n_demonstrations"] = record.policy.get("n_demonstrations", 1)
         asked_for["n_demonstrations"] = options.n_demonstrations
+    if description.policy_type == "deltaco":
+        made_for["leave_out"], asked_for["leave_out"] = record.policy.get("leave_out"), options.leave_out
     if made_for != asked_for:
         raise RecordError(
             f"{path} belongs to another evaluation: {made_for}. Expected {asked_for}. Use the same "
@@ -393,6 +399,12 @@ def _parser() -> argparse.ArgumentParser:
         dest="demo_root",
         metavar="DIR",
         help="folder of that dataset, if it is not in LeRobot's cache",
+    )
+    parser.add_argument(
+        "--leave-out",
+        choices=("demo", "instruction"),
+        help="evaluate without the demonstration, or without the instruction, a policy that was trained with "
+        "--policy.demo_dropout or --policy.instruction_dropout; needs --out",
     )
     parser.add_argument(
         "--n-demonstrations",

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from draccus.utils import ParsingError
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, get_policy_class, make_policy, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
@@ -46,9 +47,13 @@ def load_policy(
     Raises:
         RunError: Packages of this type of policy are not installed.
         ProcessorFileError: The checkpoint's processors would run code of their own when they are loaded.
-        ValueError: It is a policy of another type, and not one for the benchmark's environment.
+        ValueError: It is a policy of another type, and not one for the benchmark's environment; or the
+            overrides do not fit it.
     """
-    config = PreTrainedConfig.from_pretrained(folder, cli_overrides=list(overrides))
+    try:
+        config = PreTrainedConfig.from_pretrained(folder, cli_overrides=list(overrides))
+    except ParsingError as error:
+        raise ValueError(f"{folder}: {error.__cause__ or error}") from error
     if isinstance(config, DeltacoConfig):
         policy: PreTrainedPolicy = DeltacoPolicy.from_pretrained(folder, config=config)
     else:

@@ -251,7 +251,9 @@ class Evaluation:
 
     @property
     def _uses_demo(self) -> bool:
-        return self._deltaco is not None and self._deltaco.config.uses_demo
+        if self._deltaco is None or self._deltaco.config.leave_out == "demo":
+            return False
+        return self._deltaco.config.uses_demo
 
     def _earlier_instructions(self) -> dict[int, list[str]]:
         """For each task, the instructions of the episodes before its own, of those that it has itself.
