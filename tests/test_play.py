@@ -1,17 +1,29 @@
 """The page without a browser: what its buttons do, with a small untrained policy in the real environment."""
 
+import gc
+import io
 import json
+import os
 import random
+import re
 import shutil
 import subprocess
 import sys
 import threading
+import time
+from dataclasses import replace
 from pathlib import Path
 
+import av
+import httpx
+import huggingface_hub
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from small_policies import use_fake_encoder
 
@@ -22,13 +34,18 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.explanation import GRASP_COLOR, draw_explanation
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.play import engine as engine_module
+from lerobot_deltaco.play import sources
 from lerobot_deltaco.play.checkpoints import find_checkpoint
+from lerobot_deltaco.play.datasets import EpisodeDataset
+from lerobot_deltaco.play.demonstrations import Demonstration
 from lerobot_deltaco.play.engine import Engine
-from lerobot_deltaco.play.episodes import MAX_SENTENCE, Demonstration, Player, checked_sentence
+from lerobot_deltaco.play.episodes import MAX_SENTENCE, RENDER_SIZE, Player, checked_sentence
 from lerobot_deltaco.play.errors import PlayError
+from lerobot_deltaco.play.modalities import BOTH, DEMONSTRATION_ALONE, INSTRUCTION_ALONE
 from lerobot_deltaco.play.session import Actions, Session
+from lerobot_deltaco.play.videos import LIFETIME, VideoFiles
 from lerobot_deltaco.play.worker import Worker
-from lerobot_deltaco.policy.demonstrations import DemonstrationSet
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals
 
 # Two names and a color, each in a container's color and at a place.
@@ -61,6 +78,38 @@ def save_policy(folder, **options):
     return folder
 
 
+DATASET_TASKS = [DEMONSTRATED[0], DEMONSTRATED[0], TASKS[9].instruction]
+LENGTH = 6
+
+
+def write_dataset(folder, camera="observation.image", n_states=10, use_videos=False):
+    """A dataset with an episode for each of `DATASET_TASKS`, whose images grow brighter."""
+    features = {
+        camera: {
+            "dtype": "video" if use_videos else "image",
+            "shape": (64, 64, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "observation.state": {"dtype": "float32", "shape": (n_states,), "names": None},
+        "action": {"dtype": "float32", "shape": (4,), "names": None},
+    }
+    dataset = LeRobotDataset.create("test/shown", 24, features, root=folder, use_videos=use_videos)
+    for number, task in enumerate(DATASET_TASKS):
+        for step in range(LENGTH):
+            gripper = -1 if 2 <= step < 4 else 1
+            dataset.add_frame(
+                {
+                    camera: np.full((64, 64, 3), 60 * number + 10 * step, np.uint8),
+                    "observation.state": np.full(n_states, 10 * number + step, np.float32),
+                    "action": np.array([0, 0, 0, gripper], np.float32),
+                    "task": task,
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return folder
+
+
 pytestmark = pytest.mark.usefixtures("fake_language")
 
 
@@ -73,6 +122,11 @@ def checkpoints(tmp_path_factory):
         save_policy(folder / "goals", demo_encoder="correspondence")
         save_policy(folder / "attention", demo_encoder="attention")
         save_policy(folder / "language", demo_encoder="attention", method="language_only")
+        dropouts = {"demo_dropout": 0.3, "instruction_dropout": 0.3}
+        save_policy(folder / "either", demo_encoder="correspondence", **dropouts)
+        save_policy(folder / "no_demo", demo_encoder="correspondence", demo_dropout=0.3)
+        save_policy(folder / "demo_only", demo_encoder="correspondence", method="demo_only")
+    write_dataset(folder / "dataset")
     return folder
 
 
@@ -358,6 +412,261 @@ def test_two_users_do_not_mix(actions, session):
         assert mine.title == expected.title
         assert np.array_equal(mine.moment.image, expected.moment.image)
         assert np.array_equal(mine.moment.view, expected.moment.view)
+
+
+# Videos
+
+
+def n_images(video):
+    """Number of images of an MP4 file, and their size."""
+    with av.open(io.BytesIO(video)) as container:
+        images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    return len(images), images[0].shape
+
+
+def test_the_experts_episode_has_a_video_of_all_of_it(actions, session):
+    assert session.demonstration.video is None  # of a checkpoint, only the ends are known
+    session = actions.use_recorded(last(actions.run_expert(session)))
+    n_frames, shape = n_images(session.demonstration.video)
+    assert n_frames >= EPISODE_STEPS
+    assert shape == (RENDER_SIZE, RENDER_SIZE, 3)
+
+
+def test_videos_are_files_of_the_page_and_are_forgotten():
+    files = VideoFiles()
+    first, second = (Path(files.put(video)) for video in (b"one", b"two"))
+    assert first.read_bytes() == b"one"
+    assert files.put(b"one") == str(first) != str(second)
+    assert set(first.parent.iterdir()) == {first, second}
+    os.utime(first, (0, time.time() - LIFETIME - 1))
+    files.put(b"two")
+    assert not first.exists()
+    assert second.exists()
+    del files
+    gc.collect()
+    assert not second.parent.exists()
+
+
+# Datasets
+
+
+def test_the_episodes_of_a_dataset_become_the_demonstrations(actions, checkpoints, session):
+    session = actions.open_dataset(session, f" {checkpoints / 'dataset'} ")
+    assert session.demonstrated_tasks == {DATASET_TASKS[0]: 2, DATASET_TASKS[2]: 1}
+    assert session.demonstrated == (DATASET_TASKS[0], 1)  # the scene's own task
+    session = actions.choose_demonstration(session, DATASET_TASKS[0], 2)
+    demonstration = session.demonstration
+    assert demonstration.ends.shape == (2, 48, 48, 3)
+    assert demonstration.ends[0].max() == 60
+    assert demonstration.ends[1].min() == 60 + 10 * (LENGTH - 1)
+    n_frames, (height, width, _) = n_images(demonstration.video)
+    assert n_frames >= LENGTH
+    assert height == width >= 192
+    run = last(actions.run(session, "go")).latest
+    assert f"{DATASET_TASKS[0]} (2 of 2 in {checkpoints / 'dataset'})" in run.title
+    with pytest.raises(PlayError, match="dataset has no demonstration of 'wave'"):
+        actions.choose_demonstration(session, "wave", 1)
+
+
+def test_the_grasp_of_an_episode_is_known_if_the_policy_asks_for_it(actions, checkpoints, session):
+    session = actions.open_dataset(session, str(checkpoints / "dataset"))
+    assert (session.demonstration.grasp_state == 3).all()  # one step after the gripper closes
+    session = actions.open_checkpoint(session, str(checkpoints / "attention"))
+    session = actions.open_dataset(session, str(checkpoints / "dataset"))
+    assert session.demonstration.grasp_state is None
+
+
+def test_an_episode_is_read_as_a_checkpoint_reads_its_own(actions, checkpoints, session):
+    folder = checkpoints / "dataset"
+    session = actions.choose_demonstration(actions.open_dataset(session, str(folder)), DATASET_TASKS[2], 1)
+    own = load_demonstrations("test/shown", folder, None, "observation.image", 48, 2)
+    expected = own.frames[own.rows[DATASET_TASKS[2]][0]].permute(0, 2, 3, 1).numpy()
+    assert np.array_equal(session.demonstration.frames, expected)
+
+
+def test_a_dataset_of_videos_is_shown(actions, session, checkpoints):
+    folder = write_dataset(checkpoints / "videos", use_videos=True)
+    session = actions.open_dataset(session, str(folder))
+    assert n_images(session.demonstration.video)[0] >= LENGTH
+
+
+def test_without_a_dataset_the_checkpoints_own_demonstrations_return(actions, checkpoints, session):
+    session = actions.open_dataset(session, str(checkpoints / "dataset"))
+    for own in (actions.open_dataset(session, " "), actions.open_checkpoint(session, session.checkpoint)):
+        assert own.dataset is None
+        assert own.demonstrated_tasks == dict.fromkeys(DEMONSTRATED, N_EACH)
+
+
+def test_two_users_have_datasets_of_their_own(actions, checkpoints, session):
+    other = actions.open_dataset(session, str(checkpoints / "dataset"))
+    mine = actions.choose_demonstration(session, DEMONSTRATED[0], 2)
+    swapped = last(actions.run_with_other_demonstration(other, "go"))
+    assert swapped.demonstrated[0] == DATASET_TASKS[2]
+    assert "of 2)" in mine.demonstration.title
+    assert mine.dataset is None
+
+
+def test_what_is_no_dataset_is_explained(actions, checkpoints, session, tmp_path):
+    for name, message in (
+        ("/etc", "no dataset '/etc' that this page may load. Enter the folder of a dataset in"),
+        (str(checkpoints / "nowhere"), "no dataset .*nowhere"),
+        ("USER/NAME", "no dataset 'USER/NAME'"),
+        (str(checkpoints / "goals"), "not a LeRobotDataset: meta/info.json is missing"),
+    ):
+        with pytest.raises(PlayError, match=message):
+            actions.open_dataset(session, name)
+    with pytest.raises(PlayError, match="dataset 'USER/NAME' cannot be fetched .*Hub"):
+        EpisodeDataset("USER/NAME", [], True)
+
+
+def test_of_a_repository_only_data_are_fetched(checkpoints, monkeypatch):
+    fetched = []
+
+    def fetch(repo_id, repo_type, allow_patterns):
+        fetched.append((repo_id, repo_type))
+        assert all(pattern.startswith(("meta/", "data/", "videos/")) for pattern in allow_patterns)
+        assert not any(pattern.endswith(("*", ".py")) for pattern in allow_patterns)
+        return str(checkpoints / "dataset")
+
+    monkeypatch.setattr(sources, "snapshot_download", fetch)
+    assert sum(EpisodeDataset("USER/NAME", [], True).counts.values()) == len(DATASET_TASKS)
+    assert fetched == [("USER/NAME", "dataset")]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"camera": "observation.images.top"}, "no camera 'observation.image'.*observation.images.top"),
+        ({"n_states": 7}, r"wrong features: .*'observation.state' of the shape \(10,\).*\(7,\)"),
+    ],
+)
+def test_a_dataset_that_does_not_fit_is_refused(actions, checkpoints, session, tmp_path, options, message):
+    folder = write_dataset(checkpoints / tmp_path.name, **options)
+    with pytest.raises(PlayError, match=message):
+        actions.open_dataset(session, str(folder))
+
+
+def test_a_policy_without_demonstrations_takes_no_dataset(actions, checkpoints, session):
+    session = actions.open_checkpoint(session, str(checkpoints / "language"))
+    with pytest.raises(PlayError, match="takes no demonstrations: its method is language_only"):
+        actions.open_dataset(session, str(checkpoints / "dataset"))
+
+
+def change_info(folder, **changes):
+    path = folder / "meta/info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"data_path": "/etc/{chunk_index}"}, "refused: its `data_path`"),
+        ({"video_path": "../{video_key}.mp4"}, "refused: its `video_path`"),
+        ({"features": {"../../secret": {"dtype": "video"}}}, "refused: the feature '../../secret'"),
+        ({"features": []}, "has no features"),
+        ({"codebase_version": "v2.1"}, "cannot be read"),
+    ],
+)
+def test_a_dataset_that_leads_elsewhere_is_refused(checkpoints, tmp_path, changes, message):
+    folder = shutil.copytree(checkpoints / "dataset", tmp_path / "changed")
+    change_info(folder, **changes)
+    with pytest.raises(PlayError, match=message):
+        EpisodeDataset(str(folder), [tmp_path], False)
+
+
+def test_images_that_lie_in_other_files_are_not_read(checkpoints, tmp_path):
+    folder = shutil.copytree(checkpoints / "dataset", tmp_path / "changed")
+    (file,) = folder.glob("data/*/*.parquet")
+    table = pq.read_table(file)
+    images = [{"bytes": None, "path": "/etc/image.png"}] * len(table)
+    place = table.schema.get_field_index("observation.image")
+    field = table.schema.field(place)
+    pq.write_table(table.set_column(place, field, pa.array(images, field.type)), file)
+    with pytest.raises(PlayError, match="images of 'observation.image' lie in other files"):
+        EpisodeDataset(str(folder), [tmp_path], False)
+
+
+def test_what_a_folder_lacks_is_not_downloaded(checkpoints, tmp_path, monkeypatch):
+    folder = shutil.copytree(checkpoints / "dataset", tmp_path / "changed")
+    shutil.rmtree(folder / "data")
+    sent = []
+    monkeypatch.setattr(httpx.Client, "send", lambda *args, **kwargs: sent.append(args))
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
+    with pytest.raises(PlayError, match="cannot be read .*files are missing"):
+        EpisodeDataset(str(folder), [tmp_path], False)
+    assert not sent
+    assert not (folder / "data").exists()
+
+
+# Leaving out a modality
+
+
+@pytest.mark.parametrize(
+    ("name", "choices", "reason"),
+    [
+        ("either", (BOTH, INSTRUCTION_ALONE, DEMONSTRATION_ALONE), "^$"),
+        ("no_demo", (BOTH, INSTRUCTION_ALONE), "without the instruction: .*`instruction_dropout` 0"),
+        ("goals", (BOTH,), "without either: .*`demo_dropout` and `instruction_dropout` 0"),
+        ("language", (BOTH,), "never takes a demonstration"),
+        ("demo_only", (BOTH,), "never takes an instruction"),
+    ],
+)
+def test_only_what_was_learned_is_offered(actions, checkpoints, name, choices, reason):
+    session = actions.open_checkpoint(Session(), str(checkpoints / name))
+    assert session.use == BOTH
+    assert session.uses.choices == choices
+    assert re.search(reason, session.uses.reason)
+    if name != "either":
+        with pytest.raises(PlayError, match="This checkpoint can use both"):
+            actions.choose_use(session, DEMONSTRATION_ALONE, "go")
+
+
+@pytest.fixture
+def either(actions, checkpoints):
+    """A session with a checkpoint that can do without one of the two."""
+    opened = actions.open_checkpoint(Session(), str(checkpoints / "either"))
+    return actions.choose_scene(opened, 4, 3)
+
+
+def test_without_the_instruction_it_does_not_matter_and_none_is_needed(actions, either):
+    session = actions.choose_use(either, DEMONSTRATION_ALONE, "what I wrote")
+    assert session.sentence == "what I wrote"
+    runs = [last(actions.run(session, sentence)).latest for sentence in ("", "put it in the red bin")]
+    assert "Instruction: left out\nDemonstration: Put" in runs[0].title
+    assert runs[0].title == runs[1].title
+    assert np.array_equal(runs[0].moment.image, runs[1].moment.image)
+    assert np.array_equal(runs[0].moment.view, runs[1].moment.view)
+    with pytest.raises(PlayError, match="instruction is left out, so another one changes nothing"):
+        last(actions.run_with_other_sentence(session))
+
+
+def test_without_the_demonstration_it_does_not_matter_and_none_is_needed(actions, either):
+    session = actions.choose_use(either, INSTRUCTION_ALONE, "go")
+    others = replace(session, demonstration=None)
+    runs = [last(actions.run(each, "go")).latest for each in (session, others)]
+    assert "Instruction: go\nDemonstration: left out" in runs[0].title
+    assert np.array_equal(runs[0].moment.view, runs[1].moment.view)
+    assert runs[0].moment.view.shape[1] == 224  # the scene alone
+    with pytest.raises(PlayError, match="demonstration is left out"):
+        last(actions.run_with_other_demonstration(session, "go"))
+    with pytest.raises(PlayError, match="instruction is empty"):
+        last(actions.run(session, " "))
+
+
+def test_a_run_leaves_the_checkpoints_own_option(actions, either, engine):
+    def option():
+        return engine.call(either.checkpoint, lambda player: player.policy.config.leave_out)
+
+    plain = last(actions.run(either, "go")).latest.moment
+    session = actions.choose_use(either, INSTRUCTION_ALONE, "go")
+    stream = actions.run(session, "go")
+    next(stream)
+    stream.close()  # a user who leaves in the middle
+    assert option() is None
+    last(actions.run(session, "go"))
+    assert option() is None
+    again = last(actions.run(actions.choose_use(session, BOTH, "go"), "go")).latest.moment
+    assert np.array_equal(plain.view, again.view)
 
 
 # Bad input

@@ -9,7 +9,7 @@ import time
 from contextlib import contextmanager
 
 import pytest
-from test_play import DEMONSTRATED, save_policy
+from test_play import DATASET_TASKS, DEMONSTRATED, save_policy, write_dataset
 
 from lerobot_deltaco.policy.language_encoders import MINILM_L3
 
@@ -36,6 +36,9 @@ def free_port():
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("play")
     save_policy(folder / "policy", demo_encoder="correspondence", language_encoder=MINILM_L3)
+    dropouts = {"demo_dropout": 0.3, "instruction_dropout": 0.3}
+    save_policy(folder / "either", demo_encoder="correspondence", language_encoder=MINILM_L3, **dropouts)
+    write_dataset(folder / "dataset")
     broken = shutil.copytree(folder / "policy", folder / "broken")
     (broken / "model.safetensors").write_bytes(b"nothing")
     return folder
@@ -158,6 +161,56 @@ def test_the_experts_episode_is_used_as_the_demonstration(user):
     user.await_text("latest_text", "Expert. " + OVER)
     user.press("use")
     user.await_text("shown", "by the expert")
+
+
+def await_video(user):
+    """Waits until the video of the demonstration can be played, and returns its length in seconds."""
+    user.page.wait_for_function("document.querySelector('#video video')?.readyState >= 2")
+    return user.page.evaluate("document.querySelector('#video video').duration")
+
+
+def test_the_experts_demonstration_is_a_video_and_a_checkpoints_is_not(user):
+    assert "a checkpoint keeps only 2 images" in user.read("no_video")
+    assert user.page.locator("#video video").count() == 0
+    user.press("expert")
+    user.await_text("latest_text", "Expert. " + OVER)
+    user.press("use")
+    user.await_text("shown", "by the expert")
+    assert await_video(user) > 1
+    assert not user.page.locator("#no_video").is_visible()
+
+
+def test_the_episodes_of_a_dataset_are_shown_and_used(user, folder):
+    user.page.click("text=Another dataset of demonstrations")
+    user.write("dataset", str(folder / "policy"))
+    user.press("load_dataset")
+    user.await_text("message", "not a LeRobotDataset: meta/info.json is missing")
+    user.write("dataset", str(folder / "dataset"))
+    user.press("load_dataset")
+    shown = user.await_text("shown", r"^(.*) \(1 of \d in .*dataset\)$")[1]
+    assert shown in DATASET_TASKS
+    assert await_video(user) > 1
+    user.press("run")
+    user.await_text("latest_text", OVER)
+    assert f"Demonstration: {shown} (1 of" in user.read("latest_text")
+
+
+def test_one_of_the_two_can_be_left_out_if_that_was_learned(user, folder):
+    assert user.page.locator("#modality input").count() == 1
+    assert user.page.locator("#modality input").is_disabled()
+    assert "has not learned to do without either" in user.page.inner_text("#modality")
+    user.page.click("text=Another checkpoint")
+    user.write("checkpoint", str(folder / "either"))
+    user.press("load")
+    user.await_text("status", "either")
+    user.write("sentence", "")
+    user.page.click("#modality >> text=demonstration alone")
+    user.press("run")
+    user.await_text("latest_text", "Instruction: left out[\\s\\S]*uccess")
+    user.page.click("#modality >> text=instruction alone")
+    user.write("sentence", "go there")
+    user.press("run")
+    user.await_text("latest_text", "Instruction: go there\\nDemonstration: left out[\\s\\S]*uccess")
 
 
 def test_a_bad_sentence_gets_a_message_and_markup_stays_text(user):

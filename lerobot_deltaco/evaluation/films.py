@@ -16,7 +16,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from lerobot.utils.io_utils import write_video
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -29,6 +28,7 @@ from lerobot_deltaco.evaluation.evaluate import Evaluation, Film
 from lerobot_deltaco.evaluation.explanation import draw_episode
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import EpisodeResult, EvaluationRecord
+from lerobot_deltaco.evaluation.videos import write_episode_video
 from lerobot_deltaco.lerobot_internals import without_rollout_progress
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 
@@ -45,7 +45,6 @@ KINDS = MappingProxyType(
 EXPLANATIONS, VIDEOS = "explanations", "videos"
 RENDER_SIZE = 256  # px
 VIDEO_FPS = 10
-_HELD_FRAMES = 10  # for which the last image of a video stays
 _MAX_SLUG = 60  # characters
 
 
@@ -176,7 +175,7 @@ def write_videos(
             name = f"{kind}/{_file_name(episode)}.mp4"
             (new / kind).mkdir(exist_ok=True)
             frames = [_video_frame(episode, film, step) for step in range(len(film.images))]
-            write_video(new / name, frames + frames[-1:] * _HELD_FRAMES, VIDEO_FPS)
+            write_episode_video(new / name, frames, VIDEO_FPS)
             last_images[kind].append(Image.fromarray(frames[-1]))
             index.append(
                 {

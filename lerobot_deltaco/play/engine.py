@@ -14,12 +14,14 @@ from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.play.worker import Worker
 
 if TYPE_CHECKING:
+    from lerobot_deltaco.play.datasets import EpisodeDataset
+    from lerobot_deltaco.play.demonstrations import Demonstration
     from lerobot_deltaco.play.episodes import Player
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
-MAX_LOADED = 3  # checkpoints at a time
+MAX_LOADED = 3  # checkpoints, and datasets, at a time
 
 
 class Status(NamedTuple):
@@ -37,12 +39,12 @@ class Status(NamedTuple):
 
 
 class Engine:
-    """Checkpoints that act, for any number of users. Only one thing runs at a time; the others wait.
+    """Checkpoints that act, and datasets, for any number of users. One thing runs at a time; others wait.
 
     Args:
         checkpoint: Name of the checkpoint to begin with, as `find_checkpoint` takes it.
-        roots: Folders from which checkpoints may be loaded.
-        is_hub_allowed: Whether checkpoints may be downloaded from the Hugging Face Hub.
+        roots: Folders from which checkpoints and datasets may be loaded.
+        is_hub_allowed: Whether they may be downloaded from the Hugging Face Hub.
     """
 
     def __init__(self, checkpoint: str, roots: Sequence[Path], is_hub_allowed: bool = True) -> None:
@@ -50,6 +52,7 @@ class Engine:
         self._roots, self._is_hub_allowed = tuple(roots), is_hub_allowed
         self._worker = Worker()
         self._players: OrderedDict[str, Player] = OrderedDict()
+        self._datasets: OrderedDict[str, EpisodeDataset] = OrderedDict()
         self._status = Status("Starting.")
 
     @property
@@ -91,23 +94,79 @@ class Engine:
         """Yields what a generator yields that uses a checkpoint, once its turn has come."""
         return self._worker.stream(lambda: function(self._player(name)))
 
+    def demonstrated_tasks(self, checkpoint: str, dataset: str | None) -> dict[str, int]:
+        """Number of demonstrations by task string.
+
+        Args:
+            checkpoint: Name of the checkpoint.
+            dataset: Name of the dataset whose episodes are the demonstrations; None for the checkpoint's own.
+
+        Raises:
+            PlayError: One of the two may not or cannot be loaded, or the dataset does not fit the checkpoint.
+        """
+
+        def count() -> dict[str, int]:
+            player = self._player(checkpoint)
+            if dataset is None:
+                return player.demonstrated_tasks
+            opened = self._dataset(dataset)
+            opened.check_fits(player.policy.config)
+            return opened.counts
+
+        return self._worker.call(count)
+
+    def demonstration(self, checkpoint: str, dataset: str | None, task: str, number: int) -> Demonstration:
+        """A demonstration for a checkpoint.
+
+        Args:
+            checkpoint: Name of the checkpoint.
+            dataset: Name of the dataset that it is of; None for the checkpoint's own.
+            task: Task string.
+            number: Number of the demonstration among those of the task, from 1.
+
+        Raises:
+            PlayError: There is none.
+        """
+
+        def choose() -> Demonstration:
+            player = self._player(checkpoint)
+            if dataset is None:
+                return player.demonstration(task, number)
+            return self._dataset(dataset).demonstration(task, number, player.policy.config)
+
+        return self._worker.call(choose)
+
     def _player(self, name: str) -> Player:
         """A checkpoint, in the worker's thread."""
-        if name in self._players:
-            self._players.move_to_end(name)
-            return self._players[name]
         from lerobot_deltaco.play.episodes import Player
 
-        player = Player(find_checkpoint(name, self._roots, self._is_hub_allowed))
-        self._players[name] = player
-        while len(self._players) > MAX_LOADED:
-            self._players.popitem(last=False)
-        return player
+        return _kept(
+            self._players,
+            name,
+            lambda: Player(find_checkpoint(name, self._roots, self._is_hub_allowed)),
+        )
+
+    def _dataset(self, name: str) -> EpisodeDataset:
+        """A dataset, in the worker's thread."""
+        from lerobot_deltaco.play.datasets import EpisodeDataset
+
+        return _kept(self._datasets, name, lambda: EpisodeDataset(name, self._roots, self._is_hub_allowed))
+
+
+def _kept[T](loaded: OrderedDict[str, T], name: str, load: Callable[[], T]) -> T:
+    """What is loaded under a name; else it is loaded, and what was not used for longest is forgotten."""
+    if name not in loaded:
+        loaded[name] = load()
+    loaded.move_to_end(name)
+    while len(loaded) > MAX_LOADED:
+        loaded.popitem(last=False)
+    return loaded[name]
 
 
 def _import_episodes() -> None:
     import torch
 
+    import lerobot_deltaco.play.datasets
     import lerobot_deltaco.play.episodes  # noqa: F401  (takes 10 s and more)
 
     # An episode is a batch of one, which several threads make no faster. On a busy machine, where they wait

@@ -15,19 +15,26 @@ from lerobot.envs.utils import preprocess_observation
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gym_deltaco import EPISODE_STEPS
+from gym_deltaco import CONTROL_FPS, EPISODE_STEPS
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.seeding import episode_seed
+from gym_deltaco.sheets import caption, down, to_image
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, Task, get_task
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.evaluation.evaluate import counterfactual_task
 from lerobot_deltaco.evaluation.explanation import draw_explanation
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.play.demonstrations import (
+    Demonstration,
+    check_number,
+    demonstration_of,
+    stored_demonstration,
+)
 from lerobot_deltaco.play.errors import PlayError
-from lerobot_deltaco.policy.demonstrations import DemonstrationSet, kept_frame_indices, resize_images
+from lerobot_deltaco.play.modalities import BOTH, DEMONSTRATION_ALONE, INSTRUCTION_ALONE, using
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet, resize_images
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals
-from lerobot_deltaco.policy.keyframes import find_keyframes
 from lerobot_deltaco.policy.language import LanguageEncoderError
 
 MAX_SEED = 2**32 - 1
@@ -56,27 +63,6 @@ class SceneView:
     image: NDArray[np.uint8]
     objects: tuple[str, ...]
     info: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Demonstration:
-    """An episode that shows a task.
-
-    Attributes:
-        title: Description for the page.
-        frames: Kept images, the first and the last among them, (kept, H, W, 3), at the policy's size.
-        grasp_state: Robot state when the gripper closed, (state,); NaN if it never did, None if it is not
-            known.
-    """
-
-    title: str
-    frames: NDArray[np.uint8]
-    grasp_state: NDArray[np.float32] | None = None
-
-    @property
-    def ends(self) -> NDArray[np.uint8]:
-        """First and last image, (2, H, W, 3)."""
-        return self.frames[[0, -1]]
 
 
 class Moment(NamedTuple):
@@ -148,6 +134,27 @@ def other_instruction(view: SceneView, current: str, rng: random.Random) -> str:
     return task.instruction
 
 
+def other_demonstration(
+    counts: dict[str, int], view: SceneView, current: tuple[str, int] | None, rng: random.Random
+) -> tuple[str, int]:
+    """The task and number of another demonstration that makes sense in a scene.
+
+    Args:
+        counts: Number of demonstrations by task string.
+        view: The scene.
+        current: Task string and number of the present demonstration, whose task is not drawn again.
+        rng: Source of the draw.
+
+    Raises:
+        PlayError: There is no other demonstration.
+    """
+    others = [task for task in TASKS if task.instruction in counts]
+    task = _other_task(others, view, current[0] if current else None, rng)
+    if task is None:
+        raise PlayError("There is no demonstration of another task. Let the expert make one.")
+    return task.instruction, rng.randint(1, counts[task.instruction])
+
+
 def _other_task(
     candidates: Sequence[Task], view: SceneView, current: str | None, rng: random.Random
 ) -> Task | None:
@@ -211,46 +218,21 @@ class Player:
         Raises:
             PlayError: There is none.
         """
-        counts = self.demonstrated_tasks
-        if task not in counts:
-            raise PlayError(f"The checkpoint has no demonstration of {task!r}.")
-        if not isinstance(number, int) or not 1 <= number <= counts[task]:
-            raise PlayError(f"{task!r} has the demonstrations 1 to {counts[task]}. Got {number!r}.")
+        check_number(self.demonstrated_tasks, task, number, "checkpoint")
         demonstrations = self.policy.eval_demonstrations
         assert demonstrations is not None
-        row = demonstrations.rows[task][number - 1]
-        frames = demonstrations.frames[row].permute(0, 2, 3, 1).cpu().numpy()
-        states = demonstrations.grasp_states
-        grasp_state = None if states is None else states[row].cpu().numpy()
-        return Demonstration(f"{task} ({number} of {counts[task]})", frames, grasp_state)
+        return stored_demonstration(demonstrations, task, number)
 
-    def other_demonstration(
-        self, view: SceneView, current: tuple[str, int] | None, rng: random.Random
-    ) -> tuple[str, int]:
-        """The task and number of another demonstration that makes sense in a scene.
-
-        Args:
-            view: The scene.
-            current: Task string and number of the present demonstration, whose task is not drawn again.
-            rng: Source of the draw.
-
-        Raises:
-            PlayError: The checkpoint has no other demonstration.
-        """
-        counts = self.demonstrated_tasks
-        others = [task for task in TASKS if task.instruction in counts]
-        task = _other_task(others, view, current[0] if current else None, rng)
-        if task is None:
-            raise PlayError("The checkpoint has no demonstration of another task. Let the expert make one.")
-        return task.instruction, rng.randint(1, counts[task.instruction])
-
-    def run(self, scene: Scene, demonstration: Demonstration | None, sentence: str) -> Generator[Moment]:
+    def run(
+        self, scene: Scene, demonstration: Demonstration | None, sentence: str, use: str = BOTH
+    ) -> Generator[Moment]:
         """Runs an episode of the policy.
 
         Args:
             scene: The scene.
             demonstration: The demonstration; None if the policy takes none.
             sentence: The instruction.
+            use: What of them the policy gets, one of `LEFT_OUT`.
 
         Yields:
             The episode before the first step, and after each.
@@ -258,13 +240,17 @@ class Player:
         Raises:
             PlayError: The policy takes demonstrations and there is none, or it cannot read the sentence.
         """
-        if self.policy.config.uses_demo and demonstration is None:
+        if use == INSTRUCTION_ALONE:
+            demonstration = None
+        elif self.policy.config.uses_demo and demonstration is None:
             raise PlayError("This policy needs a demonstration. Choose one, or let the expert make one.")
+        if use == DEMONSTRATION_ALONE:
+            sentence = ""
         with closing(_environment(scene, self._camera_size)) as env:
             observation, info = env.reset(seed=_seed(scene))
-            with _demonstrated_by(self.policy, demonstration, sentence):
+            with using(self.policy.config, use), _demonstrated_by(self.policy, demonstration, sentence):
                 goals = self._find_goals(observation, sentence)
-                view = self._explain(observation, demonstration, goals)
+                view = self._explain(observation, demonstration, goals, use)
                 self.policy.reset()
                 action = self._act(observation, sentence)
             yield Moment(env.scene.render(RENDER_SIZE), view, f"0 of {EPISODE_STEPS} steps")
@@ -291,22 +277,20 @@ class Player:
         """
         task = get_task(scene.task_id)
         with closing(_environment(scene, self._camera_size)) as env:
-            frames, states, gripper = [], [], []
+            frames, states, gripper, film = [], [], [], []
             for number, step in enumerate(expert_episode(env, task.index, _seed(scene)), start=1):
                 frames.append(step.observation["pixels"])
                 states.append(step.observation["agent_pos"])
                 gripper.append(float(step.action[-1]))
+                film.append(env.scene.render(RENDER_SIZE))
                 text = f"Expert, {number} of {EPISODE_STEPS} steps: {step.stage.value}"
                 if number == EPISODE_STEPS:
                     text = f"Expert. {outcome(step.info, -1)}"
-                yield Moment(env.scene.render(RENDER_SIZE), None, text)
-        kept = kept_frame_indices(0, len(frames) - 1, self.policy.config.n_demo_frames).tolist()
-        images = torch.from_numpy(np.stack([frames[index] for index in kept])).permute(0, 3, 1, 2)
-        images = resize_images(images, self.policy.config.image_size)
+                yield Moment(film[-1], None, text)
+        images = torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2)
+        robot = torch.from_numpy(np.stack(states)), torch.tensor(gripper)
         title = f"{task.instruction} (by the expert, seed {scene.seed})"
-        span = (0, len(frames) - 1)
-        keyframes = find_keyframes(torch.from_numpy(np.stack(states)), torch.tensor(gripper), [span])
-        yield Demonstration(title, images.permute(0, 2, 3, 1).numpy(), keyframes.grasp_states[0].numpy())
+        yield demonstration_of(title, images, robot, self.policy.config, film, CONTROL_FPS)
 
     def _batch(self, observation: dict[str, NDArray[Any]], sentence: str) -> dict[str, Any]:
         batch = preprocess_observation({name: value[None] for name, value in observation.items()})
@@ -321,16 +305,20 @@ class Player:
         observation: dict[str, NDArray[Any]],
         demonstration: Demonstration | None,
         goals: FoundGoals | None,
+        use: str,
     ) -> NDArray[np.uint8]:
         """Draws what the policy receives and, if it has goals, what led to them."""
         ends = None
         if demonstration is not None and self.policy.config.uses_demo:
             ends = demonstration.ends
         from_demonstration = (True, True)
-        if self.policy.goals is not None:
+        if self.policy.goals is not None and use == BOTH:
             locator = self.policy.goals.locator
             from_demonstration = (locator.grasp_source == "demo", locator.release_source == "demo")
-        return draw_explanation(observation["pixels"], ends, goals, from_demonstration)
+        image = draw_explanation(observation["pixels"], ends, goals, from_demonstration)
+        if use == BOTH:
+            return image
+        return np.asarray(down([caption(f"Used: {use}", image.shape[1]), to_image(image)]))
 
     @torch.no_grad()
     def _find_goals(self, observation: dict[str, NDArray[Any]], sentence: str) -> FoundGoals | None:

@@ -10,9 +10,17 @@ from typing import TYPE_CHECKING, Any
 from gym_deltaco.tasks import TASKS
 from lerobot_deltaco.play.engine import Engine
 from lerobot_deltaco.play.errors import PlayError
+from lerobot_deltaco.play.modalities import (
+    BOTH,
+    DEMONSTRATION_ALONE,
+    INSTRUCTION_ALONE,
+    Uses,
+    learned_uses,
+)
 
 if TYPE_CHECKING:
-    from lerobot_deltaco.play.episodes import Demonstration, Moment, Scene, SceneView
+    from lerobot_deltaco.play.demonstrations import Demonstration
+    from lerobot_deltaco.play.episodes import Moment, Scene, SceneView
 
 TASK_OF_INSTRUCTION = {task.instruction: task.index for task in TASKS}
 _MAX_RANDOM_SEED = 9999
@@ -37,11 +45,15 @@ class Session:
 
     Attributes:
         checkpoint: Name of the checkpoint; None until the first is loaded.
-        demonstrated_tasks: Number of the checkpoint's demonstrations by task string.
+        uses: What the checkpoint can do with and without.
+        use: What the next run uses, one of the choices of `uses`.
+        dataset: Name of the dataset whose episodes are the demonstrations; None for the checkpoint's own.
+        demonstrated_tasks: Number of those demonstrations by task string.
         scene: The scene.
         view: View of the scene.
         demonstration: The demonstration; None if the checkpoint has none, or none is chosen.
-        demonstrated: Task string and number of a demonstration of the checkpoint's; None for another one.
+        demonstrated: Task string and number of a demonstration of the checkpoint's or the dataset's; None for
+            another one.
         sentence: The instruction.
         recorded: Demonstration that the expert made last.
         earlier: The run before the latest.
@@ -49,6 +61,9 @@ class Session:
     """
 
     checkpoint: str | None = None
+    uses: Uses = Uses()
+    use: str = BOTH
+    dataset: str | None = None
     demonstrated_tasks: dict[str, int] | None = None
     scene: Scene | None = None
     view: SceneView | None = None
@@ -75,11 +90,21 @@ class Actions:
         self._random = rng or random.Random()
 
     def open_checkpoint(self, session: Session, name: str) -> Session:
-        """Takes another checkpoint, and a first scene and demonstration for it."""
+        """Takes another checkpoint, its own demonstrations, and a first scene and demonstration for it."""
         name = name.strip()
-        counts = self._engine.call(name, lambda player: player.demonstrated_tasks)
+        uses = self._engine.call(name, lambda player: learned_uses(player.policy.config))
+        use = session.use if session.use in uses.choices else BOTH
+        return self._take_demonstrations(replace(session, checkpoint=name, uses=uses, use=use), name, None)
+
+    def open_dataset(self, session: Session, name: str) -> Session:
+        """Takes the episodes of a dataset as demonstrations; without a name, the checkpoint's own again."""
+        checkpoint, _ = _opened(session)
+        return self._take_demonstrations(session, checkpoint, name.strip() or None)
+
+    def _take_demonstrations(self, session: Session, checkpoint: str, dataset: str | None) -> Session:
+        counts = self._engine.demonstrated_tasks(checkpoint, dataset)
         session = replace(
-            session, checkpoint=name, demonstrated_tasks=counts, demonstration=None, demonstrated=None
+            session, dataset=dataset, demonstrated_tasks=counts, demonstration=None, demonstrated=None
         )
         if session.scene is None:
             session = self.random_scene(session)
@@ -88,8 +113,14 @@ class Actions:
             task = next(iter(counts), "")
         return self.choose_demonstration(session, task, 1) if task else session
 
+    def choose_use(self, session: Session, use: str, sentence: str) -> Session:
+        """Takes the demonstration, the instruction, or both for the next run, and keeps what is written."""
+        if use not in session.uses.choices:
+            raise PlayError(f"This checkpoint can use {' or '.join(session.uses.choices)}. Got {use!r}.")
+        return replace(session, use=use, sentence=sentence)
+
     def random_scene(self, session: Session) -> Session:
-        """Draws a scene of a task that the checkpoint has demonstrations of, with that demonstration."""
+        """Draws a scene of a task that there are demonstrations of, with one of them."""
         checkpoint, counts = _opened(session)
         tasks = [TASK_OF_INSTRUCTION[task] for task in counts if task in TASK_OF_INSTRUCTION]
         task_id = self._random.choice(tasks or [task.index for task in TASKS])
@@ -110,9 +141,9 @@ class Actions:
         return replace(session, scene=scene, view=view, sentence=TASKS[scene.task_id].instruction)
 
     def choose_demonstration(self, session: Session, task: str, number: int) -> Session:
-        """Takes a demonstration that comes with the checkpoint."""
+        """Takes a demonstration of the checkpoint's or the dataset's."""
         checkpoint, _ = _opened(session)
-        demonstration = self._engine.call(checkpoint, lambda player: player.demonstration(task, number))
+        demonstration = self._engine.demonstration(checkpoint, session.dataset, task, number)
         return replace(session, demonstration=demonstration, demonstrated=(task, number))
 
     def use_recorded(self, session: Session) -> Session:
@@ -129,23 +160,32 @@ class Actions:
         scene, demonstration = session.scene, session.demonstration
         if scene is None:
             raise PlayError("There is no scene yet. Choose one.")
-        sentence = checked_sentence(sentence)
+        use = session.use
+        if use == DEMONSTRATION_ALONE:
+            told = "left out"
+        else:
+            told = sentence = checked_sentence(sentence)
         session = replace(session, sentence=sentence, earlier=session.latest)
-        shown = demonstration.title if demonstration is not None else "none"
-        title = f"Policy, seed {scene.seed}\nInstruction: {sentence}\nDemonstration: {shown}"
-        moments = self._engine.stream(checkpoint, lambda player: player.run(scene, demonstration, sentence))
+        if use == INSTRUCTION_ALONE:
+            shown = "left out"
+        else:
+            shown = demonstration.title if demonstration is not None else "none"
+        title = f"Policy, seed {scene.seed}\nInstruction: {told}\nDemonstration: {shown}"
+        moments = self._engine.stream(
+            checkpoint, lambda player: player.run(scene, demonstration, sentence, use)
+        )
         for moment in moments:
             yield replace(session, latest=Run(title, moment))
 
     def run_with_other_demonstration(self, session: Session, sentence: str) -> Iterator[Session]:
         """The same scene and sentence, with the demonstration of another task that makes sense there."""
-        checkpoint, _ = _opened(session)
-        view = session.view
-        if view is None:
+        from lerobot_deltaco.play.episodes import other_demonstration
+
+        _, counts = _opened(session)
+        if session.view is None:
             raise PlayError("There is no scene yet. Choose one.")
-        task, number = self._engine.call(
-            checkpoint, lambda player: player.other_demonstration(view, session.demonstrated, self._random)
-        )
+        _check_used(session, INSTRUCTION_ALONE, "demonstration")
+        task, number = other_demonstration(counts, session.view, session.demonstrated, self._random)
         yield from self.run(self.choose_demonstration(session, task, number), sentence)
 
     def run_with_other_sentence(self, session: Session) -> Iterator[Session]:
@@ -154,11 +194,12 @@ class Actions:
 
         if session.view is None:
             raise PlayError("There is no scene yet. Choose one.")
+        _check_used(session, DEMONSTRATION_ALONE, "instruction")
         yield from self.run(session, other_instruction(session.view, session.sentence, self._random))
 
     def run_expert(self, session: Session) -> Iterator[Session]:
         """Lets the scripted expert do the scene's own task, and keeps that as a demonstration."""
-        from lerobot_deltaco.play.episodes import Demonstration
+        from lerobot_deltaco.play.demonstrations import Demonstration
 
         checkpoint, _ = _opened(session)
         scene = session.scene
@@ -172,6 +213,12 @@ class Actions:
             else:
                 session = replace(session, latest=Run(title, step))
             yield session
+
+
+def _check_used(session: Session, unused_by: str, word: str) -> None:
+    """Checks that what is to be swapped matters."""
+    if session.use == unused_by:
+        raise PlayError(f"The {word} is left out, so another one changes nothing. Choose another use first.")
 
 
 def _opened(session: Session) -> tuple[str, dict[str, int]]:

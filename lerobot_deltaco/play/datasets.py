@@ -1,0 +1,201 @@
+"""Datasets whose episodes are demonstrations. Nothing is read from anywhere but the dataset itself.
+
+LeRobot downloads what a folder lacks, reads files wherever a dataset's `info.json` says, and opens paths and
+addresses that its images name. So a dataset is checked here before LeRobot reads its episodes.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor
+
+from gym_deltaco.sheets import enlarged
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.play.demonstrations import Demonstration, check_number, demonstration_of
+from lerobot_deltaco.play.errors import PlayError
+from lerobot_deltaco.play.sources import DATASET, find_folder, read_json
+from lerobot_deltaco.policy.dataset_folders import INFO_FILE
+from lerobot_deltaco.policy.demonstrations import to_uint8
+
+MAX_FRAMES = 1000  # of an episode
+_FILM_SIZE = 192  # px, at least, of the longer side of a video
+# No repository can have this name, so that LeRobot cannot download what a folder lacks.
+_NO_REPOSITORY = "a/local/folder"
+
+
+class EpisodeDataset:
+    """A LeRobotDataset. Images are read when an episode is chosen, so it may be of any size.
+
+    Args:
+        name: Folder of the dataset, or its repository's id on the Hugging Face Hub.
+        roots: Folders in which datasets may lie, at any depth.
+        is_hub_allowed: Whether datasets may be downloaded.
+
+    Attributes:
+        counts: Number of episodes by task string.
+
+    Raises:
+        PlayError: There is none, it may not be loaded, or it is not a LeRobotDataset.
+    """
+
+    def __init__(self, name: str, roots: Sequence[Path], is_hub_allowed: bool) -> None:
+        folder = find_folder(name, DATASET, roots, is_hub_allowed)
+        self._name = name.strip()
+        _check_info(folder, self._name)
+        try:
+            self._dataset = LeRobotDataset(_NO_REPOSITORY, root=folder, return_uint8=True)
+            _check_images(self._dataset, self._name)
+            episodes = self._dataset.meta.episodes.select_columns(
+                ["tasks", "dataset_from_index", "dataset_to_index"]
+            )[:]
+            self._tasks = [str(tasks[0]) for tasks in episodes["tasks"]]
+            self._spans = [
+                (int(start), int(end))
+                for start, end in zip(
+                    episodes["dataset_from_index"], episodes["dataset_to_index"], strict=True
+                )
+            ]
+        except PlayError:
+            raise
+        # Whatever is wrong with files that come from anywhere: the page says so and goes on.
+        except Exception as error:
+            raise self._unreadable(error) from error
+        if not self._tasks:
+            raise PlayError(f"The dataset {self._name!r} has no episodes.")
+        self._rows: dict[str, list[int]] = defaultdict(list)
+        for episode, task in enumerate(self._tasks):
+            self._rows[task].append(episode)
+        self.counts = {task: len(rows) for task, rows in self._rows.items()}
+
+    def check_fits(self, config: DeltacoConfig) -> None:
+        """Checks that the episodes can be demonstrations for a policy.
+
+        Raises:
+            PlayError: The policy takes none, or expects another camera, state or action.
+        """
+        if not config.uses_demo:
+            raise PlayError(f"This checkpoint takes no demonstrations: its method is {config.method}.")
+        camera, meta = config.cameras[0], self._dataset.meta
+        if camera not in meta.camera_keys:
+            raise PlayError(
+                f"The dataset {self._name!r} has no camera {camera!r}, which the checkpoint expects. Its "
+                f"cameras are {', '.join(meta.camera_keys) or 'none'}."
+            )
+        if not _needs_robot(config):
+            return
+        for key, feature in ((OBS_STATE, config.robot_state_feature), (ACTION, config.action_feature)):
+            expected = None if feature is None else tuple(feature.shape)
+            found = tuple(meta.features[key]["shape"]) if key in meta.features else None
+            if expected is not None and found != expected:
+                got = "none" if found is None else f"the shape {found}"
+                raise PlayError(
+                    f"The dataset {self._name!r} has the wrong features: the checkpoint expects {key!r} of "
+                    f"the shape {expected}, and the dataset has {got}."
+                )
+
+    def demonstration(self, task: str, number: int, config: DeltacoConfig) -> Demonstration:
+        """An episode as a demonstration for a policy.
+
+        Args:
+            task: Task string.
+            number: Number of the episode among those of the task, from 1.
+            config: The policy's.
+
+        Raises:
+            PlayError: There is none, or it does not fit the policy.
+        """
+        check_number(self.counts, task, number, "dataset")
+        self.check_fits(config)
+        episode = self._rows[task][number - 1]
+        start, end = self._spans[episode]
+        if not 2 <= end - start <= MAX_FRAMES:
+            raise PlayError(
+                f"A demonstration has 2 to {MAX_FRAMES} frames. Episode {episode} has {end - start}."
+            )
+        try:
+            items = [self._dataset[index] for index in range(start, end)]
+            images = to_uint8(torch.stack([item[config.cameras[0]] for item in items]))  # (frames, 3, H, W)
+            robot = self._robot(items, config)
+        except Exception as error:
+            raise self._unreadable(error) from error
+        title = f"{task} ({number} of {self.counts[task]} in {self._name})"
+        film = _film(images)
+        return demonstration_of(title, images, robot, config, film, round(self._dataset.meta.fps))
+
+    @staticmethod
+    def _robot(items: Sequence[dict[str, Any]], config: DeltacoConfig) -> tuple[Tensor, Tensor] | None:
+        """States of the robot and commands of its gripper, if the policy needs them."""
+        if not _needs_robot(config):
+            return None
+        states, actions = (
+            torch.stack([item[name] for item in items]).float() for name in (OBS_STATE, ACTION)
+        )
+        return states, actions[:, config.gripper_index]
+
+    def _unreadable(self, error: Exception) -> PlayError:
+        reason = " ".join(str(error).split())[:200]
+        return PlayError(
+            f"The dataset {self._name!r} cannot be read ({type(error).__name__}): files are missing, damaged "
+            f"or of another version of LeRobot. {reason}"
+        )
+
+
+def _needs_robot(config: DeltacoConfig) -> bool:
+    """Whether a policy needs the robot's state at the grasp of a demonstration."""
+    return config.locates_goals and config.grasp_depth and config.gripper_index is not None
+
+
+def _check_info(folder: Path, name: str) -> None:
+    """Checks that a folder holds a dataset whose files are all within it.
+
+    Raises:
+        PlayError: It does not.
+    """
+    if not (folder / INFO_FILE).is_file():
+        raise PlayError(
+            f"{name!r} is not a LeRobotDataset: {INFO_FILE} is missing. Enter the folder that has `meta`, "
+            "`data` and, for videos, `videos` in it."
+        )
+    info = read_json(folder / INFO_FILE, name)
+    features = info.get("features")
+    if not isinstance(features, dict) or not all(isinstance(value, dict) for value in features.values()):
+        raise PlayError(f"{name!r} is not a LeRobotDataset: {INFO_FILE} has no features.")
+    for option, valid in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
+        if info.get(option) not in (None, valid):
+            raise PlayError(f"{name!r} is refused: its `{option}` is {info[option]!r}, not {valid!r}.")
+    odd = next((key for key in features if "/" in key or "\\" in key or ".." in key), None)
+    if odd is not None:
+        raise PlayError(f"{name!r} is refused: the feature {odd!r} may lead out of the dataset.")
+
+
+def _check_images(dataset: LeRobotDataset, name: str) -> None:
+    """Checks that the images are in the dataset's files, rather than named by paths or addresses.
+
+    Raises:
+        PlayError: They are not.
+    """
+    for key, feature in dataset.meta.features.items():
+        if feature.get("dtype") == "image":
+            column = dataset.hf_dataset.data.column(key)
+            if sum(pc.struct_field(chunk, "bytes").null_count for chunk in column.chunks):
+                raise PlayError(f"{name!r} is refused: some images of {key!r} lie in other files.")
+
+
+def _film(images: Tensor) -> list[np.ndarray]:
+    """Images (frames, 3, H, W) for people: small ones with visible pixels, and of even height and width."""
+    height, width = images.shape[-2:]
+    factor = 1
+    if max(height, width) < _FILM_SIZE:
+        factor = 2 * -(-_FILM_SIZE // (2 * max(height, width)))
+    images = images[..., : height * factor // 2 * 2 // factor, : width * factor // 2 * 2 // factor]
+    return [np.asarray(enlarged(image, factor)) for image in images.permute(0, 2, 3, 1).numpy()]
