@@ -273,7 +273,8 @@ class Player:
             scene: The scene.
 
         Yields:
-            The episode after each step, and at the end the demonstration that it makes.
+            The episode after each step, and before the last of these the demonstration that it makes, so that
+            the demonstration can be used once the end is seen.
         """
         task = get_task(scene.task_id)
         with closing(_environment(scene, self._camera_size)) as env:
@@ -283,14 +284,14 @@ class Player:
                 states.append(step.observation["agent_pos"])
                 gripper.append(float(step.action[-1]))
                 film.append(env.scene.render(RENDER_SIZE))
-                text = f"Expert, {number} of {EPISODE_STEPS} steps: {step.stage.value}"
-                if number == EPISODE_STEPS:
-                    text = f"Expert. {outcome(step.info, -1)}"
-                yield Moment(film[-1], None, text)
+                if number < EPISODE_STEPS:
+                    text = f"Expert, {number} of {EPISODE_STEPS} steps: {step.stage.value}"
+                    yield Moment(film[-1], None, text)
         images = torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2)
         robot = torch.from_numpy(np.stack(states)), torch.tensor(gripper)
         title = f"{task.instruction} (by the expert, seed {scene.seed})"
         yield demonstration_of(title, images, robot, self.policy.config, film, CONTROL_FPS)
+        yield Moment(film[-1], None, f"Expert. {outcome(step.info, -1)}")
 
     def _batch(self, observation: dict[str, NDArray[Any]], sentence: str) -> dict[str, Any]:
         batch = preprocess_observation({name: value[None] for name, value in observation.items()})

@@ -22,6 +22,7 @@ PAGE = Path("docs", "leaderboard.md")
 # Between these lines of the page, the table stands.
 BEGIN, END = "<!-- The table is made from results/leaderboard.yaml. -->", "<!-- End of the table. -->"
 NOT_RUN = "not run"
+AMBIGUITY = "container"
 _HEADER = ("method", "given", "success, % [95 %]", *KINDS, "seeds", "training", "commit", "command")
 
 
@@ -88,7 +89,8 @@ def table(root: Path) -> str:
         root: Folder of the repository.
 
     Raises:
-        LeaderboardError: A row's records are of other tasks or of several experiments.
+        LeaderboardError: A row's records are of other tasks, of another ambiguity scheme, or of several
+            experiments.
         ReportError: A row's folder has no records, or they do not belong together.
         RecordError: A record is damaged.
     """
@@ -139,6 +141,11 @@ def _cells(row: Row, root: Path, tasks: str) -> Sequence[str]:
         raise LeaderboardError(
             f"The records of {row.method!r} are of the tasks {recorded.tasks!r}. The leaderboard is of "
             f"{tasks!r}."
+        )
+    if recorded.ambiguity != AMBIGUITY:
+        raise LeaderboardError(
+            f"The records of {row.method!r} are of the ambiguity scheme {recorded.ambiguity!r}. The leaderboard "
+            f"is of {AMBIGUITY!r}."
         )
     estimate = mean_rate(series.last_task_rates)
     rates: dict[str, Any] = {
