@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gym_deltaco.tasks import get_task
 from lerobot_deltaco.commands import evaluate as evaluate_command
 from lerobot_deltaco.common.run_folder import RunError, checkpoints
 from lerobot_deltaco.evaluation import processes
@@ -162,12 +163,28 @@ def test_the_number_of_demonstrations_is_overridden_and_recorded(tmp_path, capsy
     assert "other demonstrations" in capsys.readouterr().err
 
 
-def test_what_a_policy_cannot_do_without_is_not_left_out(tmp_path, capsys):
+def test_the_demonstration_or_the_instruction_is_left_out(tmp_path, capsys):
+    for modality, demonstration in (("demo", None), ("instruction", get_task(24).instruction)):
+        out = tmp_path / modality
+        record = command(out, "--leave-out", modality, "--processes", "1", tasks="24")
+        assert record.policy["leave_out"] == modality
+        assert {episode.demonstration for episode in record.episodes} == {demonstration}
+        with pytest.raises(SystemExit):
+            command(out, tasks="24")
+        assert "belongs to another evaluation" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         evaluate_command.main([str(CHECKPOINT), "--tasks", "24", "--leave-out", "demo"])
     assert "with something left out" in capsys.readouterr().err
+
+
+def test_what_a_policy_cannot_do_without_is_not_left_out(tmp_path, capsys):
+    copy = shutil.copytree(CHECKPOINT, tmp_path / "copy")
+    config = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps({**config, "demo_dropout": 0.0}))
     with pytest.raises(SystemExit):
-        command(tmp_path, "--leave-out", "demo", tasks="24")
+        evaluate_command.main(
+            [str(copy), "--tasks", "24", "--leave-out", "demo", "--out", str(tmp_path / "out")]
+        )
     assert "this policy was not trained without it: `demo_dropout` is 0" in capsys.readouterr().err
 
 

@@ -11,7 +11,16 @@ import yaml
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.record import read_record
 from lerobot_deltaco.experiments.config import SHARED, experiment_names, read_experiment
-from lerobot_deltaco.reporting.leaderboard import PAGE, ROWS_FILE, LeaderboardError, read_rows, table, updated
+from lerobot_deltaco.reporting.leaderboard import (
+    AMBIGUITY,
+    PAGE,
+    ROWS_FILE,
+    LeaderboardError,
+    read_rows,
+    table,
+    updated,
+)
+from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS
 from lerobot_deltaco.reporting.report import write_report
 from lerobot_deltaco.reporting.series import find_records
 
@@ -103,10 +112,22 @@ def test_the_leaderboard_is_what_the_records_give():
     assert updated(page, ROOT) == page, "Write it anew: python scripts/leaderboard.py"
 
 
+def is_method(experiment):
+    """Whether an experiment is a method of its own, rather than an ablation of one."""
+    return not PAPER_RESULTS.keys() & {f"ablations/{experiment.rpartition('/')[2]}"}
+
+
 def test_the_leaderboard_has_all_methods_that_were_run():
-    _, rows = read_rows(ROOT / ROWS_FILE)
+    tasks, rows = read_rows(ROOT / ROWS_FILE)
     listed = {ROOT / "results" / row.records for row in rows if row.records is not None}
-    run = {path for records in RECORDS for path in records.iterdir() if "validation" not in str(path)}
+    experiments = [path for records in RECORDS for path in records.iterdir()]
+    examples = {path: read_record(find_records([path])[0]) for path in experiments}
+    run = {
+        path
+        for path, record in examples.items()
+        if (record.tasks, record.ambiguity) == (tasks, AMBIGUITY) and is_method(record.experiment)
+    }
+    assert run
     assert run <= listed  # which may have further evaluations of them
     assert all(path.is_dir() for path in listed)
 
@@ -145,6 +166,13 @@ def test_records_of_other_tasks_are_no_row(tmp_path):
     with pytest.raises(
         LeaderboardError, match="are of the tasks 'scenario_a_test'. The leaderboard is of 'all'"
     ):
+        table(tmp_path)
+    (record,) = copy.rglob("0024000.json")
+    record.write_text(record.read_text().replace('"ambiguity": "container"', '"ambiguity": "object"'))
+    (tmp_path / ROWS_FILE).write_text(f"tasks: scenario_a_test\nrows:\n  - {ROW}\n{rest}")
+    for other in set(copy.rglob("*.json")) - {record}:
+        other.unlink()
+    with pytest.raises(LeaderboardError, match="are of the ambiguity scheme 'object'"):
         table(tmp_path)
     with pytest.raises(LeaderboardError, match="needs the lines"):
         updated("no place", tmp_path)

@@ -144,8 +144,8 @@ def _cells(row: Row, root: Path, tasks: str) -> Sequence[str]:
         )
     if recorded.ambiguity != AMBIGUITY:
         raise LeaderboardError(
-            f"The records of {row.method!r} are of the ambiguity scheme {recorded.ambiguity!r}. The leaderboard "
-            f"is of {AMBIGUITY!r}."
+            f"The records of {row.method!r} are of the ambiguity scheme {recorded.ambiguity!r}. The "
+            f"leaderboard is of {AMBIGUITY!r}."
         )
     estimate = mean_rate(series.last_task_rates)
     rates: dict[str, Any] = {
