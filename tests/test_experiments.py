@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -28,6 +29,7 @@ from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.finished_dataset import UNFINISHED
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
+from lerobot_deltaco.evaluation.record import read_record
 from lerobot_deltaco.experiments import command_runner, gpus, side_by_side
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
 from lerobot_deltaco.experiments.config import ExperimentConfigError, experiment_names, read_experiment
@@ -150,6 +152,31 @@ def test_a_row_that_starts_from_another_needs_it(tmp_path, monkeypatch):
     config = read_experiment(FOLDER, "scenario_a/demo_only_finetuned_10")
     with pytest.raises(ExperimentError, match="starts from scenario_a/demo_only.*Run that experiment first"):
         ExperimentRun(config, 3, tmp_path).run()
+
+
+def test_fine_tuning_starts_from_the_seed_with_the_highest_success(tmp_path):
+    name = "small_a/demo_only_finetuned_10"
+    run = ExperimentRun(read_experiment(FOLDER, name), 0, tmp_path)
+    with pytest.raises(ExperimentError, match="not trained and evaluated with any seed"):
+        run.train_and_evaluate(CommandRunner())
+    records = Path(__file__).parents[1] / "results/small_a/records/demo_only"
+    for seed in (0, 1, 2):
+        finish_training(tmp_path, "small_a/demo_only", seed, 24_000)
+        if seed < 2:  # the third is trained, but not evaluated
+            shutil.copytree(
+                records / f"seed_{seed}", run_folder(tmp_path, "small_a/demo_only", seed), dirs_exist_ok=True
+            )
+    rates = [read_record(records / f"seed_{seed}/evaluations/0024000.json").success_rate for seed in (0, 1)]
+    assert rates[1] > rates[0]
+    (train,) = (command for command in run.commands() if command.name == "train")
+    assert any(f"{Path('small_a/demo_only/seed_1/checkpoints')}" in option for option in train.arguments)
+    # Each of the seeds is waited for, and no other experiment's.
+    assert run.may_start_from(run_folder(tmp_path, "small_a/demo_only", 2))
+    assert not run.may_start_from(run_folder(tmp_path, "small_a/deltaco", 0))
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "config.yaml").write_text("start_from_seed: 3\n")
+    with pytest.raises(ExperimentConfigError, match="must be 'same' or 'best'. Got 3"):
+        read_experiment(tmp_path, "one/config")
 
 
 def test_rows_share_their_data(tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ import yaml
 
 SHARED = "shared.yaml"
 EXTENDS = "extends"
+SAME_SEED, BEST_SEED = "same", "best"
 _SECTIONS = ("data", "demonstrations", "policy", "training", "evaluation")
 
 
@@ -32,8 +33,9 @@ class ExperimentConfig:
         policy: Options of `--policy`.
         training: Further options of `deltaco-train`.
         evaluation: Arguments of the evaluation sets, as `EvaluationPlan` has them.
-        start_from: Name of the experiment whose last checkpoint, with the same seed, is fine-tuned; None to
-            train from scratch.
+        start_from: Name of the experiment whose last checkpoint is fine-tuned; None to train from scratch.
+        start_from_seed: Seed of that experiment: "same", the run's own, or "best", the one with the highest
+            success rate at its last step, as in the paper.
     """
 
     name: str
@@ -43,6 +45,7 @@ class ExperimentConfig:
     training: Mapping[str, Any]
     evaluation: Mapping[str, Any]
     start_from: str | None = None
+    start_from_seed: str = SAME_SEED
 
 
 def default_folder() -> Path:
@@ -84,7 +87,14 @@ def read_experiment(folder: Path, name: str, settings: Sequence[str] = ()) -> Ex
     for setting in settings:
         merged = _merged(merged, _parsed(setting))
     sections = {section: merged.get(section, {}) for section in _SECTIONS}
-    return ExperimentConfig(name, **sections, start_from=merged.get("start_from"))
+    start_from_seed = merged.get("start_from_seed", SAME_SEED)
+    if start_from_seed not in (SAME_SEED, BEST_SEED):
+        raise ExperimentConfigError(
+            f"`start_from_seed` of {name} must be {SAME_SEED!r} or {BEST_SEED!r}. Got {start_from_seed!r}."
+        )
+    return ExperimentConfig(
+        name, **sections, start_from=merged.get("start_from"), start_from_seed=start_from_seed
+    )
 
 
 def _shared_files(folder: Path, room: Path) -> list[Path]:
@@ -115,11 +125,11 @@ def _read(path: Path) -> dict[str, Any]:
     content = _content(path)
     if path.name == SHARED:
         content.pop(EXTENDS, None)
-    unknown = set(content) - {*_SECTIONS, "start_from"}
+    unknown = set(content) - {*_SECTIONS, "start_from", "start_from_seed"}
     if unknown:
         raise ExperimentConfigError(
             f"{path} has the unknown section {sorted(unknown)[0]!r}. Valid are {', '.join(_SECTIONS)} and "
-            "start_from."
+            "start_from and start_from_seed."
         )
     return content
 

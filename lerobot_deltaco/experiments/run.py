@@ -15,9 +15,9 @@ from typing import Any, Literal, NamedTuple, get_args
 from gym_deltaco.atomic_files import write_json
 from lerobot_deltaco.common.run_folder import last_policy, last_step, last_train_config
 from lerobot_deltaco.data.finished_dataset import is_finished
-from lerobot_deltaco.evaluation.record import RECORDS_FOLDER
+from lerobot_deltaco.evaluation.record import RECORDS_FOLDER, read_record, record_path
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
-from lerobot_deltaco.experiments.config import ExperimentConfig
+from lerobot_deltaco.experiments.config import BEST_SEED, SAME_SEED, ExperimentConfig
 
 Step = Literal["collect", "train", "evaluate"]
 STEPS: tuple[Step, ...] = get_args(Step)
@@ -162,7 +162,7 @@ class ExperimentRun:
             "demonstrations": dict(self.config.demonstrations),
             "policy": dict(self.config.policy),
             "training": dict(self.config.training),
-            "start_from": self.config.start_from,
+            "start_from": self._start_in_words(),
         }
 
     def _collect_commands(self) -> list[Command]:
@@ -211,24 +211,53 @@ class ExperimentRun:
             if "image_size" in self.config.data:
                 options["env.image_size"] = self.config.data["image_size"]
         start = self._start_folder()
-        if start is None:
+        if self.config.start_from is None:
             options = {"policy.type": "deltaco", **options}
         else:
+            # Without any run to start from, a dry run shows where the run's own seed would be.
+            start = start or run_folder(self.outputs, self.config.start_from, self.seed)
             options = {"policy.path": last_policy(start), **options}
         return Command("train", [f"--{name}={_text(value)}" for name, value in options.items()])
 
+    def may_start_from(self, folder: Path) -> bool:
+        """Whether the run in a folder is one that this one starts from, or may be."""
+        start = self.config.start_from
+        if start is None:
+            return False
+        own = run_folder(self.outputs, start, self.seed)
+        return folder == own or (self.config.start_from_seed == BEST_SEED and folder.parent == own.parent)
+
     def _start_folder(self) -> Path | None:
-        if self.config.start_from is None:
+        """The folder of the run that this one starts from; None without one."""
+        start = self.config.start_from
+        if start is None:
             return None
-        return run_folder(self.outputs, self.config.start_from, self.seed)
+        own = run_folder(self.outputs, start, self.seed)
+        if self.config.start_from_seed == SAME_SEED:
+            return own if last_policy(own).exists() else None
+        rates = {}
+        for folder in sorted(own.parent.glob("seed_*/")):
+            if last_train_config(folder).exists():
+                path = record_path(folder, last_step(folder))
+                if path.exists():
+                    rates[folder] = read_record(path).success_rate
+        return max(rates, key=lambda folder: rates[folder]) if rates else None
+
+    def _start_in_words(self) -> str | None:
+        if self.config.start_from_seed == BEST_SEED:
+            return f"{self.config.start_from}, the best seed"
+        return self.config.start_from
 
     def _check_start(self) -> None:
-        start = self._start_folder()
-        if start is not None and not last_policy(start).exists():
-            raise ExperimentError(
-                f"{self.config.name} starts from {self.config.start_from}, which was not trained with seed "
-                f"{self.seed}. Run that experiment first."
-            )
+        if self.config.start_from is None or self._start_folder() is not None:
+            return
+        lacks = f"trained with seed {self.seed}"
+        if self.config.start_from_seed == BEST_SEED:
+            lacks = "trained and evaluated with any seed"
+        raise ExperimentError(
+            f"{self.config.name} starts from {self.config.start_from}, which was not {lacks}. Run that "
+            "experiment first."
+        )
 
     def _evaluate_command(self) -> Command:
         """The command that evaluates the checkpoints that the training has not evaluated."""

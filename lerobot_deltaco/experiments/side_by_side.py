@@ -20,7 +20,7 @@ from tqdm import tqdm
 from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.experiments.command_runner import CommandRunner
 from lerobot_deltaco.experiments.gpus import gpu_of_its_own, visible_gpus
-from lerobot_deltaco.experiments.run import ExperimentRun, Step, run_folder
+from lerobot_deltaco.experiments.run import ExperimentRun, Step
 
 SECONDS_BETWEEN_LOOKS = 1.0
 SECONDS_BETWEEN_LINES = 60.0  # where what is printed goes to a file
@@ -143,8 +143,7 @@ def _next(waiting: Sequence[ExperimentRun], running: Collection[_Running]) -> Ex
     """The first that does not start from one that is still to be completed."""
     incomplete = {experiment.folder for experiment in (*waiting, *(now.experiment for now in running))}
     for experiment in waiting:
-        start = experiment.config.start_from
-        if start is None or run_folder(experiment.outputs, start, experiment.seed) not in incomplete:
+        if not any(experiment.may_start_from(folder) for folder in incomplete - {experiment.folder}):
             return experiment
     return waiting[0] if waiting and not running else None  # one that says what it lacks
 
