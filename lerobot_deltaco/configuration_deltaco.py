@@ -414,6 +414,12 @@ class DeltacoConfig(PreTrainedConfig):
                 f"`demo_encoder={CORRESPONDENCE}`. Set them to 0, or choose these. Got {self.method!r} and "
                 f"{self.demo_encoder!r}."
             )
+        film, concat, _ = self.conditioning
+        if self.instruction_dropout and (film, concat) != ("none", "none"):
+            raise ValueError(
+                "With `instruction_dropout`, the instruction is an input of the locator alone: `film` and "
+                f"`concat` must be 'none'. Got {film!r} and {concat!r}."
+            )
         if sum(dropouts.values()) >= 1:
             raise ValueError(
                 "`demo_dropout` and `instruction_dropout` must sum to less than 1, so that some samples have "
@@ -519,6 +525,11 @@ class DeltacoConfig(PreTrainedConfig):
         if self.locates_goals and "language" in METHODS[self.method]:
             return True
         return "language" in film or "language" in concat or encoder_loss != "none"
+
+    @property
+    def language_is_input(self) -> bool:
+        """Whether the network gets the instructions' embeddings, through FiLM or concatenated."""
+        return any("language" in part for part in self.conditioning[:2])
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -460,7 +460,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             demonstrations, rows = self._choose_eval_demonstrations(tasks, trials)
             generator = torch.Generator().manual_seed(self.config.seed)
             demo = self._embedder.embed_demonstrations(demonstrations, rows, generator, self.training)
-        if self.config.uses_language:
+        if self.config.language_is_input:
             language = self._embedder.embed_instructions(tasks, images.device)
         if self.config.method == "mcil":
             assert language is not None

@@ -360,13 +360,17 @@ def trained_to_find(dataset, n_steps, **options):
 
 
 def share_found(policy, dataset, episodes):
-    """Shares of the grasps and of the releases that are found within 3 px, in the other 20 episodes."""
+    """Share of the grasps found within 3 px, and of the releases in x, in the other 20 episodes.
+
+    The task and the demonstration say on which side the release is; its y is that of the scene's own thing.
+    """
     held_out = range(40, 60)
     batch = batch_of(dataset, [episode * LENGTH for episode in held_out])
     conditioning = policy.encode_task(tuple(batch["task"]), batch["observation.image"][:, None])
     true = torch.from_numpy(np.stack([np.stack(episodes[n][1::2]) for n in held_out])).float()
-    errors = (conditioning.goals.places - true).norm(dim=2) * SIZE / 2
-    return (errors < 3).float().mean(dim=0).tolist()
+    errors = (conditioning.goals.places - true) * SIZE / 2
+    found = torch.stack([errors[:, 0].norm(dim=1) < 3, errors[:, 1, 0].abs() < 3])
+    return found.float().mean(dim=1).tolist()
 
 
 def test_it_learns_to_find_what_a_demonstration_moved(dataset, episodes):
@@ -378,7 +382,7 @@ def test_it_learns_to_do_without_a_demonstration_or_an_instruction(dataset, epis
     policy = trained_to_find(dataset, 150, demo_dropout=0.3, instruction_dropout=0.3)
     for leave_out in (None, "demo", "instruction"):
         policy.config.leave_out = leave_out
-        assert share_found(policy, dataset, episodes)[0] > 0.85, leave_out
+        assert min(share_found(policy, dataset, episodes)) > 0.85, leave_out
 
 
 def test_what_is_left_out_does_not_matter(dataset):
@@ -418,6 +422,26 @@ def test_without_a_demonstration_none_is_needed(dataset, tmp_path):
     loaded.config.leave_out = "demo"
     loaded.reset()
     assert loaded.select_action(observation).shape == (1, 3)
+    # What is left out is a choice of one evaluation, and not of the checkpoint.
+    loaded.save_pretrained(tmp_path / "again")
+    assert DeltacoPolicy.from_pretrained(tmp_path / "again").config.leave_out is None
+
+
+def test_without_an_instruction_none_is_embedded(dataset):
+    policy, before, _ = small_policy(
+        dataset,
+        **CORRESPONDENCE,
+        instruction_dropout=0.5,
+        demo_repo_id="test/table",
+        demo_root=str(dataset.root),
+    )
+    policy.forward(before(batch_of(dataset, [0, LENGTH])))
+    policy.eval()
+    policy.config.leave_out, policy.config.demo_episode = "instruction", 0
+    batch = before(batch_of(dataset, [0]))
+    known = dict(policy.instructions.rows)
+    policy.select_action({**batch, "task": ["a sentence that nobody knows"]})
+    assert policy.instructions.rows == known
 
 
 @pytest.mark.parametrize("method", ["deltaco", "demo_only", "language_only", "one_hot"])
@@ -533,6 +557,7 @@ def test_several_demonstrations_are_combined(dataset):
         ({"frames_after_release": -1}, "`frames_after_release` must be at least 0"),
         ({"demo_dropout": 0.1, "method": "demo_only"}, "`demo_dropout` and .* need `method=deltaco`"),
         ({"demo_dropout": 0.5, "instruction_dropout": 0.5}, "must sum to less than 1"),
+        ({"film": "language", "instruction_dropout": 0.5}, "`film` and `concat` must be 'none'"),
         ({"leave_out": "demo", "instruction_dropout": 0.5}, "`demo_dropout` is 0"),
         ({"leave_out": "language", "demo_dropout": 0.5}, "`leave_out` must be one of demo, instruction"),
     ],

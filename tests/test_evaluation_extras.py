@@ -168,10 +168,11 @@ def test_the_demonstration_or_the_instruction_is_left_out(tmp_path, capsys):
         out = tmp_path / modality
         record = command(out, "--leave-out", modality, "--processes", "1", tasks="24")
         assert record.policy["leave_out"] == modality
+        assert record.experiment == f"small_a_correspondence_without_{modality}"
         assert {episode.demonstration for episode in record.episodes} == {demonstration}
         with pytest.raises(SystemExit):
             command(out, tasks="24")
-        assert "belongs to another evaluation" in capsys.readouterr().err
+        assert "belongs to another" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         evaluate_command.main([str(CHECKPOINT), "--tasks", "24", "--leave-out", "demo"])
     assert "with something left out" in capsys.readouterr().err

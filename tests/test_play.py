@@ -586,13 +586,27 @@ def test_images_that_lie_in_other_files_are_not_read(checkpoints, tmp_path):
         EpisodeDataset(str(folder), [tmp_path], False)
 
 
+def test_columns_that_declare_themselves_as_files_are_not_read(checkpoints, tmp_path):
+    folder = shutil.copytree(checkpoints / "dataset", tmp_path / "changed")
+    (file,) = folder.glob("meta/episodes/*/*.parquet")
+    table = pq.read_table(file)
+    declared = {"info": {"features": {"tasks": {"_type": "List", "feature": {"_type": "Image"}}}}}
+    changed = table.replace_schema_metadata({"huggingface": json.dumps(declared)})
+    pq.write_table(changed, file)
+    with pytest.raises(PlayError, match="meta/episodes/.*parquet has a column of the type 'Image'"):
+        EpisodeDataset(str(folder), [tmp_path], False)
+    file.write_bytes(b"PAR1")
+    with pytest.raises(PlayError, match="is damaged: meta/episodes/.* cannot be read"):
+        EpisodeDataset(str(folder), [tmp_path], False)
+
+
 def test_what_a_folder_lacks_is_not_downloaded(checkpoints, tmp_path, monkeypatch):
     folder = shutil.copytree(checkpoints / "dataset", tmp_path / "changed")
     shutil.rmtree(folder / "data")
     sent = []
     monkeypatch.setattr(httpx.Client, "send", lambda *args, **kwargs: sent.append(args))
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
-    with pytest.raises(PlayError, match="cannot be read .*files are missing"):
+    with pytest.raises(PlayError, match="cannot be read: files are missing"):
         EpisodeDataset(str(folder), [tmp_path], False)
     assert not sent
     assert not (folder / "data").exists()

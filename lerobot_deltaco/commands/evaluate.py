@@ -118,7 +118,8 @@ def _evaluate(
     command: str,
 ) -> None:
     folder = options.out or run
-    experiment = options.experiment or description.experiment
+    left_out = "" if options.leave_out is None else f"_without_{options.leave_out}"
+    experiment = options.experiment or description.experiment + left_out
     if description.policy_type != "deltaco":
         ours = {
             "demo_repo_id": "--policy.demo_repo_id",

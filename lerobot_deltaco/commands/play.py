@@ -29,9 +29,9 @@ def main(arguments: list[str] | None = None) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="folder from which the page may load checkpoints; may be repeated (default: the current folder)",
+        help="folder of checkpoints and datasets for the page; may be repeated (default: the current folder)",
     )
-    parser.add_argument("--no-hub", action="store_true", help="download no checkpoints from the Hub")
+    parser.add_argument("--no-hub", action="store_true", help="download nothing from the Hub")
     parser.add_argument("--host", default="127.0.0.1", help="address to serve at (default: %(default)s)")
     parser.add_argument("--port", type=int, default=7860, help="port to serve at (default: %(default)s)")
     parser.add_argument("--open", action="store_true", help="open the page in the browser")

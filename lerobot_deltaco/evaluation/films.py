@@ -132,6 +132,8 @@ def write_explanations(
     assert loaded.policy.goals is not None
     locator = loaded.policy.goals.locator
     from_demonstration = (locator.grasp_source == "demo", locator.release_source == "demo")
+    if loaded.policy.config.leave_out == "instruction":
+        from_demonstration = (True, True)
     chosen = _evenly(record.episodes, n_episodes)
     written = []
     with _NewFolder(folder / EXPLANATIONS) as new:

@@ -23,8 +23,9 @@ from lerobot_deltaco.policy.task_file import (
 
 # Prefix that the names of the weights of `DeltacoPolicy.model` had in version 0.1.
 OLD_MODEL_PREFIX = "policy."
-# Options that name files whose contents a checkpoint holds.
+# Options that name files whose contents a checkpoint holds, and the one that is a choice of each evaluation.
 _SOURCES = (
+    "leave_out",
     "demo_repo_id",
     "demo_root",
     "instruction_embeddings",

@@ -1,18 +1,23 @@
 """Datasets whose episodes are demonstrations. Nothing is read from anywhere but the dataset itself.
 
 LeRobot downloads what a folder lacks, reads files wherever a dataset's `info.json` says, and opens paths and
-addresses that its images name. So a dataset is checked here before LeRobot reads its episodes.
+addresses that its images name: those of the data, and of any column of its metadata that declares itself as
+images. So a dataset is checked here before LeRobot reads its episodes.
 """
 
 from __future__ import annotations
 
+import json
+import logging
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH
@@ -27,7 +32,11 @@ from lerobot_deltaco.play.sources import DATASET, find_folder, read_json
 from lerobot_deltaco.policy.dataset_folders import INFO_FILE
 from lerobot_deltaco.policy.demonstrations import to_uint8
 
+logger = logging.getLogger(__name__)
+
 MAX_FRAMES = 1000  # of an episode
+# Types of columns that hold what is in them.
+_PLAIN_TYPES = {"Value", "Sequence", "List", "LargeList"}
 _FILM_SIZE = 192  # px, at least, of the longer side of a video
 # No repository can have this name, so that LeRobot cannot download what a folder lacks.
 _NO_REPOSITORY = "a/local/folder"
@@ -52,6 +61,7 @@ class EpisodeDataset:
         folder = find_folder(name, DATASET, roots, is_hub_allowed)
         self._name = name.strip()
         _check_info(folder, self._name)
+        _check_columns(folder, self._name)
         try:
             self._dataset = LeRobotDataset(_NO_REPOSITORY, root=folder, return_uint8=True)
             _check_images(self._dataset, self._name)
@@ -143,10 +153,11 @@ class EpisodeDataset:
         return states, actions[:, config.gripper_index]
 
     def _unreadable(self, error: Exception) -> PlayError:
-        reason = " ".join(str(error).split())[:200]
+        # The details, which name files of this machine, are for the terminal.
+        logger.warning("The dataset %r cannot be read.", self._name, exc_info=error)
         return PlayError(
-            f"The dataset {self._name!r} cannot be read ({type(error).__name__}): files are missing, damaged "
-            f"or of another version of LeRobot. {reason}"
+            f"The dataset {self._name!r} cannot be read: files are missing, damaged or of another version of "
+            "LeRobot."
         )
 
 
@@ -176,6 +187,33 @@ def _check_info(folder: Path, name: str) -> None:
     odd = next((key for key in features if "/" in key or "\\" in key or ".." in key), None)
     if odd is not None:
         raise PlayError(f"{name!r} is refused: the feature {odd!r} may lead out of the dataset.")
+
+
+def _check_columns(folder: Path, name: str) -> None:
+    """Checks that no column of the metadata declares itself as images or other files, which would be opened.
+
+    Raises:
+        PlayError: One does, or a file cannot be read.
+    """
+    for path in sorted((folder / "meta").rglob("*.parquet")):
+        file = path.relative_to(folder).as_posix()
+        try:
+            declared = json.loads((pq.read_schema(path).metadata or {}).get(b"huggingface", b"{}"))
+        except (OSError, ValueError, RecursionError, pa.ArrowException) as error:
+            raise PlayError(f"{name!r} is damaged: {file} cannot be read.") from error
+        odd = sorted(_declared_types(declared) - _PLAIN_TYPES)
+        if odd:
+            raise PlayError(f"{name!r} is refused: {file} has a column of the type {odd[0]!r}.")
+
+
+def _declared_types(declared: Any) -> set[str]:
+    """The types of columns anywhere in a declaration of them."""
+    if isinstance(declared, list):
+        return set().union(*map(_declared_types, declared))
+    if not isinstance(declared, dict):
+        return set()
+    own = {str(declared["_type"])} if "_type" in declared else set()
+    return own.union(*map(_declared_types, declared.values()))
 
 
 def _check_images(dataset: LeRobotDataset, name: str) -> None:

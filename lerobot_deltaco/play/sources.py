@@ -89,16 +89,22 @@ def _allowed_folder(name: str, roots: Sequence[Path]) -> Path | None:
 
 
 def _downloaded(repo_id: str, kind: Kind) -> Path:
-    """The folder of a repository's files, of which only data are fetched."""
+    """The folder of a public repository's files, of which only data are fetched.
+
+    The host's token is not used: visitors are not to see what only the host may.
+    """
     try:
         if not constants.HF_HUB_OFFLINE:
-            info = HfApi().repo_info(repo_id, repo_type=kind.repo_type, files_metadata=True)
+            info = HfApi(token=False).repo_info(repo_id, repo_type=kind.repo_type, files_metadata=True)
             n_bytes = sum(file.size or 0 for file in getattr(info, "siblings", None) or ())
             if n_bytes > MAX_HUB_BYTES:
                 raise PlayError(
                     f"{repo_id!r} has {n_bytes / 1e9:.1f} GB; at most {MAX_HUB_BYTES / 1e9:g} are loaded."
                 )
-        return Path(snapshot_download(repo_id, repo_type=kind.repo_type, allow_patterns=list(kind.patterns)))
+        folder = snapshot_download(
+            repo_id, repo_type=kind.repo_type, allow_patterns=list(kind.patterns), token=False
+        )
+        return Path(folder)
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
         reason = " ".join(str(error).split())[:200]
         raise PlayError(

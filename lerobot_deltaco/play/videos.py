@@ -32,9 +32,10 @@ class VideoFiles:
         if path.exists():
             os.utime(path)
         else:
-            part = Path(tempfile.mkstemp(suffix=".part", dir=folder)[1])
-            part.write_bytes(video)
-            part.rename(path)
+            number, part = tempfile.mkstemp(suffix=".part", dir=folder)
+            with os.fdopen(number, "wb") as file:
+                file.write(video)
+            Path(part).rename(path)
         return str(path)
 
     @staticmethod
