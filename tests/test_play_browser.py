@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on the path"),
 ]
 
-TIMEOUT = 600  # s, also on a busy machine
+TIMEOUT = 300  # s, also on a busy machine
 STANDS_WITHIN = 60  # s; a few seconds on an idle machine
 
 
