@@ -522,7 +522,8 @@ def test_what_is_no_dataset_is_explained(actions, checkpoints, session, tmp_path
 def test_of_a_repository_only_data_are_fetched(checkpoints, monkeypatch):
     fetched = []
 
-    def fetch(repo_id, repo_type, allow_patterns):
+    def fetch(repo_id, repo_type, allow_patterns, token):
+        assert token is False  # the host may see more than its visitors
         fetched.append((repo_id, repo_type))
         assert all(pattern.startswith(("meta/", "data/", "videos/")) for pattern in allow_patterns)
         assert not any(pattern.endswith(("*", ".py")) for pattern in allow_patterns)
