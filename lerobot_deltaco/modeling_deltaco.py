@@ -247,7 +247,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         config, images = self.config, self._images(batch)
         n_samples, device = len(images), images.device
         instructions = self._embedder.draw_instructions(tasks, generator)
-        language = self._embedder.embed_instructions(instructions, device) if config.uses_language else None
+        language = None
+        if config.language_is_input:
+            language = self._embedder.embed_instructions(instructions, device)
         demonstrations = self._training_demonstrations(device)
         assert self.goal_trainer is not None
         rows = demonstrations.episode_rows(batch["episode_index"])

@@ -404,6 +404,8 @@ def test_what_is_left_out_does_not_matter(dataset):
     torch.testing.assert_close(by_instruction.logits, goals(red, "demo", 1).logits)
     assert by_instruction.attention is None
     assert by_demo.attention is not None
+    sources = [goals.from_demonstration for goals in (both, by_demo, by_instruction)]
+    assert sources == [(True, False), (True, True), (False, False)]
     # With both, the demonstration alone says what, and the instruction alone where.
     torch.testing.assert_close(both.logits[:, 1], goals(red, None, 1).logits[:, 1])
     assert not torch.equal(both.logits[:, 0], goals(red, None, 1).logits[:, 0])

@@ -179,7 +179,8 @@ def test_a_map_is_drawn_where_it_is_great():
 
 def test_attention_is_not_drawn_where_the_demonstration_does_not_matter():
     scene = np.full((48, 48, 3), 120, np.uint8)
-    image = draw_explanation(scene, np.stack([scene, scene]), goals_at(6, 18), (True, False), panel_size=96)
+    goals = goals_at(6, 18)._replace(from_demonstration=(True, False))
+    image = draw_explanation(scene, np.stack([scene, scene]), goals, panel_size=96)
     assert not (image[:96, :96] == 120).all()
     second = image[:96, 96 + 8 : 2 * 96 + 8]
     assert (second == 120).all()

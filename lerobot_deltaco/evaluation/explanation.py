@@ -29,7 +29,6 @@ def draw_explanation(
     scene: NDArray[np.uint8],
     demonstration: NDArray[np.uint8] | None,
     goals: FoundGoals | None,
-    from_demonstration: tuple[bool, bool] = (True, True),
     sample: int = 0,
     panel_size: int = 224,
 ) -> NDArray[np.uint8]:
@@ -39,8 +38,7 @@ def draw_explanation(
         scene: First image of an episode, (H, W, 3).
         demonstration: First and last image of the demonstration, (2, H, W, 3); None if the policy takes none.
         goals: Goals that the policy found; None if it finds none, which leaves the images as they are.
-        from_demonstration: Whether the grasp and the release come from the demonstration. What does not is
-            not looked for there, so that its attention says nothing and is not drawn.
+            Attention is drawn for those that were found by the demonstration.
         sample: Number of the scene within the batch that `goals` are of.
         panel_size: Height and width at which each image is drawn, in pixels.
 
@@ -54,7 +52,7 @@ def draw_explanation(
         explained = ("Demonstration: what was moved", "Demonstration: where it was put")
         for number, image in enumerate(demonstration):
             panel = to_image(image).resize((panel_size, panel_size), Image.Resampling.BICUBIC)
-            is_explained = attention is not None and from_demonstration[number]
+            is_explained = goals is not None and goals.from_demonstration[number]
             if attention is not None and is_explained:
                 panel = _overlaid(panel, attention[number : number + 1], _COLORS[number : number + 1])
             panels.append(_captioned(panel, explained[number] if is_explained else plain[number]))
@@ -74,7 +72,6 @@ def draw_episode(
     observed: NDArray[np.uint8],
     demonstration: NDArray[np.uint8] | None,
     goals: FoundGoals,
-    from_demonstration: tuple[bool, bool] = (True, True),
 ) -> NDArray[np.uint8]:
     """Draws where a policy looked, and below it what it did then: images of the episode with both goals.
 
@@ -84,12 +81,11 @@ def draw_episode(
         observed: First image that the policy received, (H, W, 3).
         demonstration: First and last image of the demonstration, (2, H, W, 3); None if the policy takes none.
         goals: Goals that the policy found, of this episode alone.
-        from_demonstration: Whether the grasp and the release come from the demonstration.
 
     Returns:
         One image, (height, width, 3) RGB.
     """
-    top = to_image(draw_explanation(observed, demonstration, goals, from_demonstration))
+    top = to_image(draw_explanation(observed, demonstration, goals))
     n_columns = max(2, round(top.width / _MOMENT_SIZE))
     size = (top.width - GAP * (n_columns - 1)) // n_columns
     moments = []

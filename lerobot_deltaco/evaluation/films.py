@@ -128,21 +128,13 @@ def write_explanations(
         ValueError: The policy finds no goals.
     """
     check_explainable(loaded)
-    assert isinstance(loaded.policy, DeltacoPolicy)
-    assert loaded.policy.goals is not None
-    locator = loaded.policy.goals.locator
-    from_demonstration = (locator.grasp_source == "demo", locator.release_source == "demo")
-    if loaded.policy.config.leave_out == "instruction":
-        from_demonstration = (True, True)
     chosen = _evenly(record.episodes, n_episodes)
     written = []
     with _NewFolder(folder / EXPLANATIONS) as new:
         for episode, film, _ in _run_again(loaded, plan, record, chosen):
             assert film.goals is not None
             title = f"“{episode.instruction}” {in_words(episode)}"
-            image = draw_episode(
-                title, film.images, film.observed, film.demonstration, film.goals, from_demonstration
-            )
+            image = draw_episode(title, film.images, film.observed, film.demonstration, film.goals)
             save_png(to_image(image), new / f"{_file_name(episode)}.png")
             written.append(folder / EXPLANATIONS / f"{_file_name(episode)}.png")
     return written

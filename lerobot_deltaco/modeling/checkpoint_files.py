@@ -37,9 +37,10 @@ _SOURCES = (
 
 @contextmanager
 def without_sources(config: DeltacoConfig) -> Iterator[None]:
-    """Leaves out of a configuration which files were read, while the context is open.
+    """Leaves out of a configuration what is not the checkpoint's, while the context is open.
 
-    What was read from them is saved with the policy, whose next user has other files.
+    What was read from files is saved with the policy, whose next user has other files; and what is left out
+    is chosen anew for each evaluation.
 
     Args:
         config: Configuration of the policy.

@@ -312,11 +312,7 @@ class Player:
         ends = None
         if demonstration is not None and self.policy.config.uses_demo:
             ends = demonstration.ends
-        from_demonstration = (True, True)
-        if self.policy.goals is not None and use == BOTH:
-            locator = self.policy.goals.locator
-            from_demonstration = (locator.grasp_source == "demo", locator.release_source == "demo")
-        image = draw_explanation(observation["pixels"], ends, goals, from_demonstration)
+        image = draw_explanation(observation["pixels"], ends, goals)
         if use == BOTH:
             return image
         return np.asarray(down([caption(f"Used: {use}", image.shape[1]), to_image(image)]))

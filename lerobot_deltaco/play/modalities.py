@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 BOTH, INSTRUCTION_ALONE, DEMONSTRATION_ALONE = "both", "instruction alone", "demonstration alone"
 # What the policy's option `leave_out` is for each of them.
 LEFT_OUT = MappingProxyType({BOTH: None, INSTRUCTION_ALONE: "demo", DEMONSTRATION_ALONE: "instruction"})
+_WORDS = MappingProxyType({"demo": "demonstration", "instruction": "instruction"})
 
 
 class Uses(NamedTuple):
@@ -35,18 +36,14 @@ def learned_uses(config: DeltacoConfig) -> Uses:
         return Uses(reason=f"This checkpoint never takes an instruction: its method is {config.method}.")
     dropouts = {"demo": config.demo_dropout, "instruction": config.instruction_dropout}
     choices = tuple(use for use, part in LEFT_OUT.items() if part is None or dropouts[part] > 0)
-    missing = [f"`{part}_dropout`" for part, dropout in dropouts.items() if not dropout]
+    missing = [part for part, dropout in dropouts.items() if not dropout]
     if not missing:
         return Uses(choices)
     lacking = "either" if len(missing) == 2 else f"the {_WORDS[missing[0]]}"
+    options = " and ".join(f"`{part}_dropout`" for part in missing)
     return Uses(
-        choices,
-        f"This checkpoint has not learned to do without {lacking}: it was trained with "
-        f"{' and '.join(missing)} 0.",
+        choices, f"This checkpoint has not learned to do without {lacking}: it was trained with {options} 0."
     )
-
-
-_WORDS = {"`demo_dropout`": "demonstration", "`instruction_dropout`": "instruction"}
 
 
 @contextmanager

@@ -33,19 +33,22 @@ class FoundGoals(NamedTuple):
         logits: Maps of both over the scene, (batch, 2, h, w).
         attention: Maps of where the object was and where it was put in the demonstration,
             (batch, 2, h, w); None without a demonstration.
+        from_demonstration: Whether the grasp and the release were found by the demonstration. Attention on
+            what was not says nothing.
     """
 
     places: Tensor
     depths: Tensor | None
     logits: Tensor
     attention: Tensor | None
+    from_demonstration: tuple[bool, bool] = (True, True)
 
     def of_sample(self, sample: int) -> FoundGoals:
         """The goals of one sample of the batch, as a batch of one."""
         one = slice(sample, sample + 1)
         depths = None if self.depths is None else self.depths[one]
         attention = None if self.attention is None else self.attention[one]
-        return FoundGoals(self.places[one], depths, self.logits[one], attention)
+        return FoundGoals(self.places[one], depths, self.logits[one], attention, self.from_demonstration)
 
 
 class Demonstrations(NamedTuple):
@@ -167,6 +170,7 @@ class GoalConditioning(nn.Module):
                 takes either.
         """
         description = demonstrated = given = None
+        condition_is_missing = condition is None
         if demonstrations is not None:
             n_each = demonstrations.ends.shape[1]
             each = self.locator.describe(demonstrations.ends.flatten(0, 1))
@@ -193,4 +197,8 @@ class GoalConditioning(nn.Module):
             )
             depths = depths + self.depth_margin
         attention = None if demonstrations is None or description is None else description.attention
-        return FoundGoals(places, depths, located.logits, attention)
+        sources = (self.locator.grasp_source, self.locator.release_source)
+        if self.locator.takes_either and condition_is_missing:
+            sources = ("demo", "demo")
+        grasp, release = (demonstrations is not None and source == "demo" for source in sources)
+        return FoundGoals(places, depths, located.logits, attention, (grasp, release))

@@ -309,7 +309,7 @@ def _markdown(report: Report) -> str:
             f"![Success rates over training steps]({CURVES_IMAGE})\n\n"
             "Lines are means over seeds, bands one standard deviation to both sides. Nothing is smoothed.\n"
         )
-        if _beside_paper(report):
+        if any(paper_result(series.experiment) is not None for series in report.regular):
             sections.append(
                 "## Beside the paper\n\n"
                 f"![Success rates and the paper's]({BESIDE_PAPER_IMAGE})\n\n"
