@@ -20,7 +20,9 @@ from lerobot_deltaco.reporting.leaderboard import (
     table,
     updated,
 )
-from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS
+from lerobot_deltaco.reporting.page_tables import PageTableError, replaced
+from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS, small_scale_experiment
+from lerobot_deltaco.reporting.paper_table import NOT_RUN, PAPER_PAGE, paper_tables, updated_paper_page
 from lerobot_deltaco.reporting.report import write_report
 from lerobot_deltaco.reporting.series import find_records
 
@@ -104,17 +106,51 @@ def test_experiments_that_are_compared_are_evaluated_alike():
         assert all(value == values[0] for value in values), folder
 
 
+# The tables of the pages
+
+
+def test_the_papers_tables_are_what_the_records_give():
+    page = (ROOT / PAPER_PAGE).read_text()
+    assert updated_paper_page(page, ROOT) == page, "Write it anew: python scripts/result_tables.py"
+
+
+def test_the_papers_tables_have_each_row_once():
+    tables = paper_tables(ROOT)
+    for name, result in PAPER_RESULTS.items():
+        row = f"| {result.label} | {100 * result.rate:.1f} ("
+        labels = [other.label for other in PAPER_RESULTS.values()]
+        assert tables.count(row) >= 1, name
+        assert tables.count(f"\n| {result.label} |") == labels.count(result.label)
+
+
+def test_what_was_measured_of_the_papers_rows_is_shown():
+    measured = [
+        name
+        for name in PAPER_RESULTS
+        if (ROOT / "results" / small_scale_experiment(name).replace("/", "/records/")).is_dir()
+    ]
+    assert len(measured) >= 10
+    lines = [line for line in paper_tables(ROOT).splitlines() if line.count("|") > 2]
+    assert sum(NOT_RUN in line for line in lines) == len(PAPER_RESULTS) - len(measured)
+
+
+def test_a_page_without_a_place_for_the_table_is_rejected():
+    with pytest.raises(PageTableError, match="needs the lines 'BEGIN' and 'END'"):
+        replaced("no place", "BEGIN", "END", "| a |")
+
+
 # The leaderboard
 
 
 def test_the_leaderboard_is_what_the_records_give():
     page = (ROOT / PAGE).read_text()
-    assert updated(page, ROOT) == page, "Write it anew: python scripts/leaderboard.py"
+    assert updated(page, ROOT) == page, "Write it anew: python scripts/result_tables.py"
 
 
-def is_method(experiment):
-    """Whether an experiment is a method of its own, rather than an ablation of one."""
-    return not PAPER_RESULTS.keys() & {f"ablations/{experiment.rpartition('/')[2]}"}
+def is_method(record):
+    """Whether an experiment is a method of its own: no ablation, and trained on the templates."""
+    name = record.experiment.rpartition("/")[2]
+    return f"ablations/{name}" not in PAPER_RESULTS and record.policy.get("instructions") is None
 
 
 def test_the_leaderboard_has_all_methods_that_were_run():
@@ -125,7 +161,7 @@ def test_the_leaderboard_has_all_methods_that_were_run():
     run = {
         path
         for path, record in examples.items()
-        if (record.tasks, record.ambiguity) == (tasks, AMBIGUITY) and is_method(record.experiment)
+        if (record.tasks, record.ambiguity) == (tasks, AMBIGUITY) and is_method(record)
     }
     assert run
     assert run <= listed  # which may have further evaluations of them
@@ -174,5 +210,3 @@ def test_records_of_other_tasks_are_no_row(tmp_path):
         other.unlink()
     with pytest.raises(LeaderboardError, match="are of the ambiguity scheme 'object'"):
         table(tmp_path)
-    with pytest.raises(LeaderboardError, match="needs the lines"):
-        updated("no place", tmp_path)

@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING
 from lerobot_deltaco.commands.command_errors import exit_on_error
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from lerobot_deltaco.reporting.series import Report
+    from lerobot_deltaco.reporting.wordings import WordingResult
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -22,10 +25,14 @@ def main(arguments: list[str] | None = None) -> None:
     from lerobot_deltaco.evaluation.record import RecordError
     from lerobot_deltaco.reporting.report import write_report
     from lerobot_deltaco.reporting.series import ReportError
+    from lerobot_deltaco.reporting.wordings import write_wordings_report
 
     with exit_on_error(parser, ReportError, RecordError, OSError, interrupted="Interrupted."):
-        report = write_report(options.runs, options.out, options.authors_levels)
-    sys.stdout.write(_text(report, options.out))
+        if options.by_wording:
+            text = _wordings_text(write_wordings_report(options.runs, options.out), options.out)
+        else:
+            text = _text(write_report(options.runs, options.out, options.authors_levels), options.out)
+    sys.stdout.write(text)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -51,7 +58,26 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="draw the rates of the paper, measured in another simulation, into the curves as dashed lines",
     )
+    parser.add_argument(
+        "--by-wording",
+        action="store_true",
+        help="report instead how success depends on the wording of the instructions: the evaluations may "
+        "differ in their tasks and in --instructions",
+    )
     return parser
+
+
+def _wordings_text(results: Sequence[WordingResult], out: Path) -> str:
+    from lerobot_deltaco.reporting.wordings import WORDINGS_REPORT, wording_label
+
+    lines = [f"{out / WORDINGS_REPORT}: success in % at the last step [95 %]"]
+    for result in results:
+        low, value, high = (100 * rate for rate in (result.rate.low, result.rate.value, result.rate.high))
+        lines.append(
+            f"  {result.experiment}, {result.tasks}, {wording_label(result.wording)}: "
+            f"{value:.1f} [{low:.1f}, {high:.1f}]"
+        )
+    return "\n".join(lines) + "\n"
 
 
 def _text(report: Report, out: Path) -> str:

@@ -272,7 +272,9 @@ def run_folder(outputs: Path, experiment_name: str, seed: int) -> Path:
 
 def dataset_folder(outputs: Path, plan: Mapping[str, Any]) -> Path:
     """The folder of a collection's dataset, which experiments share."""
-    return outputs / "data" / "_".join(f"{key}-{value}" for key, value in sorted(plan.items()))
+    name = "_".join(f"{key}-{value}" for key, value in sorted(plan.items()))
+    # Such as that of "random:100", which not every file system takes.
+    return outputs / "data" / name.replace(":", "-")
 
 
 def missing_records(runs: Sequence[ExperimentRun]) -> str | None:

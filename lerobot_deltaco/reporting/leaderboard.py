@@ -1,6 +1,6 @@
 """The table of docs/leaderboard.md, made from the committed records and `results/leaderboard.yaml`.
 
-`python scripts/leaderboard.py`, in a clone of the repository, writes it anew.
+`python scripts/result_tables.py`, in a clone of the repository, writes it anew.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from typing import Any
 import yaml
 
 from lerobot_deltaco.common.typed_fields import in_words, is_a, type_hints
+from lerobot_deltaco.reporting.page_tables import PageTableError, replaced
+from lerobot_deltaco.reporting.report_files import markdown_table
 from lerobot_deltaco.reporting.series import Series, find_records, make_report
 from lerobot_deltaco.reporting.statistics import KINDS, breakdown
 from lerobot_deltaco.reporting.task_bootstrap import mean_rate
@@ -26,7 +28,7 @@ AMBIGUITY = "container"
 _HEADER = ("method", "given", "success, % [95 %]", *KINDS, "seeds", "training", "commit", "command")
 
 
-class LeaderboardError(ValueError):
+class LeaderboardError(PageTableError):
     """The rows cannot be made into a table; the message says why."""
 
 
@@ -97,23 +99,16 @@ def table(root: Path) -> str:
     tasks, rows = read_rows(root / ROWS_FILE)
     ranked = [(_cells(row, root, tasks), _rate(row, root)) for row in rows]
     ranked.sort(key=lambda item: -item[1])  # stable: what was not run keeps its order
-    lines = [_HEADER, ["---"] * len(_HEADER), *(cells for cells, _ in ranked)]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    return markdown_table(_HEADER, [cells for cells, _ in ranked])
 
 
 def updated(page: str, root: Path) -> str:
-    """A page with the table in its place.
+    """The page with its table made anew.
 
     Raises:
-        LeaderboardError: The page has no place for it.
+        PageTableError: The page has no place for it.
     """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise LeaderboardError(
-            f"The page needs the lines {BEGIN!r} and {END!r}, between which the table stands."
-        )
-    return f"{before}{begin}\n\n{table(root)}\n{end}{after}"
+    return replaced(page, BEGIN, END, table(root))
 
 
 def _series(row: Row, root: Path) -> Series:

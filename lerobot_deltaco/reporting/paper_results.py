@@ -98,6 +98,28 @@ _REPEATED: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "small_ambiguity": ("ambiguity_object",),
     }
 )
+# Fine-tuning on nothing is no experiment of its own.
+_SAME_AS: Mapping[str, str] = MappingProxyType({"demo_only_finetuned_0": "demo_only"})
+# Of experiments that the paper does not have.
+_OWN_LABELS: Mapping[str, str] = MappingProxyType(
+    {
+        "deltaco": "DeL-TaCo",
+        "demo_only": "demo only",
+        "either": "DeL-TaCo, takes either input",
+        "deltaco_paraphrases": "DeL-TaCo, trained on paraphrases",
+        "language_only_paraphrases": "language only, trained on paraphrases",
+        "minilm_l3": "DeL-TaCo, MiniLM-L3",
+        "minilm_l3_language_only": "language only, MiniLM-L3",
+        "efficientnet_both": "EfficientNet, both",
+        "efficientnet_demo": "EfficientNet, demo only",
+        "efficientnet_head": "EfficientNet with an MLP head",
+        "language_film_demo_concat": "FiLM(language), concat(demo)",
+        "paper_architecture": "the paper's architecture",
+        "objects_24": "24 training objects",
+        "objects_100": "100 training objects",
+        "objects_400": "400 training objects",
+    }
+)
 # What experiments whose names begin so have in common.
 TITLES: Mapping[str, str] = MappingProxyType(
     {
@@ -120,10 +142,18 @@ def paper_result(experiment: str) -> PaperResult | None:
     return PAPER_RESULTS.get(_paper_row(experiment))
 
 
+def small_scale_experiment(row: str) -> str:
+    """The experiment that repeats a row of the paper at a small scale, for example "small_a/cosine_loss"."""
+    folder, _, name = row.rpartition("/")
+    name = _SAME_AS.get(name, name)
+    return next(f"{comparison}/{name}" for comparison, folders in _REPEATED.items() if folder in folders)
+
+
 def label_of(experiment: str) -> str:
     """What an experiment is called in tables and images: the paper's name for it, else its own."""
     published = paper_result(experiment)
-    return experiment.rpartition("/")[2].replace("_", " ") if published is None else published.label
+    name = experiment.rpartition("/")[2]
+    return _OWN_LABELS.get(name, name.replace("_", " ")) if published is None else published.label
 
 
 def in_order(experiment: str) -> tuple[int, str, int, str]:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.object_sets import find_label
 from lerobot_deltaco.reporting.beside_paper import PaperComparison, draw_beside_paper
 from lerobot_deltaco.reporting.curves import Curve, draw_curves
@@ -30,6 +26,7 @@ from lerobot_deltaco.reporting.paper_results import (
     label_of,
     paper_result,
 )
+from lerobot_deltaco.reporting.report_files import csv_bytes, markdown_table, write_files
 from lerobot_deltaco.reporting.series import Report, Series, counted, find_records, make_report
 from lerobot_deltaco.reporting.statistics import (
     CUES,
@@ -87,16 +84,16 @@ def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = Fals
     """
     report = make_report(find_records(folders))
     contents = {
-        "curves.csv": _csv(_curve_rows(report)),
-        "breakdown.csv": _csv(_breakdown_rows(report)),
+        "curves.csv": csv_bytes(_curve_rows(report)),
+        "breakdown.csv": csv_bytes(_breakdown_rows(report)),
     }
     if report.regular:
-        contents["rates.csv"] = _csv(_rate_rows(report))
-        contents["novelty.csv"] = _csv(_novelty_rows(report))
-        contents["objects.csv"] = _csv(_object_rows(report))
+        contents["rates.csv"] = csv_bytes(_rate_rows(report))
+        contents["novelty.csv"] = csv_bytes(_novelty_rows(report))
+        contents["objects.csv"] = csv_bytes(_object_rows(report))
         differences = _difference_rows(report)
         if differences:
-            contents["differences.csv"] = _csv(differences)
+            contents["differences.csv"] = csv_bytes(differences)
         panels = [
             (_title(name), [Curve(series.experiment, series.steps, series.rates) for series in group])
             for name, group in report.comparisons.items()
@@ -106,9 +103,9 @@ def write_report(folders: Sequence[Path], out: Path, authors_levels: bool = Fals
         if compared:
             contents[BESIDE_PAPER_IMAGE] = draw_beside_paper(compared)
     if report.counterfactual:
-        contents["counterfactual.csv"] = _csv(_counterfactual_rows(report))
+        contents["counterfactual.csv"] = csv_bytes(_counterfactual_rows(report))
     contents[REPORT_FILE] = _markdown(report).encode()
-    _write_files(out, contents)
+    write_files(out, contents, FILES)
     return report
 
 
@@ -283,17 +280,6 @@ def _joined(numbers: Iterable[int]) -> str:
     return " ".join(map(str, numbers))
 
 
-def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow(
-            {name: round(value, 6) if isinstance(value, float) else value for name, value in row.items()}
-        )
-    return text.getvalue().encode()
-
-
 # Markdown. Rates are percentages.
 
 
@@ -350,7 +336,7 @@ def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
         f"`{example.record.ambiguity}`; scenes of the objects `{example.record.objects}`, with adversarial "
         f"distractors at a probability of {example.record.adversarial_probability:g}.{_architecture(group)}"
     )
-    rates = _table(
+    rates = markdown_table(
         [
             "experiment",
             "seeds",
@@ -363,7 +349,7 @@ def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
         [_rate_cells(series) for series in group],
     )
     breakdowns = {series.experiment: breakdown(series.last_episodes) for series in group}
-    outcomes = _table(
+    outcomes = markdown_table(
         ["experiment", "episodes", *(name.replace("_", " ") for name in OUTCOMES)],
         [
             [
@@ -379,7 +365,7 @@ def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
         *(("all", word) for word in WORDS),
         *((kind, word) for kind in KINDS for word in WORDS),
     ]
-    kinds = _table(
+    kinds = markdown_table(
         ["experiment", *(_group_name(kind, word) for kind, word in columns)],
         [
             [label_of(experiment), *(_success(rows, kind, word) for kind, word in columns)]
@@ -419,7 +405,7 @@ def _architecture(group: Sequence[Series]) -> str:
 def _difference_section(group: Sequence[Series]) -> str:
     if len(group) < 2:
         return ""
-    table = _table(
+    table = markdown_table(
         ["experiment", f"difference to {label_of(group[0].experiment)}, in points [95 %]"],
         [
             [label_of(series.experiment), _estimate_text(estimate)]
@@ -434,7 +420,7 @@ def _difference_section(group: Sequence[Series]) -> str:
 def _novelty_section(group: Sequence[Series]) -> str:
     shares = {series.experiment: _by_novelty(series) for series in group}
     columns = [name for name in NOVELTIES if any(name in found for found in shares.values())]
-    table = _table(
+    table = markdown_table(
         ["experiment", *(DESCRIPTIONS[name] for name in columns)],
         [
             [
@@ -453,7 +439,7 @@ def _novelty_section(group: Sequence[Series]) -> str:
 def _object_section(group: Sequence[Series]) -> str:
     outcomes = [by_object(series.last_episodes) for series in group]
     indices = sorted({index for found in outcomes for index in found})
-    table = _table(
+    table = markdown_table(
         ["target", *(label_of(series.experiment) for series in group)],
         [
             [
@@ -524,7 +510,7 @@ def _counterfactual_section(group: Sequence[Series]) -> str:
     for series in group:
         rows = followed(series.last_episodes, series.counterfactual)
         shares = {(row.aspect, row.among, row.cue): _share(row.proportion) for row in rows}
-        table = _table(
+        table = markdown_table(
             ["followed", "scene's task", "demonstration's", "instruction's", "neither"],
             [
                 [
@@ -578,17 +564,3 @@ def _title(comparison: str) -> str:
 
 def _percent(share: float | None) -> str:
     return "–" if share is None else f"{100 * share:.1f}"
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
-
-
-def _write_files(out: Path, contents: Mapping[str, bytes]) -> None:
-    """Puts all files in place once all of them are written; removes those of an earlier report."""
-    with ExitStack() as stack:
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(out / name)).write_bytes(content)
-    for name in set(FILES) - set(contents):
-        (out / name).unlink(missing_ok=True)

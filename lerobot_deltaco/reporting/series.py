@@ -239,17 +239,31 @@ def _check_together(everything: Sequence[Series]) -> None:
             records += f" with another task's {counterfactual}"
         _check_same("tasks", records, group, lambda item: item.task_ids, lambda item: item.record.tasks)
         _check_same("trials", records, group, lambda item: item.record.trials)
-        _check_same("evaluation seed", records, group, lambda item: item.record.evaluation_seed)
-        _check_same("ambiguity scheme", records, group, lambda item: item.record.ambiguity)
-        _check_same("image size", records, group, lambda item: item.record.image_size)
-        _check_same("episode length", records, group, lambda item: item.record.episode_length)
-        _check_same("objects", records, group, lambda item: item.record.objects)
-        _check_same(
-            "probability of adversarial distractors",
-            records,
-            group,
-            lambda item: item.record.adversarial_probability,
-        )
+        check_same_scenes(records, group)
+
+
+def check_same_scenes(records: str, group: Sequence[Series]) -> None:
+    """Checks that the scenes of some series were drawn in the same way; their tasks may differ.
+
+    Args:
+        records: Name of the records, for the message.
+        group: The series.
+
+    Raises:
+        ReportError: Two records differ; the message names them.
+    """
+    _check_same("version of the benchmark", records, group, lambda item: item.benchmark)
+    _check_same("evaluation seed", records, group, lambda item: item.record.evaluation_seed)
+    _check_same("ambiguity scheme", records, group, lambda item: item.record.ambiguity)
+    _check_same("image size", records, group, lambda item: item.record.image_size)
+    _check_same("episode length", records, group, lambda item: item.record.episode_length)
+    _check_same("objects", records, group, lambda item: item.record.objects)
+    _check_same(
+        "probability of adversarial distractors",
+        records,
+        group,
+        lambda item: item.record.adversarial_probability,
+    )
 
 
 def _check_same(
