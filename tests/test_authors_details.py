@@ -6,7 +6,7 @@ from einops import rearrange
 from torch import nn
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, crop_array, frame_array
+from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, crop_demonstrations, frame_array
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.initial_weights import initialize_demo_encoder, initialize_policy
 from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
@@ -15,7 +15,7 @@ from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
 def test_the_array_is_shifted_as_a_whole():
     torch.manual_seed(0)
     frames = torch.rand(16, 2, 3, 8, 8)
-    cropped = crop_array(frames, 1, 3, torch.Generator().manual_seed(0))
+    cropped = crop_demonstrations(frames, 3, 1, torch.Generator().manual_seed(0))
     assert cropped.shape == frames.shape
     expected = random_crop(frame_array(frames, 1), 3, torch.Generator().manual_seed(0))
     assert torch.equal(frame_array(cropped, 1), expected)
@@ -28,7 +28,7 @@ def test_the_array_is_shifted_as_a_whole():
         assert torch.equal(cropped[n, 0, :, :, -2:], frames[n, 1, :, :, :2])
         assert torch.equal(cropped[n], apart[n])
     # A row of frames comes back in its order.
-    assert torch.equal(crop_array(frames, 2, 0, torch.Generator()), frames)
+    assert torch.equal(crop_demonstrations(frames, 0, 2, torch.Generator()), frames)
 
 
 def test_frames_between_are_drawn_from_equal_parts_of_the_time():

@@ -9,11 +9,10 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.policy.demo_encoders import crop_array
+from lerobot_deltaco.policy.demo_encoders import crop_demonstrations
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures
 from lerobot_deltaco.policy.language import InstructionTable
-from lerobot_deltaco.policy.networks import random_crop
 from lerobot_deltaco.policy.paraphrases import Paraphrases
 
 
@@ -113,11 +112,10 @@ class TaskEmbedder:
         frames = demonstrations.sample_frames(
             rows, config.n_demo_frames, generator, config.demo_frames_between == "spread"
         )
-        if training and config.demo_crop_padding:
-            if config.demo_encoder == "cnn" and config.demo_crop == "array":
-                frames = crop_array(frames, config.demo_rows, config.demo_crop_padding, generator)
-            else:
-                frames = random_crop(frames, config.demo_crop_padding, generator)
+        if training:
+            is_array = config.demo_encoder == "cnn" and config.demo_crop == "array"
+            array_rows = config.demo_rows if is_array else None
+            frames = crop_demonstrations(frames, config.demo_crop_padding, array_rows, generator)
         return self._demo_encoder(frames)
 
     def conditioning_inputs(
