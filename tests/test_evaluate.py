@@ -144,7 +144,7 @@ def test_a_counterfactual_changes_one_of_both(loaded, changed):
         told = {"demo": episode.demonstration, "instruction": episode.instruction}
         assert told.pop(changed) != own
         assert list(told.values()) == [own]
-    assert loaded.policy._demonstrated_as == {}
+    assert loaded.policy._episode_tasks.replaced == {}
 
 
 def test_the_other_task_asks_for_another_object_of_the_scene_and_the_other_container():

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.policy.demo_encoders import crop_demonstrations
+from lerobot_deltaco.policy.demonstration_choice import choose_training_demonstrations
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures
 from lerobot_deltaco.policy.language import InstructionTable
@@ -88,6 +89,44 @@ class TaskEmbedder:
             return known, known[column]
         known = self.embed_instructions(self.draw_instructions(distinct, generator), column.device)
         return known, self.embed_instructions(self.draw_instructions(tasks, generator), column.device)
+
+    def embed_training_demonstrations(
+        self,
+        demonstrations: DemonstrationSet,
+        episodes: Tensor,
+        tasks: Sequence[str],
+        column: Tensor,
+        generator: torch.Generator,
+        training: bool,
+        check: bool,
+    ) -> Tensor:
+        """Embeddings of demonstrations of a training batch: episodes other than the samples' own.
+
+        Args:
+            demonstrations: The training episodes.
+            episodes: The samples' own, (batch,), as indices of the dataset.
+            tasks: Task string of each sample.
+            column: The samples' tasks, (batch,), numbered from 0.
+            generator: Source of the draws, on the CPU.
+            training: Whether this is a training step, and not a validation loss.
+            check: Whether to check that all episodes are among the demonstrations, which waits for a GPU.
+
+        Returns:
+            Unit vectors, (batch, embedding).
+
+        Raises:
+            ValueError: An episode is not among the demonstrations, or no episode of its task.
+        """
+        if not training:
+            # The episodes of a validation loss may be held back from the demonstrations.
+            rows = demonstrations.sample_other_episodes(episodes, generator, tasks=tasks)
+            return self.embed_demonstrations(demonstrations, rows, generator, training)
+        n_tasks, n_each = len(set(tasks)), self.config.demos_per_task
+        rows, which = choose_training_demonstrations(
+            demonstrations, episodes, column, n_tasks, n_each, generator, check
+        )
+        embeddings = self.embed_demonstrations(demonstrations, rows, generator, training)
+        return embeddings if which is None else embeddings[which]
 
     def embed_demonstrations(
         self, demonstrations: DemonstrationSet, rows: Tensor, generator: torch.Generator, training: bool
