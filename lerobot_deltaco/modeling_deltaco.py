@@ -406,7 +406,7 @@ class DeltacoPolicy(PreTrainedPolicy):
 
     @property
     def paraphrases(self) -> Paraphrases | None:
-        """Sentences in people's own words for task strings; None for the task strings alone."""
+        """Sentences that people wrote for task strings; None for the task strings alone."""
         return self._embedder.paraphrases
 
     @paraphrases.setter

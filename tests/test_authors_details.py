@@ -33,11 +33,11 @@ def test_the_array_is_shifted_as_a_whole():
 
 def test_frames_between_are_drawn_from_equal_parts_of_the_time():
     frames = torch.arange(16, dtype=torch.uint8)[None, :, None, None, None].expand(1, 16, 3, 2, 2)
-    shown = DemonstrationSet(frames, ["a"], [0])
+    demos = DemonstrationSet(frames, ["a"], [0])
     rows = torch.zeros(500, dtype=torch.int64)
 
     def drawn(spread):
-        images = shown.sample_frames(rows, 4, torch.Generator().manual_seed(0), spread)
+        images = demos.sample_frames(rows, 4, torch.Generator().manual_seed(0), spread)
         return (images[:, :, 0, 0, 0] * 255).round().long()
 
     spread = drawn(True)
@@ -48,7 +48,7 @@ def test_frames_between_are_drawn_from_equal_parts_of_the_time():
     independent = drawn(False)
     assert (independent[:, 1] == independent[:, 2]).any()
     assert (independent[:, 1] > 7).any()
-    assert (shown.sample_frames(rows[:2], 2, torch.Generator(), True)[:, 1] * 255 == 15).all()
+    assert (demos.sample_frames(rows[:2], 2, torch.Generator(), True)[:, 1] * 255 == 15).all()
 
 
 def test_the_authors_initial_weights():

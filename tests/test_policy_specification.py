@@ -64,8 +64,8 @@ def make(request, dataset):
 
     def make():
         torch.manual_seed(0)
-        shown = {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
-        policy, before, after = small_policy(dataset, **shown, **request.param)
+        demos = {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
+        policy, before, after = small_policy(dataset, **demos, **request.param)
         return SimpleNamespace(policy=policy, before=before, after=after, config=policy.config)
 
     return make

@@ -291,10 +291,10 @@ def test_every_option_is_tried():
 def test_a_random_configuration_works_or_is_refused_by_name(dataset, data):
     names = data.draw(st.lists(st.sampled_from(sorted(VALUES)), unique=True, max_size=4), label="names")
     options = {name: data.draw(st.sampled_from(VALUES[name]), label=name) for name in names}
-    shown = {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
+    demos = {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
     refusal = None
     try:
-        policy, before, after = small_policy(dataset, **shown, **options)
+        policy, before, after = small_policy(dataset, **demos, **options)
         # The first batch reads the training episodes, which can be too few.
         loss, _ = policy(before(batch_of(dataset, [0, 7, 16, 22, 29])))
     except ValueError as error:

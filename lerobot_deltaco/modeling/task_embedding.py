@@ -25,7 +25,7 @@ class TaskEmbedder:
     Args:
         config: Configuration of the policy.
         instructions: Embeddings of instructions.
-        paraphrases: Sentences in people's own words; None to train on the task strings.
+        paraphrases: Sentences that people wrote; None to train on the task strings.
         language_head: Layers behind the language encoder; None for none.
         demo_encoder: Encoder of demonstrations, or the layers behind the frozen one; None without a task
             embedding.
@@ -45,7 +45,7 @@ class TaskEmbedder:
         self._language_head, self._demo_encoder, self._frozen = language_head, demo_encoder, frozen
 
     def draw_instructions(self, tasks: Sequence[str], generator: torch.Generator) -> list[str]:
-        """The instruction of each training sample: its task string, or a sentence in people's own words.
+        """The instruction of each training sample: its task string, or a paraphrase.
 
         Args:
             tasks: Task string of each sample.
@@ -70,7 +70,7 @@ class TaskEmbedder:
     ) -> tuple[Tensor, Tensor]:
         """Embeddings of the instructions of a training batch.
 
-        With sentences in people's own words, each sample and each task has one drawn for it.
+        With paraphrases, one is drawn for each sample, and one for each task.
 
         Args:
             distinct: Task strings of the batch, each once.
