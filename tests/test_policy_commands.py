@@ -11,9 +11,9 @@ import pytest
 from safetensors.torch import load_file
 
 from gym_deltaco.tasks import TASKS
-from lerobot_deltaco.configuration_deltaco import METHODS
 from lerobot_deltaco.data.collection import collect
 from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.policy.options import METHODS
 
 TASK_IDS = "4,50"
 STEPS = 4

@@ -23,10 +23,11 @@ from small_policies import REPO_ID, TASKS, small_policy, write_dataset
 from gym_deltaco import ENV_ID
 from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
 from lerobot_deltaco.cards.policy_card import MAX_TASKS_LISTED, METHOD_TEXTS, policy_card
-from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.options import METHODS
 
 POLICY_ID = f"{USER}/policy"
 

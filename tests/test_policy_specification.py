@@ -23,8 +23,8 @@ from small_policies import (
     write_dataset,
 )
 
-from lerobot_deltaco.configuration_deltaco import BACKBONES, METHODS
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.options import BACKBONES, METHODS
 
 OPTIONS = [
     *({"method": method} for method in METHODS),
