@@ -24,7 +24,7 @@ from unittest import mock
 
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.tasks import N_TASKS
-from lerobot_deltaco.data import collection
+from lerobot_deltaco.data import collection, collection_workers
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 
@@ -73,16 +73,19 @@ def measure_parts(episodes_per_task: int) -> dict[str, float]:
     env.reset(seed=0)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         job = collection.make_job(Path(folder), plan)
-        worker = collection._Worker(job, env, files.data_schema(plan.features))
-        stack.enter_context(mock.patch.object(collection, "_worker", worker))
+        worker = collection_workers._Worker(job, env, files.data_schema(plan.features))
+        stack.enter_context(mock.patch.object(collection_workers, "_worker", worker))
         for owner, name in (
-            (collection, "collect_episode"),
+            (collection_workers, "collect_episode"),
             (files, "_png"),
             (files, "episode_statistics"),
         ):
             function = _timed(getattr(owner, name), seconds)
             stack.enter_context(mock.patch.object(owner, name, function))
-        collect, join = _timed(collection._collect, seconds), _timed(collection._join, seconds)
+        collect, join = (
+            _timed(collection_workers._collect, seconds),
+            _timed(collection_workers._join, seconds),
+        )
         for index in range(plan.n_episodes):
             collect(index)
         for part in range(job.n_parts):

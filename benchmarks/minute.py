@@ -114,7 +114,7 @@ def _measure_recipe(out: Path, encoder: str) -> list[Line]:
     ]
     _run(
         "-m", _command("collect"), *shared, "--episodes-per-task=1", "--split=validation",
-        f"--root={out / 'shown'}",
+        f"--root={out / 'demos'}",
     )  # fmt: skip
     settings = {
         "policy.type": "deltaco",
@@ -126,8 +126,8 @@ def _measure_recipe(out: Path, encoder: str) -> list[Line]:
         "policy.gripper_loss": "cross_entropy",
         "policy.dtype": "bfloat16",
         "policy.tasks_per_batch": 16,
-        "policy.demo_repo_id": "minute/shown",
-        "policy.demo_root": out / "shown",
+        "policy.demo_repo_id": "minute/demos",
+        "policy.demo_root": out / "demos",
         "dataset.repo_id": "minute/train",
         "dataset.root": out / "train",
         "batch_size": BATCH_SIZE,

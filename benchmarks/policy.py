@@ -17,9 +17,10 @@ from pathlib import Path
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_deltaco.configuration_deltaco import BACKBONES, DTYPES, DeltacoConfig
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
+from lerobot_deltaco.policy.options import BACKBONES, DTYPES
 
 TASKS = [f"task {n}" for n in range(16)]
 EPISODES_PER_TASK = 4

@@ -27,9 +27,9 @@ from accelerate import Accelerator
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
 
-from lerobot_deltaco.configuration_deltaco import BACKBONES
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy import language
+from lerobot_deltaco.policy.options import BACKBONES
 from lerobot_deltaco.training.frames import FramesInMemory
 from lerobot_deltaco.training.loop import InMemoryTraining
 from lerobot_deltaco.training.task_batches import TaskBatchSampler

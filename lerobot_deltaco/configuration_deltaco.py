@@ -6,7 +6,6 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
@@ -16,66 +15,26 @@ from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.data.feature_names import ACTION_NAMES
 from lerobot_deltaco.lerobot_internals import log_refusals
 from lerobot_deltaco.policy.language_encoders import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.options import (
+    BACKBONES,
+    CORRESPONDENCE,
+    DEMO_CROPS,
+    DEMO_ENCODERS,
+    DTYPES,
+    ENCODER_LOSSES,
+    FRAMES_BETWEEN,
+    GOAL_SOURCES,
+    GRIPPER_LOSSES,
+    INITIAL_WEIGHTS,
+    INPUTS,
+    METHODS,
+    MODALITIES,
+    SCHEDULERS,
+    Conditioning,
+)
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS, VISION_INPUTS
 from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAdamWConfig
 
-
-class Conditioning(NamedTuple):
-    """Conditioning of a method."""
-
-    film: str  # input through FiLM
-    concat: str  # input concatenated to the feature points
-    encoder_loss: str  # loss that aligns demonstrations with instructions
-
-
-# The methods of the paper's tables 1 and 2.
-METHODS = MappingProxyType(
-    {
-        "deltaco": Conditioning("demo", "language", "contrastive"),
-        "language_only": Conditioning("language", "none", "none"),
-        "demo_only": Conditioning("demo", "none", "contrastive"),
-        "one_hot": Conditioning("one_hot", "none", "none"),
-        "bc_z": Conditioning("demo", "none", "cosine"),
-        # The mean of two imitation losses: of the language (through a projection) and of the demonstration.
-        "mcil": Conditioning("language_or_demo", "none", "none"),
-    }
-)
-# With `demo_encoder=correspondence`: what says what is to be grasped, and where it is to be released.
-GOAL_SOURCES = MappingProxyType(
-    {
-        "deltaco": ("demo", "condition"),
-        "demo_only": ("demo", "demo"),
-        "language_only": ("condition", "condition"),
-        "one_hot": ("condition", "condition"),
-    }
-)
-INPUTS = ("none", "demo", "language", "demo+language")
-ENCODER_LOSSES = ("contrastive", "cosine", "none")
-
-
-class Backbone(NamedTuple):
-    """Sizes of a convolutional network."""
-
-    channels: tuple[int, ...]  # of the residual blocks
-    stem_stride: int  # of the first convolution
-    demo_stride: int  # of the first convolution of the demonstration encoder `cnn`
-
-
-BACKBONES = MappingProxyType(
-    {
-        "paper": Backbone((16, 16, 32, 32, 64, 64, 128, 128), stem_stride=1, demo_stride=1),
-        "strided": Backbone((16, 32, 64, 64), stem_stride=2, demo_stride=2),
-    }
-)
-CORRESPONDENCE = "correspondence"
-DEMO_ENCODERS = ("cnn", "attention", CORRESPONDENCE, "pretrained")
-GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
-MODALITIES = ("demo", "instruction")
-DEMO_CROPS = ("array", "frame")
-FRAMES_BETWEEN = ("spread", "any")
-INITIAL_WEIGHTS = ("authors", "torch")
-SCHEDULERS = ("constant", "cosine")
-DTYPES = ("float32", "bfloat16")
 # Options that may be files and folders of this machine.
 PATHS = (
     "demo_root",

@@ -2,13 +2,12 @@
 
 # No `from __future__ import annotations`: LeRobot's tests expect the annotation of `config` to be a class.
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Self
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from huggingface_hub import ModelCard
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -22,11 +21,18 @@ from lerobot_deltaco.modeling.checkpoint_files import (
     check_loaded_weights,
     check_stored_frames,
     check_weight_names,
-    demonstrations_to_store,
     stored_demonstrations,
+    task_contents,
     without_sources,
 )
-from lerobot_deltaco.modeling.goal_learning import fit_goals, learn_goals
+from lerobot_deltaco.modeling.demonstration_use import choose_demonstrations
+from lerobot_deltaco.modeling.goal_learning import (
+    GoalSamples,
+    find_goals,
+    fit_goals,
+    learn_goals,
+    validation_goals,
+)
 from lerobot_deltaco.modeling.network_factory import (
     make_demo_encoder,
     make_frozen_encoder,
@@ -43,35 +49,22 @@ from lerobot_deltaco.modeling.task_sources import (
 )
 from lerobot_deltaco.policy.actions import join_action, policy_loss
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder
-from lerobot_deltaco.policy.demonstration_choice import (
-    choose_episode,
-    choose_eval_demonstrations,
-    choose_training_demonstrations,
-    show_goals,
-)
-from lerobot_deltaco.policy.demonstrations import (
-    Demonstrated,
-    DemonstrationSet,
-    RobotData,
-)
+from lerobot_deltaco.policy.demonstrations import Demonstrated, DemonstrationSet, RobotData
 from lerobot_deltaco.policy.finite_loss import FiniteLoss, check_weights_to_save
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals
 from lerobot_deltaco.policy.goal_training import GoalTrainer
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.initial_weights import initialize_demo_encoder, initialize_policy
 from lerobot_deltaco.policy.language import InstructionTable
-from lerobot_deltaco.policy.losses import (
-    contrastive_logits,
-    contrastive_loss,
-    cosine_loss,
-)
+from lerobot_deltaco.policy.losses import contrastive_logits, contrastive_loss, cosine_loss
 from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.networks import random_crop
+from lerobot_deltaco.policy.observations import instructions_of, stacked_images
 from lerobot_deltaco.policy.paraphrases import Paraphrases
+from lerobot_deltaco.policy.precision import autocast
 from lerobot_deltaco.policy.processor_files import check_processor_files
-from lerobot_deltaco.policy.recoloring import random_recolorings
 from lerobot_deltaco.policy.scalars import LoggedScalars
-from lerobot_deltaco.policy.step_generator import step_generator
+from lerobot_deltaco.policy.step_generator import process_rank, step_generator
 from lerobot_deltaco.policy.task_conditioning import EpisodeTasks, TaskConditioning
 from lerobot_deltaco.policy.task_file import (
     TASK_FILE,
@@ -126,7 +119,6 @@ class DeltacoPolicy(PreTrainedPolicy):
         paraphrases = read_sentences(config)
         self.eval_demonstrations: DemonstrationSet | None = read_eval_demonstrations(config)
         self._train_demonstrations_are_complete = False  # whether they surely include every training episode
-        self._demonstrated_as: Mapping[str, str] = {}
         self._episode_tasks = EpisodeTasks()
         if config.method == "one_hot" and not config.one_hot_tasks:
             demonstrated = self.eval_demonstrations.rows if self.eval_demonstrations else ()
@@ -153,20 +145,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         self._folded = FoldedPolicy(self.model)
         self._finite_loss = FiniteLoss()
 
-    @property
-    def paraphrases(self) -> Paraphrases | None:
-        """Sentences in people's own words for task strings; None for the task strings alone."""
-        return self._embedder.paraphrases
-
-    @paraphrases.setter
-    def paraphrases(self, paraphrases: Paraphrases | None) -> None:
-        self._embedder.paraphrases = paraphrases
-
     def get_optim_params(self) -> list[nn.Parameter]:
         """All weights. The language encoder is frozen, and not among them."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
-    # Training
+    # The loss
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, LoggedScalars]:
         """The loss of a batch: L = L_pi + alpha_d L_demo (the paper's equation 3).
@@ -183,24 +166,39 @@ class DeltacoPolicy(PreTrainedPolicy):
         Returns:
             The loss, () or (batch,), and the scalars to log.
         """
-        tasks = list(batch["task"])
-        device = batch[ACTION].device
         if self.training:
             self._finite_loss.check()
-            if device.type == "cpu":
+            if batch[ACTION].device.type == "cpu":
                 keep_freed_memory()
         step = int(self.step) if self.training else 0
-        generator = step_generator(self.config.seed, step, _process_rank())
-        if self.goals is not None:
-            return self._goal_forward(batch, tasks, generator, reduction)
+        generator = step_generator(self.config.seed, step, process_rank())
+        tasks = list(batch["task"])
+        if self.goals is None:
+            loss, logged = self._embedding_loss(batch, tasks, generator)
+        else:
+            loss, logged = self._goal_loss(batch, tasks, generator)
+        if self.training:
+            self.step += 1
+            names = (ACTION, OBS_STATE) if self.config.robot_state_feature else (ACTION,)
+            self._finite_loss.remember(loss, {name: batch[name] for name in names}, self.step)
+        return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
+
+    def _embedding_loss(
+        self, batch: dict[str, Any], tasks: list[str], generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of each sample, (batch,), of a policy that is conditioned on task embeddings."""
         images = self._images(batch)
         if self.training and self.config.crop_padding:
             images = random_crop(images, self.config.crop_padding, generator)
         demo = language = None
         distinct = {task: n for n, task in enumerate(dict.fromkeys(tasks))}
-        column = torch.tensor([distinct[task] for task in tasks], device=device)
+        column = torch.tensor([distinct[task] for task in tasks], device=batch[ACTION].device)
         if self.config.uses_demo:
-            demo = self._train_demo_embeddings(batch["episode_index"], tasks, column, generator)
+            demonstrations = self._training_demonstrations(column.device)
+            is_checked = not self._train_demonstrations_are_complete
+            demo = self._embedder.embed_training_demonstrations(
+                demonstrations, batch["episode_index"], tasks, column, generator, self.training, is_checked
+            )
         if self.config.uses_language:
             known, language = self._embedder.embed_training_tasks(list(distinct), tasks, column, generator)
 
@@ -210,7 +208,7 @@ class DeltacoPolicy(PreTrainedPolicy):
             loss = torch.stack([part[0] for part in parts]).mean(dim=0)
             logged = {name: torch.stack([part[1][name] for part in parts]).mean() for name in parts[0][1]}
         else:
-            film, concat = self.conditioning_inputs(tasks, demo, language)
+            film, concat = self._embedder.conditioning_inputs(tasks, demo, language, images.device)
             loss, logged = self._imitation_loss(batch, images, film, concat)
 
         if self.config.conditioning.encoder_loss != "none":
@@ -224,88 +222,32 @@ class DeltacoPolicy(PreTrainedPolicy):
             loss = loss + self.config.encoder_loss_weight * encoder_loss
             logged["encoder_loss"] = encoder_loss.mean()
             logged["demo_accuracy"] = (logits.argmax(dim=1) == column).float().mean()
-        return self._finished(batch, loss, logged, reduction)
+        return loss, logged
 
-    def _finished(
-        self, batch: dict[str, Any], loss: Tensor, logged: dict[str, Tensor], reduction: str
-    ) -> tuple[Tensor, LoggedScalars]:
-        """What `forward` returns; in training, the step is counted, and its loss kept for a check."""
-        if self.training:
-            self.step += 1
-            names = (ACTION, OBS_STATE) if self.config.robot_state_feature else (ACTION,)
-            self._finite_loss.remember(loss, {name: batch[name] for name in names}, self.step)
-        return loss.mean() if reduction == "mean" else loss, LoggedScalars(logged)
-
-    def _goal_forward(
-        self, batch: dict[str, Any], tasks: Sequence[str], generator: torch.Generator, reduction: str
-    ) -> tuple[Tensor, LoggedScalars]:
-        """As `forward`, with goals: the policy loss, and that of finding the goals on a share of the samples.
-
-        The policy's network gets the goals of each sample's own episode, with noise; the locator learns, from
-        other episodes' demonstrations, to find them. So neither waits for the other.
-        """
-        config, images = self.config, self._images(batch)
-        n_samples, device = len(images), images.device
+    def _goal_loss(
+        self, batch: dict[str, Any], tasks: list[str], generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of each sample, (batch,), of a policy that is given goals, which it learns to find."""
+        images, language = self._images(batch), None
         instructions = self._embedder.draw_instructions(tasks, generator)
-        language = None
-        if config.language_is_input:
-            language = self._embedder.embed_instructions(instructions, device)
-        demonstrations = self._training_demonstrations(device)
+        if self.config.language_is_input:
+            language = self._embedder.embed_instructions(instructions, images.device)
+        film, concat = self._embedder.conditioning_inputs(tasks, None, language, images.device)
+        demonstrations = self._training_demonstrations(images.device)
         assert self.goal_trainer is not None
-        rows = demonstrations.episode_rows(batch["episode_index"])
-        places, depths, known = self.goal_trainer.goals_of(rows)
-        if self.training:
-            if not self._train_demonstrations_are_complete:
-                demonstrations.check_episodes(batch["episode_index"], rows)
-            recolorings = random_recolorings(n_samples, config.recolor_share, generator)
-            locator_loss = learn_goals(
-                config,
-                self.goal_trainer,
-                self._embedder,
-                batch["episode_index"],
-                rows,
-                tasks,
-                instructions,
-                recolorings,
-                generator,
-                self._autocast(device),
+        episodes = batch["episode_index"]
+        rows = demonstrations.episode_rows(episodes)
+        samples = GoalSamples(images, episodes, rows, tasks, instructions)
+        if not self.training:
+            inputs = validation_goals(
+                self.goal_trainer, samples, lambda: self._find_goals(images[:, 0], tasks, [0] * len(tasks))
             )
-            images, places, depths = self.goal_trainer.vary(
-                images,
-                places,
-                depths,
-                recolorings,
-                config.goal_noise,
-                config.depth_noise,
-                config.crop_padding,
-                generator,
-            )
-        elif not known.all():
-            # Of episodes that are held back for a validation loss, no goals are known: those that are found
-            # in the present image stand in for them.
-            found = self._find_goals(images[:, 0], tasks, [0] * n_samples)
-            places = torch.where(known[:, None, None], places, found.places)
-            if depths is not None and found.depths is not None:
-                depths = torch.where(known, depths, found.depths)
-        film, concat = self.conditioning_inputs(tasks, None, language)
-        loss, logged = self._imitation_loss(batch, images, film, concat, places, depths)
-        if self.training:
-            loss = locator_loss.added_to(loss)
-            logged |= locator_loss.logged()
-        return self._finished(batch, loss, logged, reduction)
-
-    def _find_goals(self, scenes: Tensor, tasks: Sequence[str], trials: Sequence[int]) -> FoundGoals:
-        """Finds the goals of tasks in scenes (batch, 3, H, W), by the demonstrations of these trials."""
-        assert self.goals is not None
-        shown = condition = None
-        if self.config.uses_demo and self.config.leave_out != "demo":
-            n_each = self.config.n_demonstrations
-            turns = [[trial * n_each + number for trial in trials] for number in range(n_each)]
-            chosen = [self._choose_eval_demonstrations(tasks, turn) for turn in turns]
-            shown = show_goals(chosen, self.goals, scenes.device)
-        if self.config.leave_out != "instruction":
-            condition = self._embedder.goal_condition(tasks, self.step.device)
-        return self.goals.find(scenes, shown, condition)
+            return self._imitation_loss(batch, inputs.images, film, concat, inputs.places, inputs.depths)
+        if not self._train_demonstrations_are_complete:
+            demonstrations.check_episodes(episodes, rows)
+        inputs, locator_loss = learn_goals(self.config, self.goal_trainer, self._embedder, samples, generator)
+        loss, logged = self._imitation_loss(batch, inputs.images, film, concat, inputs.places, inputs.depths)
+        return locator_loss.added_to(loss), logged | locator_loss.logged()
 
     def _imitation_loss(
         self,
@@ -321,88 +263,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         index, weight, kind = self.config.gripper_index, self.config.gripper_weight, self.config.gripper_loss
         return policy_loss(predicted, gripper, self.model.log_std, batch[ACTION], index, weight, kind)
 
-    def set_train_demonstrations(
-        self, demonstrations: DemonstrationSet, robot_data: RobotData | None = None
-    ) -> None:
-        """Sets the demonstrations for training, which are otherwise read from the disk with the first batch.
-
-        Args:
-            demonstrations: Demonstrations, which include every episode of the training.
-            robot_data: States and actions of the robot in them, for `demo_encoder=correspondence`.
-        """
-        self.train_demonstrations = demonstrations
-        self._train_demonstrations_are_complete = True
-        if self.goals is not None:
-            assert robot_data is not None
-            self._fit_goals(robot_data)
-
-    def _fit_goals(self, robot_data: RobotData) -> None:
-        """Finds the goals of the training episodes."""
-        assert self.train_demonstrations is not None
-        assert self.goals is not None
-        self.goal_trainer = fit_goals(
-            self.config, self.goals, self.train_demonstrations, robot_data, self._stats
-        )
-
-    def _train_demo_embeddings(
-        self, episodes: Tensor, tasks: Sequence[str], column: Tensor, generator: torch.Generator
-    ) -> Tensor:
-        """Embeddings of the samples' demonstrations, (batch, embedding); `column` numbers their tasks."""
-        demonstrations = self._training_demonstrations(episodes.device)
-        if not self.training:
-            # The episodes of a validation loss may be held back from the demonstrations.
-            rows = demonstrations.sample_other_episodes(episodes, generator, tasks=tasks)
-            return self._embedder.embed_demonstrations(demonstrations, rows, generator, self.training)
-        rows, which = choose_training_demonstrations(
-            demonstrations,
-            episodes,
-            column,
-            len(set(tasks)),
-            self.config.demos_per_task,
-            generator,
-            check=not self._train_demonstrations_are_complete,
-        )
-        embeddings = self._embedder.embed_demonstrations(demonstrations, rows, generator, self.training)
-        return embeddings if which is None else embeddings[which]
-
-    def _training_demonstrations(self, device: torch.device) -> DemonstrationSet:
-        if self.train_demonstrations is None:
-            loaded, robot_data = read_training_demonstrations(self.config, self._meta)
-            self.train_demonstrations = loaded.to(device)
-            if robot_data is not None:
-                self._fit_goals(robot_data)
-        return self.train_demonstrations
-
-    # Evaluation
-
-    def reset(self) -> None:
-        """Starts an episode, of this thread if several threads evaluate tasks at the same time."""
-        self._episode_tasks.begin_episode()
-
-    def begin_evaluation(self) -> None:
-        """Starts an evaluation: the demonstrations of each task begin with the first again."""
-        self._episode_tasks.begin_evaluation()
-
-    def demonstrated(self, sample: int) -> list[Demonstrated]:
-        """The demonstrations of a sample in this thread's episode; none before its first action."""
-        return self._episode_tasks.demonstrated(sample)
-
-    @contextmanager
-    def demonstrated_as(self, tasks: Mapping[str, str]) -> Iterator[None]:
-        """Uses other tasks' demonstrations with some instructions, while the context is open.
-
-        For example, to perform a task from a demonstration and a sentence of one's own:
-        `with policy.demonstrated_as({"fetch the jar": task.instruction}): ...`
-
-        Args:
-            tasks: For an instruction, the task string whose demonstrations are used. It is read when an
-                episode starts; instructions that it lacks keep their own demonstrations.
-        """
-        previous, self._demonstrated_as = self._demonstrated_as, tasks
-        try:
-            yield
-        finally:
-            self._demonstrated_as = previous
+    # Acting
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
@@ -417,9 +278,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         Raises:
             ValueError: There is no instruction, or a task has no demonstration.
         """
-        tasks = self._instructions_of(batch)
+        tasks = instructions_of(batch)
         images = self._images(batch)
-        with self._autocast(images.device):
+        with autocast(self.config.dtype, images.device):
             task = self._episode_tasks.conditioning(tasks, lambda tasks: self.encode_task(tasks, images))
             places, depths = (None, None) if task.goals is None else task.goals[:2]
             concatenated = self._concatenated(batch, task.concat, places, depths)
@@ -427,18 +288,6 @@ class DeltacoPolicy(PreTrainedPolicy):
         if gripper is not None:
             gripper = torch.sigmoid(gripper.float())
         return join_action(motion.mean.float(), gripper, self.config.gripper_index)
-
-    @staticmethod
-    def _instructions_of(batch: dict[str, Any]) -> tuple[str, ...]:
-        """The instruction of each sample."""
-        tasks = batch.get("task")
-        if isinstance(tasks, (list, tuple)) and tasks and all(isinstance(task, str) for task in tasks):
-            return tuple(tasks)
-        raise ValueError(
-            "`task` must be a list with an instruction for each sample of the batch. Got "
-            f"{'none' if tasks is None else repr(tasks)}. LeRobot takes it from the environment's "
-            '`task_description`, or from --task; in Python, set observation["task"] before the preprocessor.'
-        )
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The action as a chunk of one, (batch, 1, action)."""
@@ -459,7 +308,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         if self.goals is not None:
             goals = self._find_goals(images[:, 0], tasks, trials)
         elif self.config.uses_demo:
-            demonstrations, rows = self._choose_eval_demonstrations(tasks, trials)
+            demonstrations, rows = self._choose_demonstrations(tasks, trials)
             generator = torch.Generator().manual_seed(self.config.seed)
             demo = self._embedder.embed_demonstrations(demonstrations, rows, generator, self.training)
         if self.config.language_is_input:
@@ -471,48 +320,18 @@ class DeltacoPolicy(PreTrainedPolicy):
             by_language = torch.tensor(trials, device=images.device) % 2 == 0
             either = torch.where(by_language[:, None], language, demo)
             return TaskConditioning(tasks, either, None, self._acting_model())
-        film, concat = self.conditioning_inputs(tasks, demo, language)
+        film, concat = self._embedder.conditioning_inputs(tasks, demo, language, images.device)
         return TaskConditioning(tasks, film, concat, self._acting_model(), goals)
-
-    def _choose_eval_demonstrations(
-        self, tasks: Sequence[str], trials: Sequence[int]
-    ) -> tuple[DemonstrationSet, Tensor]:
-        if self.config.demo_episode is not None and self.eval_demonstrations is not None:
-            chosen, rows = choose_episode(self.eval_demonstrations, self.config.demo_episode, len(tasks))
-        else:
-            candidates = (self.eval_demonstrations, self.train_demonstrations)
-            demonstrated_as = dict(self._demonstrated_as)
-            if self.config.demo_task is not None:
-                demonstrated_as |= dict.fromkeys(tasks, self.config.demo_task)
-            if self.paraphrases is not None:
-                known = {name for candidate in candidates if candidate is not None for name in candidate.rows}
-                demonstrated_as = self.paraphrases.tasks_of(tasks, known) | demonstrated_as
-            chosen, rows = choose_eval_demonstrations(candidates, tasks, trials, demonstrated_as)
-        if not self.training:
-            self._episode_tasks.note_demonstrations(chosen.describe(rows))
-        return chosen, rows
 
     def _acting_model(self) -> nn.Module:
         """The network that acts: in evaluation mode, a copy that is faster for small batches."""
         return self.model if self.training else self._folded.network()
 
-    def _autocast(self, device: torch.device) -> AbstractContextManager:
-        if self.config.dtype == "float32":
-            return nullcontext()
-        return torch.autocast(device.type, torch.bfloat16)
-
-    # Training and evaluation
+    # Inputs of the network
 
     def _images(self, batch: dict[str, Any]) -> Tensor:
         """Images of all cameras, that of the demonstrations first, (batch, cameras, 3, size, size)."""
-        size = self.config.image_size
-        images = []
-        for name in self.config.cameras:
-            image = batch[name]  # (batch, 3, H, W)
-            if image.shape[-2:] != (size, size):
-                image = F.interpolate(image, (size, size), mode="bilinear", antialias=True)
-            images.append(image)
-        return torch.stack(images, dim=1)
+        return stacked_images(batch, self.config.cameras, self.config.image_size)
 
     def _concatenated(
         self,
@@ -530,17 +349,95 @@ class DeltacoPolicy(PreTrainedPolicy):
             parts.append(self.goals.offsets(goals, depths, batch[OBS_STATE].float()))
         return torch.cat(parts, dim=-1) if parts else None
 
-    def conditioning_inputs(
-        self, tasks: Sequence[str], demo: Tensor | None, language: Tensor | None
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """The embeddings that go through FiLM, and those that are concatenated to the feature points.
+    # Demonstrations and instructions
+
+    def set_train_demonstrations(
+        self, demonstrations: DemonstrationSet, robot_data: RobotData | None = None
+    ) -> None:
+        """Sets the demonstrations for training, which are otherwise read from the disk with the first batch.
 
         Args:
-            tasks: Instruction of each sample.
-            demo: Embeddings of demonstrations, (batch, embedding); None if they are not used.
-            language: Embeddings of instructions, (batch, embedding); None if they are not used.
+            demonstrations: Demonstrations, which include every episode of the training.
+            robot_data: States and actions of the robot in them, for `demo_encoder=correspondence`.
         """
-        return self._embedder.conditioning_inputs(tasks, demo, language, self.step.device)
+        self.train_demonstrations = demonstrations
+        self._train_demonstrations_are_complete = True
+        if self.goals is not None:
+            assert robot_data is not None
+            self._fit_goals(robot_data)
+
+    def _training_demonstrations(self, device: torch.device) -> DemonstrationSet:
+        if self.train_demonstrations is None:
+            loaded, robot_data = read_training_demonstrations(self.config, self._meta)
+            self.train_demonstrations = loaded.to(device)
+            if robot_data is not None:
+                self._fit_goals(robot_data)
+        return self.train_demonstrations
+
+    def _fit_goals(self, robot_data: RobotData) -> None:
+        """Finds the goals of the training episodes."""
+        assert self.train_demonstrations is not None
+        assert self.goals is not None
+        self.goal_trainer = fit_goals(
+            self.config, self.goals, self.train_demonstrations, robot_data, self._stats
+        )
+
+    def _find_goals(self, scenes: Tensor, tasks: Sequence[str], trials: Sequence[int]) -> FoundGoals:
+        """Finds the goals of tasks in scenes (batch, 3, H, W), by the demonstrations of these trials."""
+        assert self.goals is not None
+        n_each = self.config.n_demonstrations
+
+        def choose(number: int) -> tuple[DemonstrationSet, Tensor]:
+            return self._choose_demonstrations(tasks, [trial * n_each + number for trial in trials])
+
+        return find_goals(self.config, self.goals, self._embedder, scenes, tasks, choose)
+
+    def _choose_demonstrations(
+        self, tasks: Sequence[str], trials: Sequence[int]
+    ) -> tuple[DemonstrationSet, Tensor]:
+        """The demonstration of each sample: a set, and the row of each in it, (batch,)."""
+        candidates = (self.eval_demonstrations, self.train_demonstrations)
+        chosen, rows = choose_demonstrations(
+            self.config, candidates, tasks, trials, self._episode_tasks.replaced, self.paraphrases
+        )
+        if not self.training:
+            self._episode_tasks.note_demonstrations(chosen.describe(rows))
+        return chosen, rows
+
+    @property
+    def paraphrases(self) -> Paraphrases | None:
+        """Sentences that people wrote for task strings; None for the task strings alone."""
+        return self._embedder.paraphrases
+
+    @paraphrases.setter
+    def paraphrases(self, paraphrases: Paraphrases | None) -> None:
+        self._embedder.paraphrases = paraphrases
+
+    # Episodes
+
+    def reset(self) -> None:
+        """Starts an episode, of this thread if several threads evaluate tasks at the same time."""
+        self._episode_tasks.begin_episode()
+
+    def begin_evaluation(self) -> None:
+        """Starts an evaluation: the demonstrations of each task begin with the first again."""
+        self._episode_tasks.begin_evaluation()
+
+    def demonstrated(self, sample: int) -> list[Demonstrated]:
+        """The demonstrations of a sample in this thread's episode; none before its first action."""
+        return self._episode_tasks.demonstrated(sample)
+
+    def demonstrated_as(self, tasks: Mapping[str, str]) -> AbstractContextManager[None]:
+        """Uses other tasks' demonstrations with some instructions, while the context is open.
+
+        For example, to perform a task from a demonstration and a sentence of one's own:
+        `with policy.demonstrated_as({"fetch the jar": task.instruction}): ...`
+
+        Args:
+            tasks: For an instruction, the task string whose demonstrations are used. It is read when an
+                episode starts; instructions that it lacks keep their own demonstrations.
+        """
+        return self._episode_tasks.demonstrated_as(tasks)
 
     # Datasets and checkpoints
 
@@ -550,14 +447,10 @@ class DeltacoPolicy(PreTrainedPolicy):
         # LeRobot 0.6.1 may pass a `state_dict`, later versions do not; it is handed on as it comes.
         with without_sources(self.config):
             super()._save_pretrained(save_directory, *args, **kwargs)
-        if _process_rank() != 0:
+        if process_rank() != 0:
             return  # versions after 0.6.1 call this on every process
-        contents = self.instructions.contents()
-        if self.paraphrases is not None:
-            contents = contents._replace(paraphrases=self.paraphrases.known)
-        if self.eval_demonstrations is not None and self.config.uses_demo:
-            stored = demonstrations_to_store(self.eval_demonstrations, self._frozen)
-            contents = contents._replace(demonstrations=stored)
+        demonstrations = self.eval_demonstrations if self.config.uses_demo else None
+        contents = task_contents(self.instructions, self.paraphrases, demonstrations, self._frozen)
         write_task_file(save_directory / TASK_FILE, contents)
 
     @classmethod
@@ -599,6 +492,19 @@ class DeltacoPolicy(PreTrainedPolicy):
         check_weight_names(state_dict)
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
+    def _take_tasks(self, contents: TaskFile, path: Path) -> None:
+        """Takes what the checkpoint knows of tasks."""
+        self.instructions.take(contents, path)
+        if self.paraphrases is None and contents.paraphrases:
+            self.paraphrases = Paraphrases(contents.paraphrases)
+        if contents.demonstrations is None:
+            return
+        check_stored_frames(contents.demonstrations, path, self.config)
+        # Demonstrations named on the command line come before those of the checkpoint.
+        if self.eval_demonstrations is None:
+            known = stored_demonstrations(contents.demonstrations, path, self.config)
+            self.eval_demonstrations = known.to(self.config.device)
+
     def generate_model_card(
         self,
         dataset_repo_id: str,
@@ -614,21 +520,3 @@ class DeltacoPolicy(PreTrainedPolicy):
         return policy_card(
             self.config, demonstrations, n_known, dataset_repo_id, license, tags, cfg, dataset_meta
         )
-
-    def _take_tasks(self, contents: TaskFile, path: Path) -> None:
-        """Takes what the checkpoint knows of tasks."""
-        self.instructions.take(contents, path)
-        if self.paraphrases is None and contents.paraphrases:
-            self.paraphrases = Paraphrases(contents.paraphrases)
-        if contents.demonstrations is None:
-            return
-        check_stored_frames(contents.demonstrations, path, self.config)
-        # Demonstrations named on the command line come before those of the checkpoint.
-        if self.eval_demonstrations is None:
-            known = stored_demonstrations(contents.demonstrations, path, self.config)
-            self.eval_demonstrations = known.to(self.config.device)
-
-
-def _process_rank() -> int:
-    """Number of this process among those that train together."""
-    return torch.distributed.get_rank() if torch.distributed.is_initialized() else 0

@@ -38,7 +38,7 @@ class FakeArmConfig(RobotConfig):
 
 
 class FakeArm(_Device, Robot):
-    """Is at once where it is told to be; its camera's image is as bright as its shoulder is high."""
+    """Is at once where it is sent; its camera's image is as bright as its shoulder is high."""
 
     config_class = FakeArmConfig
     name = "fake_arm"

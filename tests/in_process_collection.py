@@ -2,7 +2,7 @@
 
 from concurrent.futures import Executor, Future
 
-from lerobot_deltaco.data import collection
+from lerobot_deltaco.data import collection, collection_workers
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import collect_episode
 
@@ -45,11 +45,11 @@ def collect_in_process(monkeypatch, remembered, episodes_per_file):
         return remembered(env, plan, task_id, number)
 
     def executor(job, n_workers):
-        worker = collection._Worker(job, None, files.data_schema(job.plan.features))
-        monkeypatch.setattr(collection, "_worker", worker)
+        worker = collection_workers._Worker(job, None, files.data_schema(job.plan.features))
+        monkeypatch.setattr(collection_workers, "_worker", worker)
         return InProcess()
 
-    monkeypatch.setattr(collection, "collect_episode", collect_and_count)
-    monkeypatch.setattr(collection, "_executor", executor)
+    monkeypatch.setattr(collection_workers, "collect_episode", collect_and_count)
+    monkeypatch.setattr(collection_workers, "_executor", executor)
     monkeypatch.setattr(collection, "EPISODES_PER_FILE", episodes_per_file)
     return collected

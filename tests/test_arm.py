@@ -1,4 +1,4 @@
-"""The arm's kinematics are the published ones, and the simulated arm does what it is told."""
+"""The arm's kinematics are the published ones, and the simulated arm follows its commands."""
 
 import numpy as np
 import pybullet

@@ -6,7 +6,7 @@ from einops import rearrange
 from torch import nn
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, crop_array, frame_array
+from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, crop_demonstrations, frame_array
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.initial_weights import initialize_demo_encoder, initialize_policy
 from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
@@ -15,7 +15,7 @@ from lerobot_deltaco.policy.networks import ConditionedPolicy, random_crop
 def test_the_array_is_shifted_as_a_whole():
     torch.manual_seed(0)
     frames = torch.rand(16, 2, 3, 8, 8)
-    cropped = crop_array(frames, 1, 3, torch.Generator().manual_seed(0))
+    cropped = crop_demonstrations(frames, 3, 1, torch.Generator().manual_seed(0))
     assert cropped.shape == frames.shape
     expected = random_crop(frame_array(frames, 1), 3, torch.Generator().manual_seed(0))
     assert torch.equal(frame_array(cropped, 1), expected)
@@ -28,16 +28,16 @@ def test_the_array_is_shifted_as_a_whole():
         assert torch.equal(cropped[n, 0, :, :, -2:], frames[n, 1, :, :, :2])
         assert torch.equal(cropped[n], apart[n])
     # A row of frames comes back in its order.
-    assert torch.equal(crop_array(frames, 2, 0, torch.Generator()), frames)
+    assert torch.equal(crop_demonstrations(frames, 0, 2, torch.Generator()), frames)
 
 
 def test_frames_between_are_drawn_from_equal_parts_of_the_time():
     frames = torch.arange(16, dtype=torch.uint8)[None, :, None, None, None].expand(1, 16, 3, 2, 2)
-    shown = DemonstrationSet(frames, ["a"], [0])
+    demos = DemonstrationSet(frames, ["a"], [0])
     rows = torch.zeros(500, dtype=torch.int64)
 
     def drawn(spread):
-        images = shown.sample_frames(rows, 4, torch.Generator().manual_seed(0), spread)
+        images = demos.sample_frames(rows, 4, torch.Generator().manual_seed(0), spread)
         return (images[:, :, 0, 0, 0] * 255).round().long()
 
     spread = drawn(True)
@@ -48,7 +48,7 @@ def test_frames_between_are_drawn_from_equal_parts_of_the_time():
     independent = drawn(False)
     assert (independent[:, 1] == independent[:, 2]).any()
     assert (independent[:, 1] > 7).any()
-    assert (shown.sample_frames(rows[:2], 2, torch.Generator(), True)[:, 1] * 255 == 15).all()
+    assert (demos.sample_frames(rows[:2], 2, torch.Generator(), True)[:, 1] * 255 == 15).all()
 
 
 def test_the_authors_initial_weights():

@@ -35,7 +35,7 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASKS
 from lerobot_deltaco.cards.dataset_card import write_card
 from lerobot_deltaco.commands.collect import main
-from lerobot_deltaco.data import collection, collection_plan
+from lerobot_deltaco.data import collection, collection_plan, collection_workers
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import CollectionError, collect
 from lerobot_deltaco.data.collection_plan import DATA_SETS, CollectionPlan
@@ -346,7 +346,7 @@ def test_an_interrupted_addition_leaves_the_old_dataset_readable(copy, tmp_path,
     collect(expected, added, append=True)
 
     before = contents(copy)
-    monkeypatch.setattr(collection, "_join", fail_with(OSError("The disk is full.")))
+    monkeypatch.setattr(collection_workers, "_join", fail_with(OSError("The disk is full.")))
     with pytest.raises(OSError, match="full"):
         collect(copy, added, append=True)
     assert before.items() <= contents(copy).items()
@@ -477,11 +477,11 @@ def test_many_complete_files_may_wait_to_be_joined(tmp_path, monkeypatch, in_pro
     plan = CollectionPlan("4,90,32", 3)
     expected = tmp_path / "expected"
     collect(expected, plan)
-    join = collection._join
-    monkeypatch.setattr(collection, "_join", lambda part: None)
+    join = collection_workers._join
+    monkeypatch.setattr(collection_workers, "_join", lambda part: None)
     with pytest.raises(CollectionError, match="missing"):
         collect(tmp_path / "root", plan)
-    monkeypatch.setattr(collection, "_join", join)
+    monkeypatch.setattr(collection_workers, "_join", join)
     collect(tmp_path / "root", plan)
     assert contents(tmp_path / "root") == contents(expected)
 
@@ -696,7 +696,7 @@ def test_other_arguments_are_refused(copy, tmp_path, monkeypatch, in_process, ch
     assert contents(copy) == before
 
     unfinished = tmp_path / "unfinished"
-    monkeypatch.setattr(collection, "_join", fail_with(OSError("full")))
+    monkeypatch.setattr(collection_workers, "_join", fail_with(OSError("full")))
     with pytest.raises(OSError, match="full"):
         collect(unfinished, PLAN)
     before = contents(unfinished)
@@ -746,7 +746,7 @@ def test_a_dataset_that_another_process_has_finished_meanwhile_is_not_touched(co
 def test_workers_of_a_killed_run_are_waited_for(tmp_path, in_process):
     """They end by themselves, but not in the same instant."""
     (tmp_path / STAGING).mkdir()
-    with (tmp_path / STAGING / collection.WORKERS_LOCK).open("w") as lock:
+    with (tmp_path / STAGING / collection_workers.WORKERS_LOCK).open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_SH)
         seconds = 0.2
         threading.Timer(seconds, lambda: fcntl.flock(lock, fcntl.LOCK_UN)).start()
@@ -766,11 +766,11 @@ def flipped(path, share):
 
 
 def test_a_damaged_episode_is_named_and_can_be_collected_anew(finished, tmp_path, monkeypatch, in_process):
-    join = collection._join
-    monkeypatch.setattr(collection, "_join", fail_with(OSError("full")))
+    join = collection_workers._join
+    monkeypatch.setattr(collection_workers, "_join", fail_with(OSError("full")))
     with pytest.raises(OSError, match="full"):
         collect(tmp_path, PLAN)
-    monkeypatch.setattr(collection, "_join", join)
+    monkeypatch.setattr(collection_workers, "_join", join)
     damaged = tmp_path / STAGING / "episodes" / "0000002.arrow"
     old = damaged.read_bytes()
     for damage in (
@@ -815,7 +815,7 @@ def test_a_damaged_file_that_waits_is_named_and_can_be_collected_anew(
 
 
 def test_a_collection_whose_arguments_are_lost_is_not_continued(copy, tmp_path, monkeypatch, in_process):
-    monkeypatch.setattr(collection, "_join", fail_with(OSError("full")))
+    monkeypatch.setattr(collection_workers, "_join", fail_with(OSError("full")))
     new, added = tmp_path / "new", copy
     for root, plan, append in ((new, PLAN, False), (added, CollectionPlan("32", 2), True)):
         with pytest.raises(OSError, match="full"):

@@ -1,4 +1,4 @@
-"""Evaluation sets: which scenes, what the policy is told, and what is recorded."""
+"""Evaluation sets: which scenes, what the policy is given, and what is recorded."""
 
 import json
 import random
@@ -141,10 +141,10 @@ def test_a_counterfactual_changes_one_of_both(loaded, changed):
     plan = EvaluationPlan("4,14,55", trials=2, counterfactual=changed)
     for episode in evaluate(*loaded, plan, set_number=0):
         own = get_task(episode.task_id).instruction
-        told = {"demo": episode.demonstration, "instruction": episode.instruction}
-        assert told.pop(changed) != own
-        assert list(told.values()) == [own]
-    assert loaded.policy._demonstrated_as == {}
+        given = {"demo": episode.demonstration, "instruction": episode.instruction}
+        assert given.pop(changed) != own
+        assert list(given.values()) == [own]
+    assert loaded.policy._episode_tasks.replaced == {}
 
 
 def test_the_other_task_asks_for_another_object_of_the_scene_and_the_other_container():
@@ -197,15 +197,15 @@ def test_records_of_other_evaluations_are_not_taken_for_this_one(run, capsys):
 
 
 def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder(run, tmp_path, capsys):
-    collect_command.main(["--tasks", "7", "--episodes-per-task", "1", "--root", str(tmp_path / "shown")])
+    collect_command.main(["--tasks", "7", "--episodes-per-task", "1", "--root", str(tmp_path / "demos")])
     arguments = [str(run), "--tasks", "7", "--trials", "1", "--steps", "last"]
     with pytest.raises(SystemExit):
         evaluate_command.main([*arguments, "--out", str(tmp_path / "out")])
     assert "--policy.demo_root" in capsys.readouterr().err
-    shown = ["--policy.demo_repo_id", "test/shown", "--policy.demo_root", str(tmp_path / "shown")]
+    demos = ["--policy.demo_repo_id", "test/demos", "--policy.demo_root", str(tmp_path / "demos")]
     with pytest.MonkeyPatch.context() as patch:
         use_fake_encoder(patch)
-        evaluate_command.main([*arguments, *shown, "--out", str(tmp_path / "out")])
+        evaluate_command.main([*arguments, *demos, "--out", str(tmp_path / "out")])
     (episode,) = read_record(record_path(tmp_path / "out", 2)).episodes
     assert episode.demonstration == episode.instruction == get_task(7).instruction
     with pytest.raises(SystemExit):

@@ -15,8 +15,8 @@ from lerobot_deltaco.commands import evaluate as evaluate_command
 from lerobot_deltaco.common.run_folder import RunError, checkpoints
 from lerobot_deltaco.evaluation import processes
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
+from lerobot_deltaco.evaluation.episode_videos import KINDS, check_explainable, kind_of, write_videos
 from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
-from lerobot_deltaco.evaluation.films import KINDS, check_explainable, kind_of, write_videos
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.processes import EvaluationError, default_processes, run_tasks
 from lerobot_deltaco.evaluation.record import EpisodeResult, read_record, record_path
@@ -209,7 +209,7 @@ def test_several_demonstrations_are_taken_from_a_dataset(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def filmed(evaluated):
+def rendered(evaluated):
     """A folder with two explanations and a video of each kind of outcome, and the record beside it."""
     out, record = evaluated
     evaluate_command.main(
@@ -231,8 +231,8 @@ def filmed(evaluated):
     return out / "evaluations" / f"{STEP:07d}", record
 
 
-def test_explanations_are_images_of_episodes_spread_over_the_set(filmed):
-    folder, record = filmed
+def test_explanations_are_images_of_episodes_spread_over_the_set(rendered):
+    folder, record = rendered
     images = sorted((folder / "explanations").iterdir())
     assert [path.name[:16] for path in images] == ["task_024_trial_0", "task_035_trial_1"]
     for path in images:
@@ -242,18 +242,18 @@ def test_explanations_are_images_of_episodes_spread_over_the_set(filmed):
             assert (pixels[-150:] == color).all(axis=-1).any()
 
 
-def test_a_map_that_was_not_learned_is_not_drawn(filmed, loaded):
+def test_a_map_that_was_not_learned_is_not_drawn(rendered, loaded):
     # The release is the instruction's: the attention for it is untrained.
     assert loaded.policy.goals.locator.release_source != "demo"
-    folder, _ = filmed
+    folder, _ = rendered
     pixels = np.asarray(Image.open(next((folder / "explanations").iterdir()))).astype(int)
     last_of_demonstration = pixels[40:240, 240:448]
     bluish = last_of_demonstration[..., 2] - last_of_demonstration[..., 0]
     assert np.median(bluish) < 20
 
 
-def test_videos_are_sorted_by_outcome_with_an_index(filmed):
-    folder, record = filmed
+def test_videos_are_sorted_by_outcome_with_an_index(rendered):
+    folder, record = rendered
     index = json.loads((folder / "videos" / "index.json").read_text())
     counts = {kind: sum(kind_of(item) == kind for item in record.episodes) for kind in KINDS}
     assert index["episodes_by_outcome"] == counts
@@ -273,8 +273,8 @@ def test_videos_are_sorted_by_outcome_with_an_index(filmed):
         assert frames[0].width > frames[0].height  # the demonstration beside the scene
 
 
-def test_a_run_that_ends_otherwise_is_said_to(filmed, loaded, tmp_path):
-    _, record = filmed
+def test_a_run_that_ends_otherwise_is_said_to(rendered, loaded, tmp_path):
+    _, record = rendered
     other = [replace(episode, success=not episode.success) for episode in record.episodes]
     record = replace(record, episodes=other)
     page = write_videos(tmp_path, loaded, EvaluationPlan(TASKS, trials=2), record, 1)
@@ -283,8 +283,8 @@ def test_a_run_that_ends_otherwise_is_said_to(filmed, loaded, tmp_path):
     assert not any(item["ends_as_recorded"] for item in index["videos"])
 
 
-def test_what_is_typed_is_no_markup(filmed, loaded, tmp_path):
-    _, record = filmed
+def test_what_is_typed_is_no_markup(rendered, loaded, tmp_path):
+    _, record = rendered
     sentence = "<script>alert(1)</script> & more"
     episodes = [replace(item, instruction=sentence) for item in record.episodes[:1]]
     page = write_videos(

@@ -71,11 +71,11 @@ def test_a_row_builds_its_policy_and_takes_a_training_step(dataset, monkeypatch,
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_what_a_row_names_is_valid(name):
     config = read_experiment(FOLDER, name)
-    plan, shown = CollectionPlan(**config.data), CollectionPlan(**config.demonstrations)
+    plan, demos = CollectionPlan(**config.data), CollectionPlan(**config.demonstrations)
     evaluation = EvaluationPlan(**config.evaluation)
     assert plan.split == "train"
-    assert shown.split == "validation"
-    assert plan.ambiguity == shown.ambiguity == evaluation.ambiguity
+    assert demos.split == "validation"
+    assert plan.ambiguity == demos.ambiguity == evaluation.ambiguity
     assert set(config.training) <= TRAINING_OPTIONS
     assert config.training["batch_size"] % config.policy["tasks_per_batch"] == 0
     if config.start_from is not None:

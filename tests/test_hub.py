@@ -110,21 +110,21 @@ def test_the_images_are_there_and_shown(dataset):
     assert set(shown) == {str(TASKS_IMAGE), str(EPISODE_IMAGE)}
     with Image.open(dataset / TASKS_IMAGE) as image:
         assert image.width > 3 * 256
-    with Image.open(dataset / EPISODE_IMAGE) as film:
-        assert film.n_frames == 30
-        assert min(film.size) > 256
+    with Image.open(dataset / EPISODE_IMAGE) as animation:
+        assert animation.n_frames == 30
+        assert min(animation.size) > 256
 
 
-def test_the_films_of_people_and_of_the_dataset_show_the_same(copy):
+def test_the_animations_of_people_and_of_the_dataset_show_the_same(copy):
     """An episode that cannot be drawn again is shown as it is stored."""
-    redrawn = film_frames(copy)
+    redrawn = animation_frames(copy)
     for path in copy.glob("data/*/*.parquet"):
         table = pq.read_table(path)
         column = table.schema.get_field_index("benchmark.seed")
         other = table.set_column(column, "benchmark.seed", [np.arange(len(table))])
         pq.write_table(other, path)
     write_card(copy)
-    stored = film_frames(copy)
+    stored = animation_frames(copy)
     assert len(stored) == len(redrawn)
     for a, b in zip(stored, redrawn, strict=True):
         coarse = [np.asarray(frame.resize((24, 24), Image.Resampling.BOX), dtype=float) for frame in (a, b)]
@@ -132,13 +132,17 @@ def test_the_films_of_people_and_of_the_dataset_show_the_same(copy):
         assert np.abs(coarse[0] - coarse[1]).mean() < 10
 
 
-def film_frames(root):
-    with Image.open(root / EPISODE_IMAGE) as film:
+def animation_frames(root):
+    with Image.open(root / EPISODE_IMAGE) as animation:
         frames = []
-        for number in range(film.n_frames):
-            film.seek(number)
-            size = film.width - 8  # without the frame; the caption is above
-            frames.append(film.convert("RGB").crop((4, film.height - size - 4, size + 4, film.height - 4)))
+        for number in range(animation.n_frames):
+            animation.seek(number)
+            size = animation.width - 8  # without the frame; the caption is above
+            frames.append(
+                animation.convert("RGB").crop(
+                    (4, animation.height - size - 4, size + 4, animation.height - 4)
+                )
+            )
         return frames
 
 

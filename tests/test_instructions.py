@@ -1,4 +1,4 @@
-"""Instructions in people's own words: files, splits, the environment and the command that fetches them."""
+"""Instructions written by people: files, splits, the environment and the command that fetches them."""
 
 import threading
 from contextlib import closing
@@ -97,13 +97,13 @@ def env():
         yield env
 
 
-def test_an_episode_is_told_one_of_its_tasks_sentences_by_its_seed(env):
-    told = []
+def test_an_episode_has_one_of_its_tasks_sentences_by_its_seed(env):
+    instructions = []
     for seed in [*range(20), *range(20)]:
         env.reset(seed=seed)
-        told.append(env.task_description)
-    assert told[:20] == told[20:]
-    assert set(told) == set(env.instructions[4])
+        instructions.append(env.task_description)
+    assert instructions[:20] == instructions[20:]
+    assert set(instructions) == set(env.instructions[4])
     env.reset(seed=0, options={"task_id": 90})
     assert env.task_description == "only one"
 
@@ -119,10 +119,10 @@ def test_scenes_are_the_same_with_other_words(env):
 
 def test_an_episode_of_a_task_without_sentences_is_refused(env):
     env.reset(seed=0)
-    told = env.task_description
+    instructions = env.task_description
     with pytest.raises(InstructionsError, match="no instruction for task 5"):
         env.reset(options={"task_id": 5})
-    assert (env.task.index, env.task_description) == (4, told)
+    assert (env.task.index, env.task_description) == (4, instructions)
 
 
 # The command

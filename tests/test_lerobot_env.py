@@ -201,7 +201,7 @@ def test_a_finished_episode_stays_finished(make_envs):
     assert not truncated.any()
 
 
-def test_films_have_the_size_of_the_configuration(make_envs):
+def test_videos_have_the_size_of_the_configuration(make_envs):
     (env,) = make_envs("4", render_size=64).values()
     env.reset(seed=0)
     assert env.call("render")[0].shape == (64, 64, 3)

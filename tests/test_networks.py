@@ -6,7 +6,6 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 
-from lerobot_deltaco.configuration_deltaco import BACKBONES
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder, frame_array
 from lerobot_deltaco.policy.inference import folded
 from lerobot_deltaco.policy.losses import (
@@ -25,6 +24,7 @@ from lerobot_deltaco.policy.networks import (
     SpatialSoftmax,
     random_crop,
 )
+from lerobot_deltaco.policy.options import BACKBONES
 
 
 @pytest.fixture(autouse=True)

@@ -100,6 +100,7 @@ FORBIDDEN = {
     },
     "lerobot_deltaco/policy/language_encoders.py": {"torch", "lerobot", "lerobot_deltaco"},
     "lerobot_deltaco/policy/vision_encoders.py": {"torch", "lerobot", "lerobot_deltaco"},
+    "lerobot_deltaco/policy/options.py": {"torch", "lerobot", "lerobot_deltaco"},
     "lerobot_deltaco/configuration_deltaco.py": {
         "torch",
         "lerobot_deltaco.modeling_deltaco",

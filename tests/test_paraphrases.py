@@ -1,4 +1,4 @@
-"""Policies that are trained and evaluated on sentences in people's own words."""
+"""Policies that are trained and evaluated on sentences that people wrote."""
 
 import functools
 from collections import Counter
@@ -41,14 +41,14 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory):
+def demos(tmp_path_factory):
     """A dataset with a demonstration of each task."""
-    return write_dataset(tmp_path_factory.mktemp("data") / "shown", TASKS)
+    return write_dataset(tmp_path_factory.mktemp("data") / "demos", TASKS)
 
 
 @pytest.fixture
-def make(dataset, shown):
-    return functools.partial(small_policy, dataset, demo_repo_id="test/foreign", demo_root=str(shown.root))
+def make(dataset, demos):
+    return functools.partial(small_policy, dataset, demo_repo_id="test/foreign", demo_root=str(demos.root))
 
 
 def test_a_file_is_read_by_task_string(tmp_path):
@@ -123,16 +123,16 @@ def test_a_sentence_has_the_demonstrations_of_its_task(make, dataset, caplog):
     policy.paraphrases = Paraphrases(WORDS)
     for task, action in zip(TASKS, expected, strict=True):
         policy.reset()
-        told = before(observation(dataset, [f" {WORDS[task][0].upper()} "]))
-        torch.testing.assert_close(policy.select_action(told), action)
+        observed = before(observation(dataset, [f" {WORDS[task][0].upper()} "]))
+        torch.testing.assert_close(policy.select_action(observed), action)
     policy.reset()
-    told = before(observation(dataset, ["do it"]))
-    torch.testing.assert_close(policy.select_action(told), expected[1])
+    observed = before(observation(dataset, ["do it"]))
+    torch.testing.assert_close(policy.select_action(observed), expected[1])
     assert "may mean 2 tasks" in caplog.text
     # What is said explicitly comes first.
     with policy.demonstrated_as({"do it": TASKS[2]}):
         policy.reset()
-        torch.testing.assert_close(policy.select_action(told), expected[2])
+        torch.testing.assert_close(policy.select_action(observed), expected[2])
 
 
 def test_a_named_task_demonstrates_any_words(make, dataset):
@@ -141,8 +141,8 @@ def test_a_named_task_demonstrates_any_words(make, dataset):
     expected = policy.select_action(before(observation(dataset, [TASKS[1]])))
     policy.config.demo_task = TASKS[1]
     policy.reset()
-    told = before(observation(dataset, ["fil teh mugs"]))
-    torch.testing.assert_close(policy.select_action(told), expected)
+    observed = before(observation(dataset, ["fil teh mugs"]))
+    torch.testing.assert_close(policy.select_action(observed), expected)
 
 
 def test_a_checkpoint_knows_the_sentences_and_names_no_file(make, dataset, tmp_path):
@@ -150,15 +150,15 @@ def test_a_checkpoint_knows_the_sentences_and_names_no_file(make, dataset, tmp_p
     policy.paraphrases = Paraphrases(WORDS, WORDS)
     policy(before(batch_of(dataset, [0, 7])))
     policy.eval()
-    told = before(observation(dataset, ["cups on cups"]))
-    expected = policy.select_action(told)
+    observed = before(observation(dataset, ["cups on cups"]))
+    expected = policy.select_action(observed)
     policy.config.instructions = str(tmp_path / "sentences.csv")
     policy.save_pretrained(tmp_path / "policy")
     assert policy.config.instructions is not None
     assert str(tmp_path) not in (tmp_path / "policy" / "config.json").read_text()
     fake_encoder.calls = []
     loaded = DeltacoPolicy.from_pretrained(tmp_path / "policy")
-    assert torch.equal(loaded.select_action(told), expected)
+    assert torch.equal(loaded.select_action(observed), expected)
     assert fake_encoder.calls == []
     assert loaded.paraphrases.known == WORDS
     assert loaded.paraphrases.drawn == {}

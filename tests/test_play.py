@@ -93,7 +93,7 @@ def write_dataset(folder, camera="observation.image", n_states=10, use_videos=Fa
         "observation.state": {"dtype": "float32", "shape": (n_states,), "names": None},
         "action": {"dtype": "float32", "shape": (4,), "names": None},
     }
-    dataset = LeRobotDataset.create("test/shown", 24, features, root=folder, use_videos=use_videos)
+    dataset = LeRobotDataset.create("test/demos", 24, features, root=folder, use_videos=use_videos)
     for number, task in enumerate(DATASET_TASKS):
         for step in range(LENGTH):
             gripper = -1 if 2 <= step < 4 else 1
@@ -480,7 +480,7 @@ def test_the_grasp_of_an_episode_is_known_if_the_policy_asks_for_it(actions, che
 def test_an_episode_is_read_as_a_checkpoint_reads_its_own(actions, checkpoints, session):
     folder = checkpoints / "dataset"
     session = actions.choose_demonstration(actions.open_dataset(session, str(folder)), DATASET_TASKS[2], 1)
-    own = load_demonstrations("test/shown", folder, None, "observation.image", 48, 2)
+    own = load_demonstrations("test/demos", folder, None, "observation.image", 48, 2)
     expected = own.frames[own.rows[DATASET_TASKS[2]][0]].permute(0, 2, 3, 1).numpy()
     assert np.array_equal(session.demonstration.frames, expected)
 

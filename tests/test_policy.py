@@ -267,13 +267,13 @@ def test_bfloat16_trains(make, dataset, options):
 
 
 @pytest.fixture
-def shown(tmp_path):
+def demos(tmp_path):
     """One demonstration of each task, and of one that is not trained on."""
-    return write_dataset(tmp_path / "shown", [*TASKS, "juggle"])
+    return write_dataset(tmp_path / "demos", [*TASKS, "juggle"])
 
 
-def test_a_novel_task_is_served_by_its_demonstration(make, dataset, shown):
-    policy, before, after = make(demo_repo_id="test/foreign", demo_root=str(shown.root))
+def test_a_novel_task_is_served_by_its_demonstration(make, dataset, demos):
+    policy, before, after = make(demo_repo_id="test/foreign", demo_root=str(demos.root))
     policy.eval()
     action = after(policy.select_action(before(observation(dataset, ["juggle", "wave"]))))
     assert action.shape == (2, 3)
@@ -282,15 +282,15 @@ def test_a_novel_task_is_served_by_its_demonstration(make, dataset, shown):
     assert (action[:, 1] <= high[1]).all()
 
 
-def test_a_task_without_a_demonstration_is_named(make, dataset, shown):
-    policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(shown.root))
+def test_a_task_without_a_demonstration_is_named(make, dataset, demos):
+    policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(demos.root))
     policy.eval()
     with pytest.raises(ValueError, match="no demonstration of the task 'sing'.*of 4 tasks.*demo_episode"):
         policy.select_action(before(observation(dataset, ["sing"])))
 
 
-def test_a_named_episode_serves_any_words(make, dataset, shown):
-    options = {"demo_repo_id": "test/foreign", "demo_root": str(shown.root), "method": "demo_only"}
+def test_a_named_episode_serves_any_words(make, dataset, demos):
+    options = {"demo_repo_id": "test/foreign", "demo_root": str(demos.root), "method": "demo_only"}
     policy, before, _ = make(**options)
     policy.eval()
     expected = policy.select_action(before(observation(dataset, ["juggle"])))
@@ -399,15 +399,15 @@ def test_mcils_trials_use_language_and_demonstration_in_turn(make, dataset):
 
 
 @pytest.mark.parametrize("options", [{}, OURS], ids=str)
-def test_a_checkpoint_is_complete_and_equal_to_the_bit(make, dataset, shown, tmp_path, options):
-    policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(shown.root), **options)
+def test_a_checkpoint_is_complete_and_equal_to_the_bit(make, dataset, demos, tmp_path, options):
+    policy, before, _ = make(demo_repo_id="test/foreign", demo_root=str(demos.root), **options)
     policy(before(batch_of(dataset, [0, 7])))
     policy.eval()
     batch = before(observation(dataset, ["juggle", "wave"]))
     expected = policy.select_action(batch)
     policy.save_pretrained(tmp_path / "policy")
     assert {path.suffix for path in (tmp_path / "policy").iterdir()} == {".json", ".safetensors"}
-    assert str(shown.root) not in (tmp_path / "policy" / "config.json").read_text()
+    assert str(demos.root) not in (tmp_path / "policy" / "config.json").read_text()
 
     fake_encoder.calls = []
     loaded = DeltacoPolicy.from_pretrained(tmp_path / "policy")

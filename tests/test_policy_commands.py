@@ -11,9 +11,9 @@ import pytest
 from safetensors.torch import load_file
 
 from gym_deltaco.tasks import TASKS
-from lerobot_deltaco.configuration_deltaco import METHODS
 from lerobot_deltaco.data.collection import collect
 from lerobot_deltaco.data.collection_plan import CollectionPlan
+from lerobot_deltaco.policy.options import METHODS
 
 TASK_IDS = "4,50"
 STEPS = 4
@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
     """The folder of the runs, with a training dataset, and another one with a demonstration of each task."""
     folder = tmp_path_factory.mktemp("commands")
     collect(folder / "train", CollectionPlan(TASK_IDS, 3), n_workers=1)
-    collect(folder / "shown", CollectionPlan(TASK_IDS, 1, split="validation"), n_workers=1)
+    collect(folder / "demos", CollectionPlan(TASK_IDS, 1, split="validation"), n_workers=1)
     return folder
 
 
@@ -60,7 +60,7 @@ def training(folder, output, *more):
     return [
         *("--policy.type=deltaco", "--policy.language_encoder=all-MiniLM-L6-v2", "--policy.backbone=strided"),
         *("--policy.device=cpu", "--dataset.repo_id=me/train", f"--dataset.root={folder / 'train'}"),
-        *("--policy.demo_repo_id=me/shown", f"--policy.demo_root={folder / 'shown'}"),
+        *("--policy.demo_repo_id=me/demos", f"--policy.demo_root={folder / 'demos'}"),
         *(f"--steps={STEPS}", f"--save_freq={HALF}", f"--env_eval_freq={HALF}", "--log_freq=1"),
         *("--batch_size=3", "--num_workers=0", f"--output_dir={folder / output}", "--wandb.enable=false"),
         *(*EVALUATION, "--eval.n_episodes=1", "--eval.batch_size=1", *more),
@@ -131,7 +131,7 @@ def test_two_processes_train_alike_from_the_disk_and_from_memory(folder):
 def test_a_checkpoint_is_evaluated_by_itself(folder, trained):
     # Nothing but the checkpoint is left.
     moved = shutil.copytree(trained, folder / "moved")
-    hidden = [(folder / name).rename(folder / f"hidden_{name}") for name in ("train", "shown")]
+    hidden = [(folder / name).rename(folder / f"hidden_{name}") for name in ("train", "demos")]
     try:
         results = []
         for more in ([], ["--env.max_parallel_tasks=2"]):

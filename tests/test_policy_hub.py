@@ -23,10 +23,11 @@ from small_policies import REPO_ID, TASKS, small_policy, write_dataset
 from gym_deltaco import ENV_ID
 from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
 from lerobot_deltaco.cards.policy_card import MAX_TASKS_LISTED, METHOD_TEXTS, policy_card
-from lerobot_deltaco.configuration_deltaco import METHODS, DeltacoConfig
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.options import METHODS
 
 POLICY_ID = f"{USER}/policy"
 
@@ -35,8 +36,8 @@ pytestmark = pytest.mark.usefixtures("fake_language")
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory):
-    return write_dataset(tmp_path_factory.mktemp("data") / "shown", [*TASKS, "juggle"])
+def demos(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data") / "demos", [*TASKS, "juggle"])
 
 
 def foreign_card(dataset, train_config=None, **options):
@@ -193,13 +194,13 @@ def test_what_is_beyond_the_paper_is_named(dataset):
     assert "Gaussians" not in paper
 
 
-def test_the_demonstrations_that_it_carries_are_listed(dataset, shown):
+def test_the_demonstrations_that_it_carries_are_listed(dataset, demos):
     text = words_of(foreign_card(dataset)[0])
     assert "has no demonstrations" in text
-    card, _ = foreign_card(dataset, demo_repo_id=REPO_ID, demo_root=str(shown.root))
+    card, _ = foreign_card(dataset, demo_repo_id=REPO_ID, demo_root=str(demos.root))
     assert "has demonstrations of 4 tasks" in words_of(card)
     assert all(f"\n- {task}\n" in card.text for task in [*TASKS, "juggle"])
-    assert str(shown.root) not in card.text
+    assert str(demos.root) not in card.text
     many = [f"task\n {number}" for number in range(MAX_TASKS_LISTED + 3)]
     text = benchmark_card(shown_tasks=many).text
     assert "\n- task 9\n" in text
@@ -235,8 +236,8 @@ def test_the_card_says_only_what_is_known():
 
 
 @pytest.mark.parametrize("has_demonstrations", [False, True])
-def test_the_commands_of_the_card_are_lerobots(dataset, shown, tmp_path, monkeypatch, has_demonstrations):
-    source = {"demo_repo_id": REPO_ID, "demo_root": str(shown.root)} if has_demonstrations else {}
+def test_the_commands_of_the_card_are_lerobots(dataset, demos, tmp_path, monkeypatch, has_demonstrations):
+    source = {"demo_repo_id": REPO_ID, "demo_root": str(demos.root)} if has_demonstrations else {}
     card, policy = foreign_card(dataset, **source)
     policy.save_pretrained(tmp_path)
     plain, with_demonstrations = commands(card)
@@ -274,9 +275,9 @@ root, policy_id = Path(sys.argv[1]), sys.argv[2]
 fake_encoder.calls = []
 language.load_language_encoder = fake_encoder
 dataset = write_dataset(root / "train", [*TASKS, *TASKS])
-shown = write_dataset(root / "shown", [*TASKS, "juggle"])
+demos = write_dataset(root / "demos", [*TASKS, "juggle"])
 policy, before, after = small_policy(
-    dataset, repo_id=policy_id, push_to_hub=True, demo_repo_id=REPO_ID, demo_root=str(shown.root)
+    dataset, repo_id=policy_id, push_to_hub=True, demo_repo_id=REPO_ID, demo_root=str(demos.root)
 )
 policy(before(batch_of(dataset, [0, 7])))
 policy.eval()

@@ -1,4 +1,4 @@
-"""On a robot: a demonstration is recorded, and a policy told to do the same, by LeRobot's commands."""
+"""On a robot: a demonstration is recorded, and a policy performs its task, by LeRobot's commands."""
 
 import json
 import os
@@ -48,7 +48,7 @@ for name, *words in commands:
 
 FakeArm.sent.clear()
 config = PreTrainedConfig.from_pretrained(folder)
-config.demo_repo_id, config.demo_root, config.demo_episode = "me/shown", "shown", 0
+config.demo_repo_id, config.demo_root, config.demo_episode = "me/demos", "demos", 0
 policy = DeltacoPolicy.from_pretrained(folder, config=config)
 before, after = make_pre_post_processors(config, folder)
 robot = FakeArm(FakeArmConfig())
@@ -84,7 +84,7 @@ def session(tmp_path_factory):
     policy = folder / POLICY
     commands = [
         record("me/tasks", folder / "tasks", TASK, 3),
-        record("me/shown", folder / "shown", "drop it", 1),
+        record("me/demos", folder / "demos", "drop it", 1),
         [
             *("train", "--policy.type=deltaco", "--policy.device=cpu", "--policy.image_size=16"),
             *(
@@ -97,7 +97,7 @@ def session(tmp_path_factory):
         ],
         [
             *("rollout", f"--policy.path={policy}", "--robot.type=fake_arm", f"--task={SENTENCE}"),
-            *("--policy.demo_repo_id=me/shown", f"--policy.demo_root={folder / 'shown'}"),
+            *("--policy.demo_repo_id=me/demos", f"--policy.demo_root={folder / 'demos'}"),
             *("--policy.demo_episode=0", "--fps=20", "--duration=1", "--return_to_initial_position=false"),
         ],
     ]
@@ -131,7 +131,7 @@ def test_a_plain_loop_does_the_same(session):
 
 def test_the_demonstrations_are_the_recorded_ones(session):
     """What `lerobot-record` wrote is a video of one episode of one task."""
-    info = json.loads((session / "shown/meta/info.json").read_text())
+    info = json.loads((session / "demos/meta/info.json").read_text())
     assert (info["total_episodes"], info["total_tasks"]) == (1, 1)
     assert info["features"]["observation.images.front"]["dtype"] == "video"
 

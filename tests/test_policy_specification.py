@@ -23,8 +23,8 @@ from small_policies import (
     write_dataset,
 )
 
-from lerobot_deltaco.configuration_deltaco import BACKBONES, METHODS
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.options import BACKBONES, METHODS
 
 OPTIONS = [
     *({"method": method} for method in METHODS),
@@ -64,8 +64,8 @@ def make(request, dataset):
 
     def make():
         torch.manual_seed(0)
-        shown = {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
-        policy, before, after = small_policy(dataset, **shown, **request.param)
+        demos = {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
+        policy, before, after = small_policy(dataset, **demos, **request.param)
         return SimpleNamespace(policy=policy, before=before, after=after, config=policy.config)
 
     return make

@@ -19,7 +19,7 @@ from lerobot_deltaco.training.remote_job import RemoteJobError, check_remote_job
 
 ROOT = Path(__file__).parents[1]
 IMAGE = "--job.image=me/lerobot-deltaco"
-ON_HUB = {"me/train", "me/shown"}
+ON_HUB = {"me/train", "me/demos"}
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def submit(monkeypatch, tmp_path):
         arguments = {
             "policy.type": "deltaco",
             "policy.tasks_per_batch": "4",
-            "policy.demo_repo_id": "me/shown",
+            "policy.demo_repo_id": "me/demos",
             "dataset.repo_id": "me/train",
             "batch_size": "8",
             "output_dir": str(tmp_path / "run"),
@@ -79,7 +79,7 @@ def test_a_job_runs_this_command_in_the_image_that_is_named(submit):
     assert job["command"] == ["deltaco-train", f"--config_path={config['policy']['repo_id']}"]
     assert (job["image"], job["flavor"]) == ("me/lerobot-deltaco", "a10g-small")
     assert config["policy"]["tasks_per_batch"] == 4
-    assert config["policy"]["demo_repo_id"] == "me/shown"
+    assert config["policy"]["demo_repo_id"] == "me/demos"
     assert config["policy"]["push_to_hub"]
 
 
@@ -106,15 +106,15 @@ def test_what_a_job_cannot_see_is_refused(options, message, tmp_path, monkeypatc
     dataset = SimpleNamespace(repo_id=options.pop("repo_id", "me/train"), root=root)
     env = DeltacoEnv(instructions=options.pop("env_instructions", None))
     job = SimpleNamespace(image=image, target="a10g-small")
-    policy = None if path else DeltacoConfig(device="cpu", **{"demo_repo_id": "me/shown", **options})
+    policy = None if path else DeltacoConfig(device="cpu", **{"demo_repo_id": "me/demos", **options})
     config = SimpleNamespace(policy=policy, job=job, dataset=dataset, env=env)
     with pytest.raises(RemoteJobError, match=message):
         check_remote_job(config, ON_HUB.__contains__)
 
 
 def test_a_refusal_ends_the_command(submit):
-    with pytest.raises(SystemExit, match="deltaco-train: --policy.demo_root=shown is a folder"):
-        submit(IMAGE, "--policy.demo_root=shown")
+    with pytest.raises(SystemExit, match="deltaco-train: --policy.demo_root=demos is a folder"):
+        submit(IMAGE, "--policy.demo_root=demos")
 
 
 def test_the_dockerfile_installs_extras_that_exist():

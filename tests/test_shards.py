@@ -9,7 +9,7 @@ from in_process_collection import collect_in_process, remember_episodes
 
 from gym_deltaco.env import PickPlaceEnv
 from lerobot_deltaco.commands.collect import main
-from lerobot_deltaco.data import collection
+from lerobot_deltaco.data import collection, collection_workers
 from lerobot_deltaco.data.collection import CollectionError, collect
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.data.finished_dataset import STAGING, verify_dataset
@@ -85,7 +85,7 @@ def test_an_episode_is_in_one_shard():
 
 def test_an_interrupted_shard_goes_on(whole, in_process, tmp_path, monkeypatch):
     root = tmp_path / "dataset"
-    collect_one = collection.collect_episode
+    collect_one = collection_workers.collect_episode
 
     def fails(*arguments):
         if len(in_process) == 4:
@@ -93,7 +93,7 @@ def test_an_interrupted_shard_goes_on(whole, in_process, tmp_path, monkeypatch):
         return collect_one(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(collection, "collect_episode", fails)
+        patch.setattr(collection_workers, "collect_episode", fails)
         with pytest.raises(KeyboardInterrupt):
             collect_shard(root, PLAN, Shard(1, 2))
     with pytest.raises(CollectionError, match="1/2 lacks 6 of 10 episodes, 2/2 is missing. Collect these"):

@@ -31,9 +31,9 @@ from small_policies import (
 
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.common.typed_fields import type_hints
-from lerobot_deltaco.configuration_deltaco import METHODS
 from lerobot_deltaco.evaluation.record import read_record, record_path
 from lerobot_deltaco.policy.calibration import MIN_EPISODES
+from lerobot_deltaco.policy.options import METHODS
 from lerobot_deltaco.policy.task_file import TaskFile, write_task_file
 
 pytestmark = pytest.mark.slow
@@ -291,10 +291,10 @@ def test_every_option_is_tried():
 def test_a_random_configuration_works_or_is_refused_by_name(dataset, data):
     names = data.draw(st.lists(st.sampled_from(sorted(VALUES)), unique=True, max_size=4), label="names")
     options = {name: data.draw(st.sampled_from(VALUES[name]), label=name) for name in names}
-    shown = {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
+    demos = {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
     refusal = None
     try:
-        policy, before, after = small_policy(dataset, **shown, **options)
+        policy, before, after = small_policy(dataset, **demos, **options)
         # The first batch reads the training episodes, which can be too few.
         loss, _ = policy(before(batch_of(dataset, [0, 7, 16, 22, 29])))
     except ValueError as error:

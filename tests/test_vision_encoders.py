@@ -364,14 +364,14 @@ def test_policies_train_and_act_and_their_checkpoints_need_no_encoder(
         assert torch.equal(weight, kept)
     assert not any("frozen" in name for name in policy.state_dict())
     policy.eval()
-    told = before(observation(dataset, [TASKS[0], TASKS[2]]))
-    expected = policy.select_action(told)
+    observed = before(observation(dataset, [TASKS[0], TASKS[2]]))
+    expected = policy.select_action(observed)
     policy.save_pretrained(tmp_path / "policy")
     monkeypatch.setattr(
         "lerobot_deltaco.modeling.network_factory.load_vision_encoder", lambda *_: pytest.fail("loaded")
     )
     loaded = DeltacoPolicy.from_pretrained(tmp_path / "policy")
-    torch.testing.assert_close(loaded.select_action(told), expected, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(loaded.select_action(observed), expected, atol=1e-3, rtol=1e-3)
 
 
 def test_embeddings_of_other_sizes_are_not_compared(make):

@@ -1,4 +1,4 @@
-"""Instructions in people's own words: sentences for tasks, read from a CSV file.
+"""Instructions written by people: sentences for tasks, read from a CSV file.
 
 The benchmark's own instruction of a task is a template. The paper's authors also collected five sentences for
 each of the 300 tasks from people (appendix H), spelling mistakes included. Nothing here depends on a

@@ -81,7 +81,8 @@ def _wordings_text(results: Sequence[WordingResult], out: Path) -> str:
 
 
 def _text(report: Report, out: Path) -> str:
-    from lerobot_deltaco.reporting.report import REPORT_FILE, last_text, rate_text
+    from lerobot_deltaco.reporting.markdown_page import last_text, rate_text
+    from lerobot_deltaco.reporting.report import REPORT_FILE
     from lerobot_deltaco.reporting.series import counted
     from lerobot_deltaco.reporting.statistics import paper_rate
 

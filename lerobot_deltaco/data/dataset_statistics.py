@@ -77,3 +77,8 @@ def merged_statistics(parts: Sequence[Statistics]) -> Statistics:
         "count": np.array([total]),
         **{name: (weights * stacked[name]).sum(axis=0) for name in QUANTILES},
     }
+
+
+def merged_by_feature(parts: Sequence[dict[str, Statistics]]) -> dict[str, Statistics]:
+    """Statistics of all features over several episodes (or parts of a dataset) from those of each."""
+    return {feature: merged_statistics([part[feature] for part in parts]) for feature in parts[0]}

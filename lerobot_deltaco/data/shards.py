@@ -21,8 +21,9 @@ from tqdm import tqdm
 
 from gym_deltaco.atomic_files import atomic_write
 from lerobot_deltaco.data import collection
-from lerobot_deltaco.data.collection import Job, Summary, collect_into, make_job, read_part, run_job, versions
+from lerobot_deltaco.data.collection import Summary, collect_into, make_job, versions
 from lerobot_deltaco.data.collection_plan import CollectionError, CollectionPlan
+from lerobot_deltaco.data.collection_workers import WORKERS_LOCK, Job, read_part, run_job
 from lerobot_deltaco.data.finished_dataset import is_finished
 from lerobot_deltaco.data.integrity import DatasetError, read_checked, read_checked_json, write_checked_json
 
@@ -167,7 +168,7 @@ def _check_arguments(job: Job, shard: Shard) -> None:
     """Checks that the folder of a shard, if there is something in it, is of the same arguments."""
     if not _plan_file(job).exists():
         others = {path.name for path in (*job.root.iterdir(), *job.staging.glob("*"))}
-        if others - {job.staging.name, collection.LOCK, collection.WORKERS_LOCK}:
+        if others - {job.staging.name, collection.LOCK, WORKERS_LOCK}:
             raise CollectionError(
                 f"{job.root} holds something else than shard {shard}. Delete it, or name another --root."
             )

@@ -13,8 +13,9 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 from torch.utils.data import DataLoader
 
-from lerobot_deltaco.configuration_deltaco import BACKBONES, DeltacoConfig
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.policy.networks import FilmResNet
+from lerobot_deltaco.policy.options import BACKBONES
 
 # bfloat16 is chosen only if it is clearly faster.
 _MIN_GAIN = 1.15

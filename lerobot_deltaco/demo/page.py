@@ -166,7 +166,7 @@ def _followed(demo: Demo) -> list[dict[str, Any]]:
 
 def _draw_examples(demo: Demo, results: list[TaskResult]) -> list[dict[str, Any]]:
     """Draws a strip for each example, and all of them as one animation."""
-    shown = LeRobotDataset(DEMONSTRATIONS, root=demo.folder / "demonstrations")
+    demonstrations = LeRobotDataset(DEMONSTRATIONS, root=demo.folder / "demonstrations")
     examples, videos = [], []
     for number, result in enumerate(results):
         instruction = get_task(result.task_id).instruction
@@ -176,7 +176,9 @@ def _draw_examples(demo: Demo, results: list[TaskResult]) -> list[dict[str, Any]
         chosen = np.linspace(0, len(frames) - 1, N_IMAGES).round().astype(int)
         strip = across(
             [
-                framed(across([enlarged(pixels, 2) for pixels in _demonstration(shown, instruction)])),
+                framed(
+                    across([enlarged(pixels, 2) for pixels in _demonstration(demonstrations, instruction)])
+                ),
                 framed(across([to_image(frames[n], IMAGE_SIZE) for n in chosen]), color),
             ],
             gap=24,
@@ -210,11 +212,11 @@ def read_video(path: Path) -> list[np.ndarray]:
         container.close()
 
 
-def _demonstration(shown: LeRobotDataset, instruction: str) -> list[np.ndarray]:
+def _demonstration(demonstrations: LeRobotDataset, instruction: str) -> list[np.ndarray]:
     """The first and the last image of the demonstration of a task."""
-    episode = next(row for row in shown.meta.episodes if row["tasks"] == [instruction])
+    episode = next(row for row in demonstrations.meta.episodes if row["tasks"] == [instruction])
     ends = episode["dataset_from_index"], episode["dataset_to_index"] - 1
-    images = [shown[index]["observation.image"] for index in ends]
+    images = [demonstrations[index]["observation.image"] for index in ends]
     return [(image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8) for image in images]
 
 

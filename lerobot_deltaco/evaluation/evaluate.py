@@ -38,17 +38,17 @@ from lerobot_deltaco.policy.goal_conditioning import FoundGoals
 PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
 
 
-class Film(NamedTuple):
-    """An episode in images.
+class EpisodeImages(NamedTuple):
+    """Images of an episode.
 
     Attributes:
-        images: The scene for people, before the first step and after each, (H, W, 3) each.
+        scenes: The scene, rendered for people before the first step and after each, (H, W, 3) each.
         observed: First image that the policy received, (H, W, 3).
         demonstration: First and last image of the (first) demonstration, (2, H, W, 3); None without one.
         goals: Goals that the policy found, of this episode alone; None if it finds none.
     """
 
-    images: list[NDArray[np.uint8]]
+    scenes: list[NDArray[np.uint8]]
     observed: NDArray[np.uint8]
     demonstration: NDArray[np.uint8] | None
     goals: FoundGoals | None
@@ -61,13 +61,13 @@ class EpisodeOutcome(NamedTuple):
         result: Episode as it is recorded.
         sum_reward: Sum of the rewards.
         max_reward: Greatest of the rewards.
-        film: The episode in images; None unless it was asked for.
+        images: Images of the episode; None unless they were asked for.
     """
 
     result: EpisodeResult
     sum_reward: float
     max_reward: float
-    film: Film | None = None
+    images: EpisodeImages | None = None
 
 
 def evaluate(
@@ -105,7 +105,7 @@ class Evaluation:
         postprocessor: Postprocessor of the policy.
         plan: Episodes to run.
         set_number: Number of the evaluation set, usually the training step.
-        render_size: Height and width of the images of films, px; None makes no films.
+        render_size: Height and width of the images that are rendered, px; None renders none.
 
     Attributes:
         task_ids: Indices of the tasks.
@@ -168,13 +168,13 @@ class Evaluation:
         for env in self._envs.values():
             env.close()
 
-    def run(self, task_id: int, filmed: Collection[int] = ()) -> list[EpisodeOutcome]:
+    def run(self, task_id: int, rendered: Collection[int] = ()) -> list[EpisodeOutcome]:
         """Runs the episodes of a task. Each task is run once.
 
         Args:
             task_id: Index of the task.
-            filmed: Trials that are filmed, and run with those in the same batch alone; if there are none, all
-                trials are run and none is filmed.
+            rendered: Trials of which images are rendered; of the others, only those in the same batches are
+                run. If there are none, all trials are run, without images.
 
         Returns:
             The episodes that were run.
@@ -189,26 +189,26 @@ class Evaluation:
             # Demonstrations of an instruction take turns over the whole set.
             self._deltaco._episode_tasks.count_trials(self._earlier[task_id])
         for trials in _chunks(range(self.plan.trials), self._n_envs):
-            if filmed and not set(filmed) & set(trials):
+            if rendered and not set(rendered) & set(trials):
                 self._skip(task_id, trials)
                 continue
             with _one_thread(self.policy.config.device), torch.no_grad():
-                outcomes += self._run_batch(task_id, trials, set(filmed) & set(trials))
+                outcomes += self._run_batch(task_id, trials, set(rendered) & set(trials))
         env.close()
         return outcomes
 
-    def _run_batch(self, task_id: int, trials: range, filmed: Collection[int]) -> list[EpisodeOutcome]:
+    def _run_batch(self, task_id: int, trials: range, rendered: Collection[int]) -> list[EpisodeOutcome]:
         seeds = self._seeds(task_id, trials)
         sampler = self._sampler(task_id, trials)
         recorded = RecordingVectorEnv(
-            self._envs[task_id], seeds, sampler.sample_instructions, is_filmed=bool(filmed)
+            self._envs[task_id], seeds, sampler.sample_instructions, is_rendered=bool(rendered)
         )
         identity: PolicyProcessorPipeline = PolicyProcessorPipeline(steps=[])
         found: list[FoundGoals | None] = []
         with ExitStack() as stack:
             if self._deltaco is not None:
                 stack.enter_context(self._deltaco.demonstrated_as(sampler.demonstrated_as))
-                if filmed:
+                if rendered:
                     found = stack.enter_context(_noted_goals(self._deltaco))
             else:
                 # Policies that draw, such as diffusion policies, do so by the batch's first seed.
@@ -220,14 +220,14 @@ class Evaluation:
         outcomes = []
         for index, (trial, seed) in enumerate(zip(trials, seeds, strict=True)):
             demonstrated = [] if self._deltaco is None else self._deltaco.demonstrated(index)
-            film = None
-            if trial in filmed:
+            images = None
+            if trial in rendered:
                 ends = self._demonstration_ends(demonstrated)
                 goals = None if not found or found[0] is None else found[0].of_sample(index)
-                film = Film(recorded.film(index), recorded.observed[index], ends, goals)
+                images = EpisodeImages(recorded.scenes(index), recorded.observed[index], ends, goals)
             rewards = data["reward"][index]
             result = _result(recorded, index, trial, seed, sampler.demonstration, demonstrated)
-            outcomes.append(EpisodeOutcome(result, float(rewards.sum()), float(rewards.max()), film))
+            outcomes.append(EpisodeOutcome(result, float(rewards.sum()), float(rewards.max()), images))
         return outcomes
 
     def _seeds(self, task_id: int, trials: range) -> list[int]:

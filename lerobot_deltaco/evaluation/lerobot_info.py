@@ -14,7 +14,7 @@ from gym_deltaco.tasks import get_task
 from lerobot_deltaco.evaluation.evaluate import EpisodeOutcome
 
 EVAL_INFO = "eval_info.json"
-# LeRobot's keys of the files of films, of which there are none here.
+# LeRobot's keys of the files of videos, of which there are none here.
 _NO_FILES: dict[str, list[str]] = {"video_paths": [], "predicted_video_paths": []}
 
 

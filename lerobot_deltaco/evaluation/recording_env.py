@@ -21,12 +21,12 @@ class RecordingVectorEnv:
         env: The vector environment.
         seeds: Seeds of the environments' resets, used as they are.
         sample_instructions: Returns the instructions for drawn scenes; None takes the environment's.
-        is_filmed: Whether the scenes are rendered before the first step and after each.
+        is_rendered: Whether the scenes are rendered before the first step and after each.
 
     Attributes:
         infos: Info of each environment, after its last step.
         instructions: Instruction of each environment.
-        observed: First images that the policy received, (environments, H, W, 3); None unless filmed.
+        observed: First images that the policy received, (environments, H, W, 3); None unless rendered.
     """
 
     def __init__(
@@ -34,12 +34,12 @@ class RecordingVectorEnv:
         env: TaskVectorEnv,
         seeds: Sequence[int],
         sample_instructions: SampleInstructions | None = None,
-        is_filmed: bool = False,
+        is_rendered: bool = False,
     ) -> None:
         self._env = env
         self._seeds = list(seeds)
         self._sample_instructions = sample_instructions
-        self._is_filmed = is_filmed
+        self._is_rendered = is_rendered
         self._rendered: list[tuple[NDArray[np.uint8], ...]] = []
         self.infos: list[dict[str, Any]] = []
         self.instructions: list[str] = []
@@ -56,7 +56,7 @@ class RecordingVectorEnv:
             self.instructions = list(self._env.call("task_description"))
         else:
             self.instructions = self._sample_instructions(self.infos)
-        if self._is_filmed:
+        if self._is_rendered:
             self.observed = observations["pixels"].copy()
             self._rendered = [self._env.render()]
         return observations, infos
@@ -65,11 +65,11 @@ class RecordingVectorEnv:
         """Does one action in each environment."""
         result = self._env.step(actions)
         self.infos = _of_each(result[-1], self._env.num_envs)
-        if self._is_filmed:
+        if self._is_rendered:
             self._rendered.append(self._env.render())
         return result
 
-    def film(self, index: int) -> list[NDArray[np.uint8]]:
+    def scenes(self, index: int) -> list[NDArray[np.uint8]]:
         """The rendered images of an environment, (H, W, 3) each."""
         return [images[index] for images in self._rendered]
 

@@ -29,7 +29,7 @@ class ExperimentConfig:
     Args:
         name: Name of the experiment, such as "scenario_a/deltaco".
         data: Arguments of the collection that is trained on, as `CollectionPlan` has them.
-        demonstrations: The same of the collection that shows the test tasks.
+        demonstrations: The same of the collection of demonstrations of the test tasks.
         policy: Options of `--policy`.
         training: Further options of `deltaco-train`.
         evaluation: Arguments of the evaluation sets, as `EvaluationPlan` has them.

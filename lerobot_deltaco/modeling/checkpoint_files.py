@@ -14,8 +14,11 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, kept_frame_indices
 from lerobot_deltaco.policy.finite_loss import non_finite_weight
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures
+from lerobot_deltaco.policy.language import InstructionTable
+from lerobot_deltaco.policy.paraphrases import Paraphrases
 from lerobot_deltaco.policy.task_file import (
     StoredDemonstrations,
+    TaskFile,
     check_demonstrations,
     check_features,
     check_grasp_states,
@@ -95,6 +98,28 @@ def check_loaded_weights(policy: nn.Module, path: str) -> None:
     name = non_finite_weight(policy)
     if name is not None:
         raise ValueError(f"{path} is damaged: the weight {name} has numbers that are not finite.")
+
+
+def task_contents(
+    instructions: InstructionTable,
+    paraphrases: Paraphrases | None,
+    demonstrations: DemonstrationSet | None,
+    frozen: FrozenFeatures | None,
+) -> TaskFile:
+    """What a policy knows of tasks, for a checkpoint's task file.
+
+    Args:
+        instructions: Embeddings of instructions.
+        paraphrases: Sentences that stand for task strings; None for none.
+        demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
+        frozen: Pretrained image encoder; None without one.
+    """
+    contents = instructions.contents()
+    if paraphrases is not None:
+        contents = contents._replace(paraphrases=paraphrases.known)
+    if demonstrations is not None:
+        contents = contents._replace(demonstrations=demonstrations_to_store(demonstrations, frozen))
+    return contents
 
 
 def demonstrations_to_store(known: DemonstrationSet, frozen: FrozenFeatures | None) -> StoredDemonstrations:

@@ -1,9 +1,8 @@
-"""Training with goals (ours): those of the training episodes, and the loss of finding them."""
+"""Goals of a policy (ours): fitted to the training episodes, learned to be found, and found in a scene."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -14,11 +13,32 @@ from torch import Tensor
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling.task_embedding import TaskEmbedder
 from lerobot_deltaco.policy.correspondence import Given
+from lerobot_deltaco.policy.demonstration_choice import goal_demonstrations
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, RobotData
-from lerobot_deltaco.policy.goal_conditioning import GoalConditioning
-from lerobot_deltaco.policy.goal_training import GoalBatch, GoalTrainer, draw_given
+from lerobot_deltaco.policy.goal_conditioning import FoundGoals, GoalConditioning
+from lerobot_deltaco.policy.goal_training import GoalBatch, GoalInputs, GoalTrainer, draw_given
+from lerobot_deltaco.policy.precision import autocast
+from lerobot_deltaco.policy.recoloring import random_recolorings
 
 _LOSSES = ("grasp_loss", "release_loss", "depth_loss", "attention_loss")
+
+
+class GoalSamples(NamedTuple):
+    """A batch, as far as its goals are concerned.
+
+    Attributes:
+        images: Images of all cameras, that of the goals first, (batch, cameras, 3, H, W) in 0..1.
+        episodes: Index of each sample's episode in the dataset, (batch,).
+        rows: Row of that episode among the demonstrations, (batch,); -1 if it is not among them.
+        tasks: Task string of each sample.
+        instructions: Instruction of each sample: its task string, or a paraphrase.
+    """
+
+    images: Tensor
+    episodes: Tensor
+    rows: Tensor
+    tasks: Sequence[str]
+    instructions: Sequence[str]
 
 
 class LocatorLoss(NamedTuple):
@@ -81,44 +101,63 @@ def learn_goals(
     config: DeltacoConfig,
     trainer: GoalTrainer,
     embedder: TaskEmbedder,
-    episodes: Tensor,
-    rows: Tensor,
-    tasks: Sequence[str],
-    instructions: Sequence[str],
-    recolorings: Tensor,
+    samples: GoalSamples,
     generator: torch.Generator,
-    autocast: AbstractContextManager,
-) -> LocatorLoss:
-    """The locator's loss on a share of a training batch, evenly spaced.
+) -> tuple[GoalInputs, LocatorLoss]:
+    """Prepares a training batch with goals.
+
+    The policy's network gets the goals of each sample's own episode, with noise. The locator learns to find
+    them by other episodes' demonstrations. So neither waits for the other.
 
     Args:
         config: Configuration of the policy.
         trainer: Knows the goals of the training episodes.
         embedder: Embeds the instructions.
-        episodes: Index of each sample's episode in the dataset, (batch,).
-        rows: Row of that episode among the demonstrations, (batch,).
-        tasks: Task string of each sample.
-        instructions: Instruction of each sample, in whatever words.
-        recolorings: Change of each sample's colors, (batch, 3, 3), on the CPU.
+        samples: The batch.
         generator: Source of the draws, on the CPU.
-        autocast: Context of the precision in which networks compute.
+
+    Returns:
+        Inputs of the policy's network, and the locator's loss on a share of the samples.
 
     Raises:
         ValueError: A one-hot policy does not know a task.
     """
-    n_samples = len(rows)
+    recolorings = random_recolorings(len(samples.rows), config.recolor_share, generator)
+    loss = _locator_loss(config, trainer, embedder, samples, recolorings, generator)
+    places, depths, _ = trainer.goals_of(samples.rows)
+    inputs = trainer.vary(
+        GoalInputs(samples.images, places, depths),
+        recolorings,
+        config.goal_noise,
+        config.depth_noise,
+        config.crop_padding,
+        generator,
+    )
+    return inputs, loss
+
+
+def _locator_loss(
+    config: DeltacoConfig,
+    trainer: GoalTrainer,
+    embedder: TaskEmbedder,
+    samples: GoalSamples,
+    recolorings: Tensor,
+    generator: torch.Generator,
+) -> LocatorLoss:
+    """The locator's loss on samples of a batch that are evenly spaced in it."""
+    n_samples, device = len(samples.rows), samples.rows.device
     n_located = max(1, round(config.locator_share * n_samples))
     some = torch.arange(n_located) * n_samples // n_located
-    here, given = some.to(rows.device), None
+    here, given = some.to(device), None
     if config.takes_either_modality:
         drawn = draw_given(n_located, config.demo_dropout, config.instruction_dropout, generator)
-        given = Given(*(part.to(rows.device) for part in drawn))
-    with autocast:
+        given = Given(*(part.to(device) for part in drawn))
+    with autocast(config.dtype, device):
         chosen = GoalBatch(
-            episodes[here],
-            rows[here],
-            [tasks[sample] for sample in some.tolist()],
-            embedder.goal_condition([instructions[sample] for sample in some.tolist()], rows.device),
+            samples.episodes[here],
+            samples.rows[here],
+            [samples.tasks[sample] for sample in some.tolist()],
+            embedder.goal_condition([samples.instructions[sample] for sample in some.tolist()], device),
             recolorings[some],
             given,
         )
@@ -126,3 +165,55 @@ def learn_goals(
             chosen, config.uses_demo, config.demo_crop_padding, config.color_blind_tasks, generator
         )
     return LocatorLoss(some, losses)
+
+
+def validation_goals(
+    trainer: GoalTrainer, samples: GoalSamples, find: Callable[[], FoundGoals]
+) -> GoalInputs:
+    """Inputs of the policy's network for a validation loss.
+
+    Of episodes that are held back for it, no goals are known. Those that are found in the present image stand
+    in for them.
+
+    Args:
+        trainer: Knows the goals of the training episodes.
+        samples: The batch.
+        find: Finds the goals of all samples in their images; called only if they are needed.
+    """
+    places, depths, known = trainer.goals_of(samples.rows)
+    if not known.all():
+        found = find()
+        places = torch.where(known[:, None, None], places, found.places)
+        if depths is not None and found.depths is not None:
+            depths = torch.where(known, depths, found.depths)
+    return GoalInputs(samples.images, places, depths)
+
+
+def find_goals(
+    config: DeltacoConfig,
+    goals: GoalConditioning,
+    embedder: TaskEmbedder,
+    scenes: Tensor,
+    tasks: Sequence[str],
+    choose: Callable[[int], tuple[DemonstrationSet, Tensor]],
+) -> FoundGoals:
+    """Finds the goals of tasks in scenes.
+
+    Args:
+        config: Configuration of the policy.
+        goals: Networks that find goals.
+        embedder: Embeds the instructions.
+        scenes: First images of episodes, (batch, 3, H, W) in 0..1.
+        tasks: Instruction of each sample.
+        choose: Chooses the first, second, ... demonstration of each sample: a set, and rows of it, (batch,).
+
+    Raises:
+        ValueError: A task has no demonstration, or a one-hot policy does not know it.
+    """
+    demonstrations = condition = None
+    if config.uses_demo and config.leave_out != "demo":
+        chosen = [choose(number) for number in range(config.n_demonstrations)]
+        demonstrations = goal_demonstrations(chosen, goals, scenes.device)
+    if config.leave_out != "instruction":
+        condition = embedder.goal_condition(tasks, scenes.device)
+    return goals.find(scenes, demonstrations, condition)

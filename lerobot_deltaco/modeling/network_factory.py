@@ -7,13 +7,14 @@ from pathlib import Path
 
 from torch import nn
 
-from lerobot_deltaco.configuration_deltaco import BACKBONES, GOAL_SOURCES, DeltacoConfig
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.policy.correspondence import GoalLocator
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures, Variants
 from lerobot_deltaco.policy.goal_conditioning import GoalConditioning
 from lerobot_deltaco.policy.heads import UnitHead
 from lerobot_deltaco.policy.networks import ConditionedPolicy
+from lerobot_deltaco.policy.options import BACKBONES, GOAL_SOURCES
 from lerobot_deltaco.policy.vision import load_vision_encoder
 
 

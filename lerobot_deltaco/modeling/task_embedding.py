@@ -9,11 +9,11 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.policy.demo_encoders import crop_array
+from lerobot_deltaco.policy.demo_encoders import crop_demonstrations
+from lerobot_deltaco.policy.demonstration_choice import choose_training_demonstrations
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures
 from lerobot_deltaco.policy.language import InstructionTable
-from lerobot_deltaco.policy.networks import random_crop
 from lerobot_deltaco.policy.paraphrases import Paraphrases
 
 
@@ -25,7 +25,7 @@ class TaskEmbedder:
     Args:
         config: Configuration of the policy.
         instructions: Embeddings of instructions.
-        paraphrases: Sentences in people's own words; None to train on the task strings.
+        paraphrases: Sentences that people wrote; None to train on the task strings.
         language_head: Layers behind the language encoder; None for none.
         demo_encoder: Encoder of demonstrations, or the layers behind the frozen one; None without a task
             embedding.
@@ -45,7 +45,7 @@ class TaskEmbedder:
         self._language_head, self._demo_encoder, self._frozen = language_head, demo_encoder, frozen
 
     def draw_instructions(self, tasks: Sequence[str], generator: torch.Generator) -> list[str]:
-        """The instruction of each training sample: its task string, or a sentence in people's own words.
+        """The instruction of each training sample: its task string, or a paraphrase.
 
         Args:
             tasks: Task string of each sample.
@@ -70,7 +70,7 @@ class TaskEmbedder:
     ) -> tuple[Tensor, Tensor]:
         """Embeddings of the instructions of a training batch.
 
-        With sentences in people's own words, each sample and each task has one drawn for it.
+        With paraphrases, one is drawn for each sample, and one for each task.
 
         Args:
             distinct: Task strings of the batch, each once.
@@ -89,6 +89,44 @@ class TaskEmbedder:
             return known, known[column]
         known = self.embed_instructions(self.draw_instructions(distinct, generator), column.device)
         return known, self.embed_instructions(self.draw_instructions(tasks, generator), column.device)
+
+    def embed_training_demonstrations(
+        self,
+        demonstrations: DemonstrationSet,
+        episodes: Tensor,
+        tasks: Sequence[str],
+        column: Tensor,
+        generator: torch.Generator,
+        training: bool,
+        check: bool,
+    ) -> Tensor:
+        """Embeddings of demonstrations of a training batch: episodes other than the samples' own.
+
+        Args:
+            demonstrations: The training episodes.
+            episodes: The samples' own, (batch,), as indices of the dataset.
+            tasks: Task string of each sample.
+            column: The samples' tasks, (batch,), numbered from 0.
+            generator: Source of the draws, on the CPU.
+            training: Whether this is a training step, and not a validation loss.
+            check: Whether to check that all episodes are among the demonstrations, which waits for a GPU.
+
+        Returns:
+            Unit vectors, (batch, embedding).
+
+        Raises:
+            ValueError: An episode is not among the demonstrations, or no episode of its task.
+        """
+        if not training:
+            # The episodes of a validation loss may be held back from the demonstrations.
+            rows = demonstrations.sample_other_episodes(episodes, generator, tasks=tasks)
+            return self.embed_demonstrations(demonstrations, rows, generator, training)
+        n_tasks, n_each = len(set(tasks)), self.config.demos_per_task
+        rows, which = choose_training_demonstrations(
+            demonstrations, episodes, column, n_tasks, n_each, generator, check
+        )
+        embeddings = self.embed_demonstrations(demonstrations, rows, generator, training)
+        return embeddings if which is None else embeddings[which]
 
     def embed_demonstrations(
         self, demonstrations: DemonstrationSet, rows: Tensor, generator: torch.Generator, training: bool
@@ -113,11 +151,10 @@ class TaskEmbedder:
         frames = demonstrations.sample_frames(
             rows, config.n_demo_frames, generator, config.demo_frames_between == "spread"
         )
-        if training and config.demo_crop_padding:
-            if config.demo_encoder == "cnn" and config.demo_crop == "array":
-                frames = crop_array(frames, config.demo_rows, config.demo_crop_padding, generator)
-            else:
-                frames = random_crop(frames, config.demo_crop_padding, generator)
+        if training:
+            is_array = config.demo_encoder == "cnn" and config.demo_crop == "array"
+            array_rows = config.demo_rows if is_array else None
+            frames = crop_demonstrations(frames, config.demo_crop_padding, array_rows, generator)
         return self._demo_encoder(frames)
 
     def conditioning_inputs(

@@ -1,4 +1,4 @@
-"""Reads what tells a policy its tasks: the demonstrations and sentences that its configuration names."""
+"""Reads what specifies a policy's tasks: the demonstrations and sentences that its configuration names."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def read_eval_demonstrations(config: DeltacoConfig) -> DemonstrationSet | None:
 
 
 def read_sentences(config: DeltacoConfig) -> Paraphrases | None:
-    """Sentences in people's own words for task strings; None if `instructions` names none.
+    """Sentences that people wrote for task strings; None if `instructions` names none.
 
     Args:
         config: Configuration of the policy.

@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 MAX_FRAMES = 1000  # of an episode
 # Types of columns that hold what is in them.
 _PLAIN_TYPES = {"Value", "Sequence", "List", "LargeList"}
-_FILM_SIZE = 192  # px, at least, of the longer side of a video
+_VIDEO_SIZE = 192  # px, at least, of the longer side of a video
 # No repository can have this name, so that LeRobot cannot download what a folder lacks.
 _NO_REPOSITORY = "a/local/folder"
 
@@ -139,8 +139,8 @@ class EpisodeDataset:
         except Exception as error:
             raise self._unreadable(error) from error
         title = f"{task} ({number} of {self.counts[task]} in {self._name})"
-        film = _film(images)
-        return demonstration_of(title, images, robot, config, film, round(self._dataset.meta.fps))
+        video_images = _video_images(images)
+        return demonstration_of(title, images, robot, config, video_images, round(self._dataset.meta.fps))
 
     @staticmethod
     def _robot(items: Sequence[dict[str, Any]], config: DeltacoConfig) -> tuple[Tensor, Tensor] | None:
@@ -229,11 +229,11 @@ def _check_images(dataset: LeRobotDataset, name: str) -> None:
                 raise PlayError(f"{name!r} is refused: some images of {key!r} lie in other files.")
 
 
-def _film(images: Tensor) -> list[np.ndarray]:
+def _video_images(images: Tensor) -> list[np.ndarray]:
     """Images (frames, 3, H, W) for people: small ones with visible pixels, and of even height and width."""
     height, width = images.shape[-2:]
     factor = 1
-    if max(height, width) < _FILM_SIZE:
-        factor = 2 * -(-_FILM_SIZE // (2 * max(height, width)))
+    if max(height, width) < _VIDEO_SIZE:
+        factor = 2 * -(-_VIDEO_SIZE // (2 * max(height, width)))
     images = images[..., : height * factor // 2 * 2 // factor, : width * factor // 2 * 2 // factor]
     return [np.asarray(enlarged(image, factor)) for image in images.permute(0, 2, 3, 1).numpy()]

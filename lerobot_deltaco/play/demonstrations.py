@@ -20,7 +20,7 @@ from lerobot_deltaco.policy.keyframes import find_keyframes
 
 @dataclass(frozen=True)
 class Demonstration:
-    """An episode that shows a task.
+    """An episode that demonstrates a task.
 
     Attributes:
         title: Description for the page.
@@ -80,7 +80,7 @@ def demonstration_of(
     images: Tensor,
     robot: tuple[Tensor, Tensor] | None,
     config: DeltacoConfig,
-    film: Sequence[NDArray[np.uint8]],
+    video_images: Sequence[NDArray[np.uint8]],
     fps: int,
 ) -> Demonstration:
     """What a policy gets of a whole episode, with a video of all of it.
@@ -91,7 +91,7 @@ def demonstration_of(
         robot: States of the robot, (frames, state), and commands of its gripper, (frames,); None if the
             policy does without.
         config: The policy's.
-        film: Images for people, (H, W, 3) each.
+        video_images: Images for people, (H, W, 3) each.
         fps: Frames per second.
     """
     last = len(images) - 1
@@ -99,7 +99,7 @@ def demonstration_of(
     grasp_state = None
     if robot is not None:
         grasp_state = find_keyframes(*robot, [(0, last)]).grasp_states[0].numpy()
-    return Demonstration(title, kept.permute(0, 2, 3, 1).numpy(), grasp_state, _encoded(film, fps))
+    return Demonstration(title, kept.permute(0, 2, 3, 1).numpy(), grasp_state, _encoded(video_images, fps))
 
 
 def _encoded(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:

@@ -278,20 +278,20 @@ class Player:
         """
         task = get_task(scene.task_id)
         with closing(_environment(scene, self._camera_size)) as env:
-            frames, states, gripper, film = [], [], [], []
+            frames, states, gripper, video_images = [], [], [], []
             for number, step in enumerate(expert_episode(env, task.index, _seed(scene)), start=1):
                 frames.append(step.observation["pixels"])
                 states.append(step.observation["agent_pos"])
                 gripper.append(float(step.action[-1]))
-                film.append(env.scene.render(RENDER_SIZE))
+                video_images.append(env.scene.render(RENDER_SIZE))
                 if number < EPISODE_STEPS:
                     text = f"Expert, {number} of {EPISODE_STEPS} steps: {step.stage.value}"
-                    yield Moment(film[-1], None, text)
+                    yield Moment(video_images[-1], None, text)
         images = torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2)
         robot = torch.from_numpy(np.stack(states)), torch.tensor(gripper)
         title = f"{task.instruction} (by the expert, seed {scene.seed})"
-        yield demonstration_of(title, images, robot, self.policy.config, film, CONTROL_FPS)
-        yield Moment(film[-1], None, f"Expert. {outcome(step.info, -1)}")
+        yield demonstration_of(title, images, robot, self.policy.config, video_images, CONTROL_FPS)
+        yield Moment(video_images[-1], None, f"Expert. {outcome(step.info, -1)}")
 
     def _batch(self, observation: dict[str, NDArray[Any]], sentence: str) -> dict[str, Any]:
         batch = preprocess_observation({name: value[None] for name, value in observation.items()})

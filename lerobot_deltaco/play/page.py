@@ -53,23 +53,23 @@ def build_page(engine: Engine) -> gr.Blocks:
             with gr.Column(min_width=280):
                 scene = lay_out_scene()
             with gr.Column(min_width=280):
-                shown = lay_out_demonstration()
+                demonstration = lay_out_demonstration()
             with gr.Column(min_width=280):
-                told = lay_out_instruction()
+                instruction = lay_out_instruction()
         earlier, latest = lay_out_runs()
 
         def everything(session: Session) -> Updates:
             """Updates of all components, so that what is shown is what the session holds."""
             return {
                 **show_scene(scene, session),
-                **show_demonstration(shown, session, files),
-                **show_instruction(told, session),
+                **show_demonstration(demonstration, session, files),
+                **show_instruction(instruction, session),
                 **show_run(earlier, session.earlier),
                 **show_run(latest, session.latest),
             }
 
         def shown_message(text: str) -> Updates:
-            return {told.message: gr.update(value=text, visible=bool(text))}
+            return {instruction.message: gr.update(value=text, visible=bool(text))}
 
         def changes(action: Callable[..., Session]) -> Callable[..., Updates]:
             """An action that changes the session at once, as a handler of an event."""
@@ -121,7 +121,10 @@ def build_page(engine: Engine) -> gr.Blocks:
                 update[start.status] = f"Ready. The checkpoint is {name}."
             return update
 
-        everywhere = [session_state, *(item for part in (start, scene, shown, told) for item in fields(part))]
+        everywhere = [
+            session_state,
+            *(item for part in (start, scene, demonstration, instruction) for item in fields(part)),
+        ]
         everywhere += [*earlier, *latest]
 
         def on(triggers: list[Any], handler: Callable[..., Any], *inputs: Any, **options: Any) -> None:
@@ -138,25 +141,34 @@ def build_page(engine: Engine) -> gr.Blocks:
         )
         on([scene.random.click], changes(actions.random_scene))
         on(
-            [shown.task.input, shown.number.submit],
+            [demonstration.task.input, demonstration.number.submit],
             changes(actions.choose_demonstration),
-            shown.task,
-            shown.number,
+            demonstration.task,
+            demonstration.number,
         )
-        on([shown.use_recorded.click], changes(actions.use_recorded))
-        on([shown.load.click, shown.source.submit], changes(actions.open_dataset), shown.source)
-        on([told.use.input], changes(actions.choose_use), told.use, told.sentence)
-        on([told.load.click, told.source.submit], open_checkpoint, told.source)
-        quiet = {"show_progress": "hidden"}
-        on([told.run.click, told.sentence.submit], runs(actions.run), told.sentence, **quiet)
+        on([demonstration.use_recorded.click], changes(actions.use_recorded))
         on(
-            [told.swap_demonstration.click],
-            runs(actions.run_with_other_demonstration),
-            told.sentence,
+            [demonstration.load.click, demonstration.source.submit],
+            changes(actions.open_dataset),
+            demonstration.source,
+        )
+        on([instruction.use.input], changes(actions.choose_use), instruction.use, instruction.sentence)
+        on([instruction.load.click, instruction.source.submit], open_checkpoint, instruction.source)
+        quiet = {"show_progress": "hidden"}
+        on(
+            [instruction.run.click, instruction.sentence.submit],
+            runs(actions.run),
+            instruction.sentence,
             **quiet,
         )
-        on([told.swap_sentence.click], runs(actions.run_with_other_sentence), **quiet)
-        on([shown.expert.click], runs(actions.run_expert), **quiet)
+        on(
+            [instruction.swap_demonstration.click],
+            runs(actions.run_with_other_demonstration),
+            instruction.sentence,
+            **quiet,
+        )
+        on([instruction.swap_sentence.click], runs(actions.run_with_other_sentence), **quiet)
+        on([demonstration.expert.click], runs(actions.run_expert), **quiet)
     return page.queue()
 
 

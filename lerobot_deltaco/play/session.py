@@ -153,7 +153,7 @@ class Actions:
         return replace(session, demonstration=session.recorded, demonstrated=None)
 
     def run(self, session: Session, sentence: str) -> Iterator[Session]:
-        """Lets the policy do what the demonstration shows and the sentence says."""
+        """Lets the policy perform the task of the demonstration and the sentence."""
         from lerobot_deltaco.play.episodes import checked_sentence
 
         checkpoint, _ = _opened(session)
@@ -162,15 +162,17 @@ class Actions:
             raise PlayError("There is no scene yet. Choose one.")
         use = session.use
         if use == DEMONSTRATION_ALONE:
-            told = "left out"
+            instruction_text = "left out"
         else:
-            told = sentence = checked_sentence(sentence)
+            instruction_text = sentence = checked_sentence(sentence)
         session = replace(session, sentence=sentence, earlier=session.latest)
         if use == INSTRUCTION_ALONE:
-            shown = "left out"
+            demonstration_text = "left out"
         else:
-            shown = demonstration.title if demonstration is not None else "none"
-        title = f"Policy, seed {scene.seed}\nInstruction: {told}\nDemonstration: {shown}"
+            demonstration_text = demonstration.title if demonstration is not None else "none"
+        title = (
+            f"Policy, seed {scene.seed}\nInstruction: {instruction_text}\nDemonstration: {demonstration_text}"
+        )
         moments = self._engine.stream(
             checkpoint, lambda player: player.run(scene, demonstration, sentence, use)
         )

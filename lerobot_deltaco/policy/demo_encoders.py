@@ -138,18 +138,26 @@ def frame_array(frames: Tensor, rows: int) -> Tensor:
     return rearrange(frames, "b (r c) d h w -> b d (r h) (c w)", r=rows)
 
 
-def crop_array(frames: Tensor, rows: int, padding: int, generator: torch.Generator) -> Tensor:
-    """Shifts each array of frames at random, as a whole: what leaves a frame enters its neighbor.
+def crop_demonstrations(
+    frames: Tensor, padding: int, array_rows: int | None, generator: torch.Generator
+) -> Tensor:
+    """Shifts demonstrations at random, for training. What comes in at the edges is black.
 
     Args:
-        frames: Frames of demonstrations, (batch, rows * columns, 3, H, W).
-        rows: Number of rows of the array.
-        padding: Greatest shift in either direction, px. What comes in at the array's edges is black.
+        frames: Frames of demonstrations, (batch, frames, 3, H, W).
+        padding: Largest shift in x and in y, px; at 0, nothing is drawn.
+        array_rows: Number of rows of the array in which the frames are laid out and shifted as a whole, so
+            that what leaves a frame enters its neighbor; None to shift each frame, all of a demonstration
+            alike.
         generator: Source of the shifts, on the CPU.
 
     Returns:
         The same shape.
     """
+    if not padding:
+        return frames
+    if array_rows is None:
+        return random_crop(frames, padding, generator)
     height, width = frames.shape[-2:]
-    array = random_crop(frame_array(frames, rows), padding, generator)
-    return rearrange(array, "b d (r h) (c w) -> b (r c) d h w", r=rows, h=height, w=width)
+    array = random_crop(frame_array(frames, array_rows), padding, generator)
+    return rearrange(array, "b d (r h) (c w) -> b (r c) d h w", r=array_rows, h=height, w=width)

@@ -102,10 +102,10 @@ def choose_episode(
     return demonstrations, found[:1].expand(n_samples)
 
 
-def show_goals(
+def goal_demonstrations(
     chosen: Sequence[tuple[DemonstrationSet, Tensor]], goals: GoalConditioning, device: torch.device
 ) -> Demonstrations:
-    """What chosen demonstrations show of the goals of their tasks.
+    """Chosen demonstrations as goals are found by them.
 
     Args:
         chosen: One or more demonstrations of each sample's task: each time a set, and rows of it, (batch,).

@@ -19,9 +19,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_deltaco.policy.demo_encoders import crop_array, frame_array
+from lerobot_deltaco.policy.demo_encoders import crop_demonstrations, frame_array
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
-from lerobot_deltaco.policy.networks import random_crop
 from lerobot_deltaco.policy.vision import BATCH_SIZE, VisionEncoder
 
 logger = logging.getLogger(__name__)
@@ -124,8 +123,11 @@ class FrozenFeatures:
                     frames = demonstrations.sample_frames(
                         rows, self.variants.n_frames, generator, self.variants.spreads_frames
                     )
-                    if variant > 0 and self.variants.crop_padding:
-                        frames = self._cropped(frames, generator)
+                    if variant > 0:
+                        array_rows = self.variants.n_rows if self.variants.crops_array else None
+                        frames = crop_demonstrations(
+                            frames, self.variants.crop_padding, array_rows, generator
+                        )
                     parts.append(self.encoder(frame_array(frames, self.variants.n_rows)).half())
                     bar.update(len(rows))
                 columns.append(torch.cat(parts))
@@ -136,11 +138,6 @@ class FrozenFeatures:
             save_file({"features": features.cpu()}, unfinished)
             os.replace(unfinished, path)
         return features.to(device)
-
-    def _cropped(self, frames: Tensor, generator: torch.Generator) -> Tensor:
-        if self.variants.crops_array:
-            return crop_array(frames, self.variants.n_rows, self.variants.crop_padding, generator)
-        return random_crop(frames, self.variants.crop_padding, generator)
 
     def _path(self, demonstrations: DemonstrationSet, n_drawn: int) -> Path | None:
         """File that keeps the features of a set; its name is a hash of all that they depend on."""

@@ -39,6 +39,20 @@ class GoalBatch(NamedTuple):
     given: Given | None = None
 
 
+class GoalInputs(NamedTuple):
+    """Images and goals that the policy's network gets.
+
+    Attributes:
+        images: Images of all cameras, that of the goals first, (batch, cameras, 3, H, W) in 0..1.
+        places: Grasp and release, x and y in -1..1, (batch, 2, 2).
+        depths: Depth of each grasp, (batch,); None without depths.
+    """
+
+    images: Tensor
+    places: Tensor
+    depths: Tensor | None
+
+
 def draw_given(
     n_samples: int, demo_dropout: float, instruction_dropout: float, generator: torch.Generator
 ) -> Given:
@@ -118,37 +132,31 @@ class GoalTrainer:
 
     def vary(
         self,
-        images: Tensor,
-        places: Tensor,
-        depths: Tensor | None,
+        inputs: GoalInputs,
         recolorings: Tensor,
         goal_noise: float,
         depth_noise: float,
         crop_padding: int,
         generator: torch.Generator,
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    ) -> GoalInputs:
         """Training samples with noisy goals, as if they had been found, in images that are changed at random.
 
         Args:
-            images: (batch, cameras, 3, H, W) in 0..1, that of the goals first.
-            places: Places of the goals, (batch, 2, 2) in -1..1.
-            depths: Depths of the grasps, (batch,); None without depths.
+            inputs: Images, and the goals as they are.
             recolorings: Changes of the samples' colors, (batch, 3, 3), on the CPU.
             goal_noise: Standard deviation of the noise of places.
             depth_noise: Standard deviation of the noise of depths.
             crop_padding: Largest random shift of the images, with their goals, px.
             generator: Source of the draws, on the CPU.
-
-        Returns:
-            Images, places and depths, in the shapes of the arguments.
         """
+        images, places, depths = inputs
         device = places.device
         places = places + goal_noise * torch.randn(places.shape, generator=generator).to(device)
         if depths is not None:
             depths = depths + depth_noise * torch.randn(depths.shape, generator=generator).to(device)
         if crop_padding:
             images, places = self._shifted(images, places, crop_padding, generator)
-        return recolor(images, recolorings), places, depths
+        return GoalInputs(recolor(images, recolorings), places, depths)
 
     def losses(
         self,

@@ -84,7 +84,7 @@ class Paraphrases:
             if len(tasks) > 1 and instruction not in self._ambiguous:
                 self._ambiguous.add(instruction)
                 logger.warning(
-                    "%r may mean %d tasks, such as %r and %r; demonstrations of the first one are shown. "
+                    "%r may mean %d tasks, such as %r and %r; demonstrations of the first one are used. "
                     "`deltaco-evaluate` knows which task is meant.",
                     instruction,
                     len(tasks),

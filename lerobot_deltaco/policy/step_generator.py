@@ -6,6 +6,11 @@ import numpy as np
 import torch
 
 
+def process_rank() -> int:
+    """Number of this process among those that train together, from 0."""
+    return torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
+
+
 def step_generator(seed: int, step: int, rank: int) -> torch.Generator:
     """A generator that depends on its arguments alone: a resumed training repeats an uninterrupted one.
 

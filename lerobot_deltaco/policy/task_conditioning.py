@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 from torch import Tensor, nn
@@ -27,12 +28,16 @@ class EpisodeTasks:
 
     With `--env.max_parallel_tasks` above 1, several threads run episodes of different tasks with one policy:
     each thread has a conditioning of its own.
+
+    Attributes:
+        replaced: For instructions that get another task's demonstrations, its task string.
     """
 
     def __init__(self) -> None:
         self._conditioning: dict[int, TaskConditioning] = {}  # by thread
         self._demonstrated: dict[int, list[tuple[Demonstrated, ...]]] = {}  # by thread
         self._n_episodes: dict[str, int] = {}  # by task
+        self.replaced: Mapping[str, str] = {}
 
     def begin_episode(self) -> None:
         """Forgets the conditioning and the demonstrations of this thread's last episode."""
@@ -64,6 +69,19 @@ class EpisodeTasks:
     def demonstrated(self, sample: int) -> list[Demonstrated]:
         """The demonstrations of a sample of this thread's episode."""
         return [each[sample] for each in self._demonstrated.get(threading.get_ident(), [])]
+
+    @contextmanager
+    def demonstrated_as(self, tasks: Mapping[str, str]) -> Iterator[None]:
+        """Uses other tasks' demonstrations with some instructions, while the context is open.
+
+        Args:
+            tasks: For an instruction, the task string whose demonstrations are used.
+        """
+        previous, self.replaced = self.replaced, tasks
+        try:
+            yield
+        finally:
+            self.replaced = previous
 
     def count_trials(self, tasks: Sequence[str]) -> list[int]:
         """Number of each sample's episode among those of its task, from 0, whichever thread runs them."""

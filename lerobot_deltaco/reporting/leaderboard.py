@@ -38,7 +38,7 @@ class Row:
 
     Attributes:
         method: Name of the method.
-        given: Inputs of the policy that tell the task.
+        given: Inputs of the policy that specify the task.
         command: Command that trains and evaluates it.
         records: Folder of its records in `results`; None if it was not run.
         training: Data, steps and cost of one training.

@@ -161,7 +161,7 @@ class InMemoryTraining:
         config, frames = policy.config, self._frames
         assert self._config is not None
         if isinstance(self._config.env, DeltacoEnv):
-            # Now, and not when the first evaluation is due.
+            # Now, and not at the first evaluation.
             check_policy_fits(config, self._config.env)
         assert isinstance(policy, DeltacoPolicy)
         assert frames is not None

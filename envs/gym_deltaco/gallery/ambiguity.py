@@ -41,12 +41,12 @@ def _container_scheme(seed: int) -> Image.Image:
     """A demonstration that fits a color as well as a place, and a new scene where the two part."""
     task = get_task(236)  # Put white colored object in left bin.
     with closing(make_env("container")) as env:
-        start, end, shown = _demonstration(env, task, seed)
+        start, end, demonstrated = _demonstration(env, task, seed)
         scene, layout = _new_scene(
-            env, task, seed, lambda new: new.target_container != shown.target_container
+            env, task, seed, lambda new: new.target_container != demonstrated.target_container
         )
         mark = pixel_of(_container_position(layout), PEOPLE_SIZE)
-    color = shown.containers[shown.target_container].color
+    color = demonstrated.containers[demonstrated.target_container].color
     word = task.container
     return _row(
         f'Scheme "container": {task.instruction}',
@@ -66,9 +66,9 @@ def _object_scheme(seed: int) -> Image.Image:
     """A demonstration that picks one of two identical objects, and a new scene with them."""
     task = get_task(31)  # Put blue colored, cylinder shaped jar in green bin.
     with closing(make_env("object")) as env:
-        start, end, shown = _demonstration(env, task, seed)
+        start, end, demonstrated = _demonstration(env, task, seed)
         scene, layout = _new_scene(
-            env, task, seed, lambda new: not np.allclose(_target_xy(new), _target_xy(shown), atol=0.05)
+            env, task, seed, lambda new: not np.allclose(_target_xy(new), _target_xy(demonstrated), atol=0.05)
         )
         mark = pixel_of(env.scene.object_pose(layout.target_object).position, PEOPLE_SIZE)
     name, word = OBJECTS[task.row].name, twin_word(task)

@@ -1,4 +1,4 @@
-"""Episodes of an evaluation set in images: where the policy looked, and videos by what went wrong.
+"""Images and videos of episodes of an evaluation set: where the policy looked, and videos by outcome.
 
 Episodes are chosen by the record and run again, which takes seconds: to render all of them would take many
 times as long as the evaluation.
@@ -24,7 +24,7 @@ from gym_deltaco.object_sets import find_label
 from gym_deltaco.sheets import GAP, across, caption, down, save_png, to_image
 from gym_deltaco.tasks import CONTAINER_COLORS
 from lerobot_deltaco.evaluation.checkpoint_policy import LoadedPolicy
-from lerobot_deltaco.evaluation.evaluate import Evaluation, Film
+from lerobot_deltaco.evaluation.evaluate import EpisodeImages, Evaluation
 from lerobot_deltaco.evaluation.explanation import draw_episode
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import EpisodeResult, EvaluationRecord
@@ -48,17 +48,17 @@ VIDEO_FPS = 10
 _MAX_SLUG = 60  # characters
 
 
-class FilmedEpisode(NamedTuple):
+class RerunEpisode(NamedTuple):
     """An episode that was run again.
 
     Attributes:
         result: Episode as it is recorded.
-        film: The episode in images.
+        images: Images of the episode.
         is_repeated: Whether it ended as recorded. On another processor, it may end otherwise.
     """
 
     result: EpisodeResult
-    film: Film
+    images: EpisodeImages
     is_repeated: bool
 
 
@@ -131,11 +131,11 @@ def write_explanations(
     chosen = _evenly(record.episodes, n_episodes)
     written = []
     with _NewFolder(folder / EXPLANATIONS) as new:
-        for episode, film, _ in _run_again(loaded, plan, record, chosen):
-            assert film.goals is not None
+        for episode, images, _ in _run_again(loaded, plan, record, chosen):
+            assert images.goals is not None
             title = f"“{episode.instruction}” {in_words(episode)}"
-            image = draw_episode(title, film.images, film.observed, film.demonstration, film.goals)
-            save_png(to_image(image), new / f"{_file_name(episode)}.png")
+            drawn = draw_episode(title, images.scenes, images.observed, images.demonstration, images.goals)
+            save_png(to_image(drawn), new / f"{_file_name(episode)}.png")
             written.append(folder / EXPLANATIONS / f"{_file_name(episode)}.png")
     return written
 
@@ -143,7 +143,7 @@ def write_explanations(
 def write_videos(
     folder: Path, loaded: LoadedPolicy, plan: EvaluationPlan, record: EvaluationRecord, n_each: int
 ) -> Path:
-    """Films some episodes of each kind of outcome.
+    """Makes videos of some episodes of each kind of outcome.
 
     Args:
         folder: Folder in which the folder of the videos is made anew: an MP4 file for each episode in a
@@ -164,11 +164,11 @@ def write_videos(
     index = []
     last_images: dict[str, list[Image.Image]] = defaultdict(list)
     with _NewFolder(folder / VIDEOS) as new:
-        for episode, film, is_repeated in _run_again(loaded, plan, record, chosen):
+        for episode, images, is_repeated in _run_again(loaded, plan, record, chosen):
             kind = kind_of(episode)
             name = f"{kind}/{_file_name(episode)}.mp4"
             (new / kind).mkdir(exist_ok=True)
-            frames = [_video_frame(episode, film, step) for step in range(len(film.images))]
+            frames = [_video_frame(episode, images, step) for step in range(len(images.scenes))]
             write_episode_video(new / name, frames, VIDEO_FPS)
             last_images[kind].append(Image.fromarray(frames[-1]))
             index.append(
@@ -222,16 +222,16 @@ class _NewFolder:
 
 def _run_again(
     loaded: LoadedPolicy, plan: EvaluationPlan, record: EvaluationRecord, chosen: Iterable[EpisodeResult]
-) -> Iterator[FilmedEpisode]:
-    """Runs episodes again as they were run, and films them; those of a task one after the other."""
+) -> Iterator[RerunEpisode]:
+    """Runs episodes again as they were run, and renders them; those of a task one after the other."""
     by_task: dict[int, dict[int, EpisodeResult]] = defaultdict(dict)
     for episode in chosen:
         by_task[episode.task_id][episode.trial] = episode
     evaluation = Evaluation(*loaded, plan, record.step, render_size=RENDER_SIZE)
     with evaluation, without_rollout_progress():
         for task_id, wanted in by_task.items():
-            for outcome in evaluation.run(task_id, filmed=wanted):
-                if outcome.film is None:
+            for outcome in evaluation.run(task_id, rendered=wanted):
+                if outcome.images is None:
                     continue
                 recorded, again = wanted[outcome.result.trial], outcome.result
                 is_repeated = (again.success, again.grasped_object, again.object_containers) == (
@@ -239,7 +239,7 @@ def _run_again(
                     recorded.grasped_object,
                     recorded.object_containers,
                 )
-                yield FilmedEpisode(recorded, outcome.film, is_repeated)
+                yield RerunEpisode(recorded, outcome.images, is_repeated)
 
 
 def _evenly(episodes: Sequence[EpisodeResult], n: int) -> list[EpisodeResult]:
@@ -254,19 +254,19 @@ def _file_name(episode: EpisodeResult) -> str:
     return f"task_{episode.task_id:03d}_trial_{episode.trial}_{words[:_MAX_SLUG].strip('-')}"
 
 
-def _video_frame(episode: EpisodeResult, film: Film, step: int) -> NDArray[np.uint8]:
+def _video_frame(episode: EpisodeResult, images: EpisodeImages, step: int) -> NDArray[np.uint8]:
     """An image of an episode with its demonstration, instruction and step, of even height and width."""
     size = RENDER_SIZE
-    columns = [to_image(film.images[step])]
-    if film.demonstration is not None:
+    columns = [to_image(images.scenes[step])]
+    if images.demonstration is not None:
         half = (size - GAP) // 2
-        shown = [
-            to_image(image).resize((half, half), Image.Resampling.BICUBIC) for image in film.demonstration
+        ends = [
+            to_image(image).resize((half, half), Image.Resampling.BICUBIC) for image in images.demonstration
         ]
-        columns.insert(0, down(shown))
+        columns.insert(0, down(ends))
     top = across(columns)
-    is_last = step == len(film.images) - 1
-    text = in_words(episode) if is_last else f"step {step} of {len(film.images) - 1}"
+    is_last = step == len(images.scenes) - 1
+    text = in_words(episode) if is_last else f"step {step} of {len(images.scenes) - 1}"
     words = caption(f"“{episode.instruction}”\n{text}", top.width, 14, n_lines=5)
     frame = np.asarray(down([top, words]))
     return frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
