@@ -109,7 +109,7 @@ def test_the_report_compares_it_with_this_projects(record, tmp_path, capsys):
     report_command.main([str(tmp_path / "act"), str(tmp_path / "deltaco"), "--out", str(tmp_path / "report")])
     text = (tmp_path / "report" / "report.md").read_text()
     assert "| act |" in text
-    assert "| deltaco |" in text
+    assert "| DeL-TaCo |" in text
     assert "- Policy: `type=act`." in text
     assert "optimizer_lr" not in text  # departures from the paper are those of this project's policies
 
