@@ -17,6 +17,9 @@ STEPS ?= 100000
 EVALUATE_EVERY ?= $(shell expr $(STEPS) / 10)
 DEVICE ?= cuda
 SETTINGS ?=
+# User or organization on the Hub that a release is published under, and its datasets: DATASETS="data/train data/test"
+HUB_USER ?=
+DATASETS ?=
 # Trainings at a time, of scenario A at a small scale
 JOBS ?= 2
 OUT ?= outputs/scenario_a
@@ -72,8 +75,9 @@ coverage: $(INSTALLED) ## Run the default tests and report which lines they reac
 docs: $(INSTALLED) ## Build the documentation, warnings being errors: docs/_build/html/index.html
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs docs/_build/html
 
-release: $(INSTALLED) ## Check everything that a release needs, in an empty environment
+release: $(INSTALLED) ## Check everything that a release needs; publish it with HUB_USER=you DATASETS="data/train"
 	$(BIN)/python scripts/check_release.py $(ARGS)
+	$(if $(HUB_USER),$(BIN)/python scripts/publish_release.py $(HUB_USER) --datasets $(DATASETS))
 
 lint: $(INSTALLED) ## Check style and types
 	$(BIN)/ruff check .

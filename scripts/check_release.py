@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--dist", type=Path, default=ROOT / "dist", metavar="DIR", help="folder of the wheel (%(default)s)"
     )
     options = parser.parse_args(arguments)
-    steps: list[tuple[str, Callable[[], None]]] = []
+    steps: list[tuple[str, Callable[[], object]]] = []
     if not options.rehearse:
         steps += [
             ("version and change log", lambda: check_version(ROOT)),
@@ -153,7 +153,7 @@ def build_wheel(dist: Path) -> None:
                 target = Path(folder, name)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, target)
-        _run([_uv(), "build", "--python", sys.executable, "--out-dir", str(dist.resolve())], Path(folder))
+        _run([uv(), "build", "--python", sys.executable, "--out-dir", str(dist.resolve())], Path(folder))
     names = set(zipfile.ZipFile(find_wheel(dist)).namelist())
     for needed in (f"{DISTRIBUTION}.py", "gym_deltaco/env.py", "lerobot_deltaco/modeling_deltaco.py"):
         if needed not in names:
@@ -186,10 +186,10 @@ def try_wheel(wheel: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         environment, elsewhere = Path(folder, "venv"), Path(folder, "elsewhere")
         elsewhere.mkdir()
-        _run([_uv(), "venv", "--python", sys.executable, str(environment)], ROOT)
+        _run([uv(), "venv", "--python", sys.executable, str(environment)], ROOT)
         python = environment / "bin" / "python"
         # In the repository's folder, where uv finds that PyBullet is built with NumPy.
-        _run([_uv(), "pip", "install", "--python", str(python), f"{wheel}[{_extras()}]"], ROOT)
+        _run([uv(), "pip", "install", "--python", str(python), f"{wheel}[{_extras()}]"], ROOT)
         for what, code in TRIALS.items():
             try:
                 _run([str(python), "-c", code], elsewhere)
@@ -220,7 +220,8 @@ def build_documentation() -> None:
     _run([sys.executable, "-m", "sphinx", *arguments, "docs", "docs/_build/html"], ROOT)
 
 
-def _uv() -> str:
+def uv() -> str:
+    """Path of this environment's uv, or the name of another one."""
     beside = Path(sys.executable).with_name("uv")
     return str(beside) if beside.exists() else "uv"
 

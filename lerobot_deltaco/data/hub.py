@@ -1,8 +1,8 @@
-"""Shares datasets on the Hugging Face Hub."""
+"""Shares datasets, and the files of other repositories, on the Hugging Face Hub."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +23,7 @@ _TOKENS_PAGE = "https://huggingface.co/settings/tokens"
 
 
 class HubError(RuntimeError):
-    """A dataset cannot be shared; the message says why, and what to do."""
+    """Something cannot be shared; the message says why, and what to do."""
 
 
 def push_dataset(root: Path, repo_id: str, private: bool = False, branch: str | None = None) -> str:
@@ -75,18 +75,7 @@ def push_dataset(root: Path, repo_id: str, private: bool = False, branch: str | 
                 if path.startswith(("data/", "meta/")) and path not in local
             ),
         ]
-        with _one_line_errors(repo_id, f"{repo_id} has either all of the new files or none of them."):
-            try:
-                api.create_commit(
-                    repo_id, operations, commit_message="Dataset", repo_type="dataset", revision=branch
-                )
-            except ValueError as error:  # before anything is uploaded
-                if isinstance(error, HfHubHTTPError):
-                    raise
-                raise HubError(
-                    f"The Hub at {constants.ENDPOINT} cannot check the dataset's card ({error}). Nothing has "
-                    "arrived. Push again when it can."
-                ) from None
+        _commit(api, repo_id, operations, "Dataset", repo_type="dataset", revision=branch)
     if branch is None:
         arrived = f"All files have arrived, but the tag {tag!r}, by which LeRobot fetches them, is not set."
         with _one_line_errors(repo_id, arrived):
@@ -94,6 +83,32 @@ def push_dataset(root: Path, repo_id: str, private: bool = False, branch: str | 
                 api.delete_tag(repo_id, tag=tag, repo_type="dataset")
             api.create_tag(repo_id, tag=tag, repo_type="dataset")
     return f"{constants.ENDPOINT}/datasets/{repo_id}"
+
+
+def push_files(files: Mapping[str, bytes], repo_id: str, message: str) -> str:
+    """Uploads files to a model repository in one commit, in place of those that it has.
+
+    Args:
+        files: Contents of the files, by name.
+        repo_id: "USER/NAME" on the Hub. It is made if there is none.
+        message: Title of the commit.
+
+    Returns:
+        The repository's address.
+
+    Raises:
+        HubError: Credentials are missing or do not suffice, or the Hub cannot be reached.
+    """
+    api = HfApi()
+    with _one_line_errors(repo_id, "Nothing has arrived."):
+        api.create_repo(repo_id, exist_ok=True)
+        remote = api.list_repo_files(repo_id)
+    operations: list[CommitOperationAdd | CommitOperationDelete] = [
+        *(CommitOperationAdd(name, content) for name, content in files.items()),
+        *(CommitOperationDelete(name) for name in remote if name not in files and name != ".gitattributes"),
+    ]
+    _commit(api, repo_id, operations, message)
+    return f"{constants.ENDPOINT}/{repo_id}"
 
 
 def check_repo_id(repo_id: str) -> None:
@@ -137,6 +152,29 @@ def check_dataset(root: Path) -> None:
         verify_dataset(root)
     except DatasetError as error:
         raise HubError(str(error)) from None
+
+
+def _commit(
+    api: HfApi,
+    repo_id: str,
+    operations: list[CommitOperationAdd | CommitOperationDelete],
+    message: str,
+    repo_type: str = "model",
+    revision: str | None = None,
+) -> None:
+    """Changes files of a repository in one commit."""
+    with _one_line_errors(repo_id, f"{repo_id} has either all of the new files or none of them."):
+        try:
+            api.create_commit(
+                repo_id, operations, commit_message=message, repo_type=repo_type, revision=revision
+            )
+        except ValueError as error:  # before anything is uploaded
+            if isinstance(error, HfHubHTTPError):
+                raise
+            raise HubError(
+                f"The Hub at {constants.ENDPOINT} cannot check the card of {repo_id} ({error}). Nothing has "
+                "arrived. Push again when it can."
+            ) from None
 
 
 @contextmanager
