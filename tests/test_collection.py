@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ import pandas as pd
 import psutil
 import pyarrow.parquet as pq
 import pytest
+from gymnasium.utils import seeding
 from in_process_collection import collect_in_process, remember_episodes
 from lerobot.datasets import LeRobotDataset
 from PIL import Image
@@ -30,6 +31,7 @@ from PIL import Image
 from gym_deltaco import EPISODE_STEPS, EXPERT_NOISE
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
+from gym_deltaco.layout import sample_layout
 from gym_deltaco.object_sets import find_label
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASKS
@@ -40,7 +42,7 @@ from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import CollectionError, collect
 from lerobot_deltaco.data.collection_plan import DATA_SETS, CollectionPlan
 from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, STAGING, verify_dataset
-from lerobot_deltaco.data.integrity import DIGESTS_FILE
+from lerobot_deltaco.data.integrity import DIGESTS_FILE, write_checked_json
 
 # Two tasks of different kinds, not in the benchmark's order, in files that end where no task does.
 PLAN = CollectionPlan("90,4", 3)
@@ -288,6 +290,28 @@ def test_a_dataset_says_of_what_its_scenes_are_made_where_that_is_not_the_papers
     card = (tmp_path / "README.md").read_text()
     assert "--env.objects=random:100 --env.adversarial_probability=0.0" in card
     assert "Put black and white colored, vase shaped object in green bin." in card
+    assert "One draw decides" not in card
+
+
+def test_a_dataset_whose_distractors_are_drawn_together_says_so(tmp_path, in_process):
+    collect(tmp_path, replace(CollectionPlan("4", 1), adversarial_draw="scene"))
+    info = json.loads((tmp_path / "meta/info.json").read_text())["features"]["observation.image"]["info"]
+    assert set(info) == {"renderer", "benchmark", "ambiguity", "adversarial_draw"}
+    write_card(tmp_path)
+    card = (tmp_path / "README.md").read_text()
+    assert "One draw decides for both distractors of a scene" in card
+    assert "--env.adversarial_draw=scene" in card
+    assert "--adversarial-draw scene" in card
+
+
+def test_episodes_are_collected_with_the_draw_of_the_plan():
+    plan = CollectionPlan("4", 1, adversarial_draw="scene")
+    with closing(PickPlaceEnv(**{**plan.env_settings, "image_size": 8})) as env:
+        for seed in range(8):
+            _, info = env.reset(seed=seed, options={"task_id": 4})
+            rng, _ = seeding.np_random(seed)
+            layout = sample_layout(TASKS[4], "container", rng, adversarial_draw="scene")
+            assert info["objects"].tolist() == [item.label.index for item in layout.objects]
 
 
 # Adding to a dataset
@@ -361,11 +385,46 @@ def test_an_interrupted_addition_leaves_the_old_dataset_readable(copy, tmp_path,
     assert contents(copy) == contents(expected)
 
 
-@pytest.mark.parametrize("change", [{"image_size": 32}, {"ambiguity": "object"}, {"objects": "random:100"}])
+@pytest.mark.parametrize(
+    "change",
+    [{"image_size": 32}, {"ambiguity": "object"}, {"objects": "random:100"}, {"adversarial_draw": "scene"}],
+    ids=str,
+)
 def test_other_images_are_not_added(copy, change, in_process):
     with pytest.raises(CollectionError, match="images differ in size, ambiguity, renderer"):
         collect(copy, replace(PLAN, **change), append=True)
     assert not in_process
+
+
+def without_draw(plan):
+    """A plan as versions before `adversarial_draw` wrote it down."""
+    return {name: value for name, value in plan.items() if name != "adversarial_draw"}
+
+
+def test_a_dataset_of_an_earlier_version_has_a_draw_for_each_distractor(copy, in_process):
+    entry = history(copy)[0]
+    assert entry["plan"]["adversarial_draw"] == "each"
+    (copy / HISTORY_FILE).write_text(json.dumps([{**entry, "plan": without_draw(entry["plan"])}]))
+    (copy / DIGESTS_FILE).unlink()
+    assert collect(copy, PLAN).episodes_per_s is None
+    with pytest.raises(CollectionError, match="finished dataset of other arguments"):
+        collect(copy, replace(PLAN, adversarial_draw="scene"))
+    with pytest.raises(CollectionError, match="probability or draw of adversarial distractors"):
+        collect(copy, replace(PLAN, adversarial_draw="scene"), append=True)
+    assert not in_process
+
+
+def test_a_collection_that_an_earlier_version_began_goes_on(finished, tmp_path, monkeypatch, in_process):
+    with monkeypatch.context() as patch:
+        patch.setattr(collection_workers, "_join", fail_with(OSError("full")))
+        with pytest.raises(OSError, match="full"):
+            collect(tmp_path, PLAN)
+    plan_file = tmp_path / STAGING / "plan.json"
+    write_checked_json(plan_file, without_draw(collection.identity(PLAN)))
+    with pytest.raises(CollectionError, match="adversarial_draw: each there, scene now"):
+        collect(tmp_path, replace(PLAN, adversarial_draw="scene"))
+    collect(tmp_path, PLAN)
+    assert contents(tmp_path) == contents(finished)
 
 
 def test_there_must_be_something_to_add_to(tmp_path, in_process):
@@ -685,6 +744,7 @@ def test_the_same_arguments_again_have_nothing_to_do(copy, capsys, in_process):
         {"image_size": 32},
         {"objects": "scenario_a_train"},
         {"adversarial_probability": 0.0},
+        {"adversarial_draw": "scene"},
     ],
     ids=str,
 )
@@ -949,6 +1009,7 @@ def test_a_missing_data_file_is_reported(copy, in_process):
         (["--objects", "none"], "`objects` must be one of all, scenario_a_train, random:N. Got 'none'"),
         (["--tasks", "1000"], "Task 1000 asks for a black and white colored, vase shaped object, of which"),
         (["--adversarial-probability", "1.5"], "`adversarial_probability` must be between 0 and 1. Got 1.5"),
+        (["--adversarial-draw", "both"], "invalid choice: 'both' (choose from"),
         (["--noise", "-0.1"], "`noise` must be at least 0. Got -0.1."),
         (["--noise", "nan"], "`noise` must be a finite number. Got nan."),
         (["--noise", "inf"], "`noise` must be a finite number. Got inf."),
@@ -983,7 +1044,9 @@ def test_necessary_arguments_are_named(tmp_path, capsys, missing):
     assert f"required: {missing}" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("change", [{"split": "evaluation"}, {"ambiguity": "both"}, {"seed": -1}])
+@pytest.mark.parametrize(
+    "change", [{"split": "evaluation"}, {"ambiguity": "both"}, {"seed": -1}, {"adversarial_draw": "both"}]
+)
 def test_a_plan_checks_its_arguments(change):
     ((name, value),) = change.items()
     with pytest.raises(ValueError, match=rf"`{name}` must be .*Got {value!r}"):

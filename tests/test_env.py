@@ -146,7 +146,7 @@ def test_the_info_is_the_documented_one(env):
 def test_the_constructor_has_the_documented_defaults():
     env = gym.make(ENV_ID).unwrapped
     assert (env.task.index, env.ambiguity, env.image_size, env.render_size) == (0, "container", 48, 256)
-    assert (env.objects, env.adversarial_probability) == ("all", 0.6)
+    assert (env.objects, env.adversarial_probability, env.adversarial_draw) == ("all", 0.6, "each")
     assert (env.render_mode, env.instructions) == (None, None)
     assert env.metadata["render_fps"] == 24
     assert env.metadata["render_modes"] == ["rgb_array"]
@@ -629,6 +629,8 @@ def test_a_policy_that_picks_at_random_succeeds_in_1_of_6():
         ({"adversarial_probability": 1.1}, r"`adversarial_probability` must be between 0 and 1\. Got 1\.1"),
         ({"adversarial_probability": -0.1}, r"between 0 and 1\. Got -0\.1"),
         ({"adversarial_probability": float("nan")}, r"between 0 and 1\. Got nan"),
+        ({"adversarial_draw": "both"}, r"`adversarial_draw` must be one of each, scene\. Got 'both'"),
+        ({"adversarial_draw": None}, r"`adversarial_draw` must be one of each, scene\. Got None"),
         ({"render_mode": "human"}, r"`render_mode` must be 'rgb_array' or None\. Got 'human'"),
     ],
     ids=str,

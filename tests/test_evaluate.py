@@ -8,12 +8,15 @@ import sys
 import numpy as np
 import pytest
 import torch
+from gymnasium.utils import seeding
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.scripts import lerobot_train
 from small_policies import use_fake_encoder
 
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import Expert
+from gym_deltaco.layout import sample_layout
+from gym_deltaco.object_sets import ADVERSARIAL_DRAWS
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.commands import collect as collect_command
@@ -24,7 +27,7 @@ from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.envs.policy_fit import check_policy_fits
 from lerobot_deltaco.evaluation import sets
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
-from lerobot_deltaco.evaluation.evaluate import counterfactual_task, evaluate
+from lerobot_deltaco.evaluation.evaluate import _scene_info, counterfactual_task, evaluate
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import read_record, record_path
 from lerobot_deltaco.training.loop import InMemoryTraining
@@ -111,6 +114,16 @@ def test_distractors_are_drawn_as_the_plan_says(loaded):
     assert max(distractors(adversarial_probability=0.0, objects="scenario_a_train")) < 24
 
 
+@pytest.mark.parametrize("draw", ADVERSARIAL_DRAWS)
+def test_distractors_are_drawn_each_or_together_as_the_plan_says(loaded, draw):
+    plan = EvaluationPlan("4", trials=6, adversarial_draw=draw)
+    for episode in evaluate(*loaded, plan, set_number=0):
+        rng, _ = seeding.np_random(episode.seed)
+        layout = sample_layout(get_task(4), "container", rng, adversarial_draw=draw)
+        assert episode.objects == [item.label.index for item in layout.objects]
+        assert _scene_info(plan, 4, episode.seed)["objects"] == episode.objects
+
+
 def test_the_outcome_is_that_of_the_scene_at_the_end(loaded, monkeypatch):
     # The policy's place is taken by the expert, which succeeds.
     acting = {}
@@ -175,6 +188,7 @@ def test_the_command_writes_a_record_of_each_checkpoint_once(run, capsys, monkey
     assert record.versions["benchmark"] == "gym_deltaco/PickPlace-v0"
     assert record.command == f"deltaco-evaluate {run} --tasks 4,14 --trials 1"
     assert (record.objects, record.adversarial_probability) == ("all", 0.6)
+    assert record.adversarial_draw == "each"
     assert capsys.readouterr().out.count("succeeded") == 2
 
     def must_not_run(*arguments):
@@ -190,10 +204,10 @@ def test_records_of_other_evaluations_are_not_taken_for_this_one(run, capsys):
     with pytest.raises(SystemExit):
         evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "2", "--steps", "last"])
     assert "belongs to another evaluation" in capsys.readouterr().err
-    uniform = ["--adversarial-probability", "0"]
-    with pytest.raises(SystemExit):
-        evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "1", "--steps", "last", *uniform])
-    assert "belongs to another evaluation" in capsys.readouterr().err
+    for changed in (["--adversarial-probability", "0"], ["--adversarial-draw", "scene"]):
+        with pytest.raises(SystemExit):
+            evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "1", "--steps", "last", *changed])
+        assert "belongs to another evaluation" in capsys.readouterr().err
 
 
 def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder(run, tmp_path, capsys):
@@ -276,6 +290,7 @@ def test_records_say_whose_words_the_instructions_are(run, sentences, tmp_path, 
         (["--objects", "none"], "`objects` must be one of all, scenario_a_train, random:N"),
         (["--tasks", "24", "--objects", "scenario_a_train"], "Task 24 asks for a gray colored"),
         (["--adversarial-probability", "2"], "`adversarial_probability` must be between 0 and 1"),
+        (["--adversarial-draw", "both"], "invalid choice: 'both'"),
         (["--steps", "5"], "no checkpoint of step 5. It has those of 1, 2"),
         (["--steps", "first"], "must be 'all', 'last' or steps"),
     ],
@@ -324,6 +339,17 @@ def test_evaluations_in_training_leave_the_records_that_evaluations_afterwards_d
 
 
 # The environment's settings
+
+
+def test_one_draw_for_both_distractors_is_evaluated_in_training_as_afterwards(run, tmp_path):
+    environment = {"env.type": "deltaco", "env.task": "4,14", "env_eval_freq": "2", "eval.n_episodes": "2"}
+    train(str(run.parent / "data"), tmp_path / "run", **environment, **{"env.adversarial_draw": "scene"})
+    during = read_record(record_path(tmp_path / "run", 2))
+    assert during.adversarial_draw == "scene"
+    arguments = [str(tmp_path / "run"), "--tasks", "4,14", "--steps", "last", "--out", str(tmp_path / "out")]
+    evaluate_command.main([*arguments, "--adversarial-draw", "scene"])
+    after = read_record(record_path(tmp_path / "out", 2))
+    assert (after.adversarial_draw, after.episodes) == ("scene", during.episodes)
 
 
 def test_image_size_and_episode_length_are_those_of_the_training(tmp_path, monkeypatch, capsys):

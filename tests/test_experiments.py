@@ -387,6 +387,22 @@ def test_a_dry_run_prints_the_commands_of_a_step_alone(called, capsys):
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["deltaco-collect"] * 2
 
 
+def test_the_draw_of_distractors_is_passed_on_to_all_commands(called, capsys):
+    settings = {
+        "data.adversarial_draw": "scene",
+        "demonstrations.adversarial_draw": "scene",
+        "evaluation.adversarial_draw": "scene",
+        "training.env_eval_freq": "1",
+    }
+    changes = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
+    called("small_a/deltaco", "--dry-run", *changes)
+    commands = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert {command[0] for command in commands} == {"deltaco-collect", "deltaco-train", "deltaco-evaluate"}
+    for command in commands:
+        option = "--env.adversarial_draw" if command[0] == "deltaco-train" else "--adversarial-draw"
+        assert f"{option}=scene" in command
+
+
 def test_shards_are_passed_on_to_the_collections(called, monkeypatch, capsys):
     arguments = []
     monkeypatch.setattr(CommandRunner, "run", lambda _, *call: arguments.append(call[1]))

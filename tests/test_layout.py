@@ -7,8 +7,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from gym_deltaco import layout as layout_module
 from gym_deltaco.layout import AMBIGUITIES, sample_layout, twin_word
-from gym_deltaco.object_sets import OBJECT_SETS, select_objects
+from gym_deltaco.object_sets import ADVERSARIAL_DRAWS, OBJECT_SETS, select_objects
 from gym_deltaco.tasks import CONTAINER_COLORS, CONTAINER_WORDS, OBJECTS, TASKS, get_task
 from gym_deltaco.workspace import QUADRANTS, container_matches
 
@@ -232,6 +233,93 @@ def test_the_share_of_adversarial_distractors_can_be_chosen(probability):
     # Drawn uniformly, 3 of the 31 others are alike.
     expected = 1.0 if probability else 3 / 31
     assert share == pytest.approx(expected, abs=4.5 * np.sqrt(expected * (1 - expected) / (2 * n)))
+
+
+# Layouts of the version before `adversarial_draw`: the objects in their order, and the generator's next
+# number, which depends on how many were drawn.
+EARLIER_LAYOUTS = [
+    (4, "container", "all", 0, [4, 16, 0], 2061532435),
+    (4, "container", "all", 1, [2, 7, 4], 2745907368),
+    (4, "container", "all", 2, [0, 10, 4], 961154287),
+    (39, "container", "all", 1, [22, 25, 29], 625792807),
+    (39, "container", "all", 2, [25, 3, 29], 1366429244),
+    (39, "container", "all", 3, [25, 29, 5], 3687839017),
+    (295, "container", "scenario_a_train", 0, [2, 15, 18], 3069263244),
+    (104, "container", "random:100", 1, [106, 75, 4], 2745907368),
+    (4, "object", "all", 0, [4, 27, 4], 1093525229),
+]
+
+
+@pytest.mark.parametrize("explicit", [{}, {"adversarial_draw": "each"}], ids=["default", "each"])
+@pytest.mark.parametrize(("task_id", "ambiguity", "objects", "seed", "indices", "number"), EARLIER_LAYOUTS)
+def test_layouts_are_those_of_earlier_versions(task_id, ambiguity, objects, seed, indices, number, explicit):
+    rng = np.random.default_rng(seed)
+    layout = sample_layout(TASKS[task_id], ambiguity, rng, select_objects(objects), **explicit)
+    assert [item.label.index for item in layout.objects] == indices
+    assert rng.integers(2**32) == number
+
+
+def shares_alike(task_id, alike, n, **settings):
+    """Shares of the scenes in which none, one and both of the distractors are alike to the target."""
+    counts = Counter()
+    for seed in range(n):
+        layout = sample_layout(TASKS[task_id], "container", np.random.default_rng(seed), **settings)
+        counts[sum(item.label.index in alike for item in layout.objects)] += 1
+    return np.array([counts[number] / n for number in range(3)])
+
+
+def shares_by_the_rule(n_alike, n_others, probability, draw):
+    """The shares that `shares_alike` estimates, by the rule: exact for at least one object that is alike."""
+
+    def next_is_alike(n_chosen_alike, n_chosen, is_adversarial):
+        left = n_alike - n_chosen_alike
+        return 1.0 if is_adversarial and left else left / (n_others - n_chosen)
+
+    shares = np.zeros(3)
+    for first, second in itertools.product([True, False], repeat=2):
+        if draw == "scene":
+            weight = (probability if first else 1 - probability) if first == second else 0.0
+        else:
+            weight = np.prod([probability if each else 1 - probability for each in (first, second)])
+        one = next_is_alike(0, 0, first)
+        both, only_second = one * next_is_alike(1, 1, second), (1 - one) * next_is_alike(0, 1, second)
+        shares += weight * np.array([1 - one - only_second, one - both + only_second, both])
+    return shares
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.6, 1.0])
+@pytest.mark.parametrize("draw", ADVERSARIAL_DRAWS)
+@pytest.mark.parametrize(("task_id", "alike"), [(task_id, alike) for task_id, alike, _ in ADVERSARIES])
+def test_one_draw_decides_for_each_distractor_or_for_both_of_a_scene(
+    monkeypatch, task_id, alike, draw, probability
+):
+    # Objects are drawn before their places. To take the first places that are drawn saves most of the time.
+    monkeypatch.setattr(layout_module, "_is_clear", lambda *_: True)
+    n = 2000
+    shares = shares_alike(task_id, alike, n, adversarial_probability=probability, adversarial_draw=draw)
+    expected = shares_by_the_rule(len(alike), 31, probability, draw)
+    assert expected.sum() == pytest.approx(1)
+    assert (np.abs(shares - expected) <= 4.5 * np.sqrt(expected * (1 - expected) / n) + 1e-12).all()
+
+
+def test_the_draws_differ_only_between_the_extremes():
+    for n_alike in (1, 3):
+        for probability in (0.0, 1.0):
+            each, scene = (shares_by_the_rule(n_alike, 31, probability, draw) for draw in ADVERSARIAL_DRAWS)
+            assert scene == pytest.approx(each)
+    # In 0.6 of the scenes both are adversarial, and uniform draws add a few; independently, in 0.36.
+    each, scene = (shares_by_the_rule(3, 31, 0.6, draw)[2] for draw in ADVERSARIAL_DRAWS)
+    assert scene == pytest.approx(0.6 + 0.4 * (3 / 31) * (2 / 30))
+    assert each == pytest.approx((0.6 + 0.4 * 3 / 31) * (0.6 + 0.4 * 2 / 30))
+
+
+def test_the_draw_does_not_matter_for_twins():
+    for seed in range(20):
+        each, scene = (
+            sample_layout(TASKS[4], "object", np.random.default_rng(seed), adversarial_draw=draw)
+            for draw in ADVERSARIAL_DRAWS
+        )
+        assert numbers(scene) == numbers(each)
 
 
 @pytest.mark.parametrize("ambiguity", AMBIGUITIES)

@@ -89,6 +89,7 @@ def test_features_agree_with_the_spaces(make_envs):
         ({"episode_length": 0}, r"`episode_length` must be at least 1\. Got 0\."),
         ({"max_parallel_tasks": 0}, r"`max_parallel_tasks` must be at least 1\. Got 0\."),
         ({"ambiguity": "none"}, r"`ambiguity` must be one of container, object\. Got 'none'\."),
+        ({"adversarial_draw": "both"}, r"`adversarial_draw` must be one of each, scene\. Got 'both'\."),
         ({"instructions_split": "test"}, "must be one of all, train, held_out. Got 'test'"),
         ({"instruction": ""}, "must be a sentence"),
         ({"instruction": "put it there", "instructions": "a.csv"}, "exclude each other"),
@@ -97,6 +98,13 @@ def test_features_agree_with_the_spaces(make_envs):
 def test_bad_configurations_say_what_is_valid(arguments, message):
     with pytest.raises(ValueError, match=message):
         DeltacoEnv(**arguments)
+
+
+@pytest.mark.parametrize("draw", [None, "each", "scene"])
+def test_the_draw_of_distractors_reaches_the_environment(make_envs, draw):
+    (env,) = make_envs("4", **({} if draw is None else {"adversarial_draw": draw})).values()
+    env.reset(seed=[0])
+    assert env.get_attr("adversarial_draw") == (draw or "each",)
 
 
 # Vector environments

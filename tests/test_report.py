@@ -431,7 +431,7 @@ def test_a_damaged_record_is_refused(tmp_path, damage, message):
 
 def test_a_record_of_the_first_format_says_what_was_so_then(tmp_path):
     content = asdict(record())
-    for name in ("image_size", "episode_length", "objects", "adversarial_probability"):
+    for name in ("image_size", "episode_length", "objects", "adversarial_probability", "adversarial_draw"):
         del content[name]
     for result in content["episodes"]:
         del result["demonstration_episodes"], result["demonstrated_objects"]
@@ -445,6 +445,35 @@ def test_a_record_of_the_first_format_says_what_was_so_then(tmp_path):
     path.write_text(json.dumps({"format": 1, **content, "image_size": "48"}))
     with pytest.raises(RecordError, match="`image_size` must be an integer"):
         read_record(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("wording", "templates"), ("adversarial_draw", "each")], ids=["wording", "draw"]
+)
+def test_the_first_records_of_the_second_format_say_what_was_so_then(tmp_path, name, value):
+    content = {"format": RECORD_FORMAT, **asdict(record())}
+    assert content.pop(name) == value
+    path = tmp_path / "0010000.json"
+    path.write_text(json.dumps(content))
+    assert read_record(path) == record()
+
+
+def test_a_record_keeps_the_draw_of_distractors(tmp_path):
+    drawn_together = record(adversarial_draw="scene")
+    path = tmp_path / "0010000.json"
+    write_record(drawn_together, path)
+    assert read_record(path) == drawn_together
+    path.write_text(json.dumps({"format": RECORD_FORMAT, **asdict(drawn_together), "adversarial_draw": "x"}))
+    with pytest.raises(RecordError, match="`adversarial_draw` must be one of each, scene. Got 'x'"):
+        read_record(path)
+
+
+@pytest.mark.parametrize("draw", ["each", "scene"])
+def test_the_page_says_if_one_draw_decides_for_both_distractors(tmp_path, draw):
+    write_report([write(tmp_path / "runs", record(adversarial_draw=draw))], tmp_path / "out")
+    text = (tmp_path / "out/report.md").read_text()
+    assert "at a probability of 0.6" in text
+    assert ("decided by one draw for both of a scene" in text) == (draw == "scene")
 
 
 @pytest.mark.parametrize("text", ['{"format": 2, "epis', "[]", ""])
@@ -591,6 +620,7 @@ def test_options_that_are_newer_than_a_record_were_as_they_are_by_default(tmp_pa
         ({"episode_length": 7}, "episode length: 30 .* 7"),
         ({"objects": "random:100"}, "objects: 'all' .* 'random:100'"),
         ({"adversarial_probability": 0.0}, "probability of adversarial distractors: 0.6 .* 0.0"),
+        ({"adversarial_draw": "scene"}, "draw of adversarial distractors: 'each' .* 'scene'"),
         ({"trials": 2}, "trials: 1 in .* 2 in"),
         ({"tasks": "24", "episodes": [episode(24)]}, "tasks: '24,32,.*' in .* '24' in"),
     ],

@@ -174,6 +174,8 @@ def test_shards_that_do_not_belong_together_are_refused(in_process, tmp_path, mo
         patch.setattr("lerobot_deltaco.data.shards.versions", lambda: versions)
         with pytest.raises(CollectionError, match=r"versions: .*Use the same arguments and versions"):
             join_shards(root, PLAN)
+    with pytest.raises(CollectionError, match="adversarial_draw: each there, scene now"):
+        join_shards(root, replace(PLAN, adversarial_draw="scene"))
     collect_all(root, 3, [1])
     with pytest.raises(CollectionError, match="holds shards of 2 and of 3"):
         join_shards(root, PLAN)

@@ -88,6 +88,7 @@ def test_a_sentence_may_have_any_signs(tmp_path):
     [
         ({"evaluation_seed": 3}, "differ in their evaluation seed: 0 in .*, 3 in"),
         ({"adversarial_probability": 0.0}, "probability of adversarial distractors"),
+        ({"adversarial_draw": "scene"}, "draw of adversarial distractors: 'each' in .*, 'scene' in"),
         ({"image_size": 96}, "image size"),
     ],
 )

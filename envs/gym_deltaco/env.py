@@ -14,7 +14,13 @@ from gym_deltaco import CONTROL_FPS, MIN_IMAGE_SIZE
 from gym_deltaco import kinematics as kin
 from gym_deltaco.instructions import check_tasks
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity, sample_layout
-from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, check_task, select_objects
+from gym_deltaco.object_sets import (
+    ADVERSARIAL_PROBABILITY,
+    AdversarialDraw,
+    check_scenes,
+    check_task,
+    select_objects,
+)
 from gym_deltaco.scene import Scene
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import Task, get_task
@@ -84,6 +90,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             "scenario_a_train", without the 8 test objects; or "random:N" (`gym_deltaco.object_sets`).
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1; 0.6 as in the paper's data, 0 for uniform draws.
+        adversarial_draw: Scope of a draw with that probability: "each", one distractor; or "scene", both
+            distractors of a scene, as in the authors' code.
         instructions: Sentences of each task, as `gym_deltaco.instructions.read_instructions` gives them. The
             `task_description` of an episode is then one of its task's, drawn by the episode's seed; the scene
             stays the same. By default, it is the benchmark's template.
@@ -103,9 +111,10 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         render_size: int = 256,
         objects: str = "all",
         adversarial_probability: float = ADVERSARIAL_PROBABILITY,
+        adversarial_draw: AdversarialDraw = "each",
         instructions: Mapping[int, Sequence[str]] | None = None,
     ) -> None:
-        check_scenes([task_id], objects, adversarial_probability)
+        check_scenes([task_id], objects, adversarial_probability, adversarial_draw)
         self.objects = objects
         self.task: Task = get_task(task_id)
         if ambiguity not in AMBIGUITIES:
@@ -121,6 +130,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             raise ValueError(f"`render_mode` must be 'rgb_array' or None. Got {render_mode!r}.")
         self.ambiguity: Ambiguity = ambiguity
         self.adversarial_probability = adversarial_probability
+        self.adversarial_draw: AdversarialDraw = adversarial_draw
         self.image_size = image_size
         self.render_mode = render_mode
         self.render_size = render_size
@@ -193,7 +203,12 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             self._simulation = Simulation()
         labels = select_objects(self.objects)
         layout = sample_layout(
-            self.task, self.ambiguity, self.np_random, labels, self.adversarial_probability
+            self.task,
+            self.ambiguity,
+            self.np_random,
+            labels,
+            self.adversarial_probability,
+            self.adversarial_draw,
         )
         self._scene = Scene(self._simulation, layout)
         self._is_success = False

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, find_label, find_model
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, AdversarialDraw, find_label, find_model
 from gym_deltaco.objects import ObjectModel
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, ContainerColor, ContainerWord, ObjectLabel, Task
 from gym_deltaco.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
@@ -63,6 +63,7 @@ def sample_layout(
     rng: np.random.Generator,
     objects: Sequence[ObjectLabel] = OBJECTS,
     adversarial_probability: float = ADVERSARIAL_PROBABILITY,
+    adversarial_draw: AdversarialDraw = "each",
 ) -> Layout:
     """Draws a scene for a task.
 
@@ -75,13 +76,17 @@ def sample_layout(
         objects: Objects that the scene is made of; the task asks for at least one of them.
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1. In scheme ii, none is.
+        adversarial_draw: Scope of a draw with that probability: "each", one distractor; or "scene", both
+            distractors of a scene, as in the authors' code.
 
     Returns:
         The scene.
     """
     target = int(rng.choice([label.index for label in objects if task.describes(label)]))
     if ambiguity == "container":
-        distractors = _sample_distractors(task, find_label(target), rng, objects, adversarial_probability)
+        distractors = _sample_distractors(
+            task, find_label(target), rng, objects, adversarial_probability, adversarial_draw
+        )
         containers, object_quadrants = _sample_quadrants(task, rng)
     else:
         distractors = (
@@ -116,14 +121,17 @@ def _sample_distractors(
     rng: np.random.Generator,
     objects: Sequence[ObjectLabel],
     adversarial_probability: float,
+    adversarial_draw: AdversarialDraw,
 ) -> tuple[int, int]:
     """Two objects that the instruction does not describe, often alike to the target in color or shape."""
     others = [label for label in objects if not task.describes(label) and label.index != target.index]
     alike = [label.index for label in others if label.color == target.color or label.shape == target.shape]
+    # None: each distractor has a draw of its own.
+    shared_draw = rng.random() if adversarial_draw == "scene" else None
     chosen: list[int] = []
     while len(chosen) < N_OBJECTS - 1:
         left = [index for index in alike if index not in chosen]
-        if not (left and rng.random() < adversarial_probability):
+        if not (left and (rng.random() if shared_draw is None else shared_draw) < adversarial_probability):
             left = [label.index for label in others if label.index not in chosen]
         chosen.append(int(rng.choice(left)))
     return chosen[0], chosen[1]

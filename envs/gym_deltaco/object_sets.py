@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable
 from functools import cache
 from types import MappingProxyType
+from typing import Literal, get_args
 
 from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.random_objects import FIRST_INDEX, random_label, random_model
@@ -21,6 +22,8 @@ OBJECT_SETS = MappingProxyType(
     }
 )
 ADVERSARIAL_PROBABILITY = 0.6  # that a distractor shares the target's color or shape, in the paper's data
+AdversarialDraw = Literal["each", "scene"]
+ADVERSARIAL_DRAWS: tuple[str, ...] = get_args(AdversarialDraw)
 MAX_OBJECTS = 10_000
 N_INDICES = (
     FIRST_INDEX + MAX_OBJECTS - len(OBJECT_SETS["scenario_a_train"])
@@ -77,7 +80,9 @@ def default_objects(tasks: str) -> str:
     return _OBJECTS_OF_TASK_SETS.get(tasks.strip(), "all")
 
 
-def check_scenes(task_ids: Iterable[int], objects: str, adversarial_probability: float) -> None:
+def check_scenes(
+    task_ids: Iterable[int], objects: str, adversarial_probability: float, adversarial_draw: str = "each"
+) -> None:
     """Checks that scenes can be drawn for tasks.
 
     Args:
@@ -85,12 +90,19 @@ def check_scenes(task_ids: Iterable[int], objects: str, adversarial_probability:
         objects: Name of the set of objects, as `select_objects` takes it.
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1.
+        adversarial_draw: Scope of a draw with that probability: "each", one distractor; or "scene", both
+            distractors of a scene, as in the authors' code.
 
     Raises:
-        ValueError: There is no such set, a task asks for none of its objects, or the probability is none.
+        ValueError: There is no such set, a task asks for none of its objects, or the probability or its draw
+            is not valid.
     """
     if not 0 <= adversarial_probability <= 1:
         raise ValueError(f"`adversarial_probability` must be between 0 and 1. Got {adversarial_probability}.")
+    if adversarial_draw not in ADVERSARIAL_DRAWS:
+        raise ValueError(
+            f"`adversarial_draw` must be one of {', '.join(ADVERSARIAL_DRAWS)}. Got {adversarial_draw!r}."
+        )
     tasks_by_row = {task.row: task for task in map(get_task, task_ids)}
     for task in tasks_by_row.values():
         check_task(task, objects)

@@ -9,7 +9,7 @@ import jinja2
 
 TEMPLATES = "datasets_cards"
 # Settings of the environment that a dataset records; those of the objects only if they are not the paper's.
-SCENE_SETTINGS = ("ambiguity", "objects", "adversarial_probability")
+SCENE_SETTINGS = ("ambiguity", "objects", "adversarial_probability", "adversarial_draw")
 
 
 def template_folder() -> Path:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from gym_deltaco import EXPERT_NOISE, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES
-from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY
+from gym_deltaco.object_sets import ADVERSARIAL_DRAWS, ADVERSARIAL_PROBABILITY
 from lerobot_deltaco.commands.command_errors import exit_on_error
 from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.data.collection_plan import COLLECTED_SPLITS, DATA_SETS, CollectionPlan
@@ -46,6 +46,7 @@ def main(arguments: list[str] | None = None) -> None:
             image_size=options.image_size,
             objects=options.objects,
             adversarial_probability=options.adversarial_probability,
+            adversarial_draw=options.adversarial_draw,
         )
     except ValueError as error:
         parser.error(str(error))
@@ -211,6 +212,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="P",
         help="probability that a distractor is drawn from the objects that share the target's color or shape "
         "(default: %(default)s)",
+    )
+    parser.add_argument(
+        "--adversarial-draw",
+        choices=ADVERSARIAL_DRAWS,
+        default="each",
+        help="scope of a draw with that probability: each, one distractor; or scene, both distractors of a "
+        "scene, as in the authors' code (default: %(default)s)",
     )
     parser.add_argument(
         "--workers",

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gym_deltaco.instructions import INSTRUCTION_SPLITS
 from gym_deltaco.layout import AMBIGUITIES
+from gym_deltaco.object_sets import ADVERSARIAL_DRAWS
 from lerobot_deltaco.commands.command_errors import exit_on_error
 from lerobot_deltaco.common.run_folder import (
     Checkpoint,
@@ -45,6 +46,7 @@ def main(arguments: list[str] | None = None) -> None:
             options.ambiguity,
             objects=options.objects,
             adversarial_probability=options.adversarial_probability,
+            adversarial_draw=options.adversarial_draw,
             instructions=options.instructions,
             instructions_split=options.instructions_split,
             instruction=options.instruction,
@@ -207,6 +209,7 @@ def _check_same_evaluation(
         record.episode_length,
         record.objects,
         record.adversarial_probability,
+        record.adversarial_draw,
         record.wording,
     )
     asked_for = _settings(
@@ -219,6 +222,7 @@ def _check_same_evaluation(
         plan.episode_length,
         plan.objects,
         plan.adversarial_probability,
+        plan.adversarial_draw,
         plan.wording,
     )
     if options.n_demonstrations is not None:
@@ -243,6 +247,7 @@ def _settings(
     episode_length: int,
     objects: str | None,
     adversarial_probability: float,
+    adversarial_draw: str,
     wording: str,
 ) -> dict[str, object]:
     """The arguments of an evaluation, for comparison and for errors."""
@@ -256,6 +261,7 @@ def _settings(
         "episode_length": episode_length,
         "objects": objects,
         "adversarial_probability": adversarial_probability,
+        "adversarial_draw": adversarial_draw,
         "wording": wording,
     }
 
@@ -361,6 +367,13 @@ def _parser() -> argparse.ArgumentParser:
         help="probability that a distractor is drawn from the objects that share the target's color or "
         "shape; 0 for uniform distractors, as in the authors' evaluation during training (default: "
         "%(default)s)",
+    )
+    parser.add_argument(
+        "--adversarial-draw",
+        choices=ADVERSARIAL_DRAWS,
+        default=plan.adversarial_draw,
+        help="scope of a draw with that probability: each, one distractor; or scene, both distractors of a "
+        "scene, as in the authors' code (default: %(default)s)",
     )
     parser.add_argument(
         "--instructions",

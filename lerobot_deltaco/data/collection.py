@@ -17,11 +17,12 @@ import os
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from gym_deltaco import ENV_ID
@@ -72,6 +73,8 @@ FINISHED_STAGING = ".collecting.finished"
 LOCK = "lock"
 # What a collection under way has in its folder, once its plan is written down.
 _STAGED = ("episodes", "parts", JOINED, "commit.json")
+# Arguments that collections of earlier versions were begun without, and what was so in all of them.
+_ADDED_ARGUMENTS = MappingProxyType({"adversarial_draw": "each"})
 
 
 @dataclass(frozen=True)
@@ -230,14 +233,9 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
     if plan_file.exists():
         remedy = f"The arguments of the collection are lost: delete {root}, and collect again."
         begun, wanted = read_checked_json(plan_file, remedy), identity(plan, append)
-        differences = [
-            f"{name}: {begun.get(name)} there, {wanted[name]} now"
-            for name in wanted
-            if begun.get(name) != wanted[name]
-        ]
-        if differences:
+        if differing := differences(begun, wanted):
             raise CollectionError(
-                f"{root} holds an unfinished collection of other arguments ({'; '.join(differences)}). Go "
+                f"{root} holds an unfinished collection of other arguments ({'; '.join(differing)}). Go "
                 "on with its own arguments, or name a new folder."
             )
         if append and base is None and not (root / STAGING / "commit.json").exists():
@@ -266,7 +264,7 @@ def _check_may_begin(root: Path, base: _Base | None, plan: CollectionPlan, appen
     elif json.loads(json.dumps(plan.features)) != base.features:
         raise CollectionError(
             f"{root} holds a dataset whose images differ in size, ambiguity, renderer, objects, probability "
-            "of adversarial distractors or version of the benchmark. Name a new folder."
+            "or draw of adversarial distractors, or version of the benchmark. Name a new folder."
         )
 
 
@@ -285,6 +283,21 @@ def identity(plan: CollectionPlan, append: bool = False) -> dict[str, Any]:
         "renderer": renderer(),
         "episodes_per_file": EPISODES_PER_FILE,
     }
+
+
+def differences(begun: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    """What keeps a collection from being continued, in words.
+
+    Args:
+        begun: Identity of the collection, as read from its folder.
+        wanted: Identity of the collection that is to continue it.
+    """
+    begun = {**_ADDED_ARGUMENTS, **begun}
+    return [
+        f"{name}: {begun.get(name)} there, {value} now"
+        for name, value in wanted.items()
+        if begun.get(name) != value
+    ]
 
 
 def versions() -> dict[str, str]:

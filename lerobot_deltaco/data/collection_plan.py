@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gym_deltaco import CONTROL_FPS, ENV_ID, EPISODE_STEPS, EXPERT_NOISE, MIN_IMAGE_SIZE
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
-from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, default_objects
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, AdversarialDraw, check_scenes, default_objects
 from gym_deltaco.seeding import Split, episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, select_tasks
 from lerobot_deltaco.common.checks import check_choices
@@ -66,6 +66,8 @@ class CollectionPlan:
             "scenario_a_train" for scenario_a_clean_train.
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1.
+        adversarial_draw: Scope of a draw with that probability: "each", one distractor; or "scene", both
+            distractors of a scene, as in the authors' code.
 
     Raises:
         ValueError: An argument is not valid; the message says what is.
@@ -80,6 +82,7 @@ class CollectionPlan:
     image_size: int = 48
     objects: str | None = None
     adversarial_probability: float = ADVERSARIAL_PROBABILITY
+    adversarial_draw: AdversarialDraw = "each"
 
     def __post_init__(self) -> None:
         check_field_types(self)
@@ -96,7 +99,7 @@ class CollectionPlan:
         check_choices(self, ambiguity=AMBIGUITIES)
         objects = default_objects(self.tasks) if self.objects is None else self.objects
         object.__setattr__(self, "objects", objects)
-        check_scenes(task_ids, objects, self.adversarial_probability)
+        check_scenes(task_ids, objects, self.adversarial_probability, self.adversarial_draw)
         if self.split is None:
             object.__setattr__(self, "split", _default_split(self.tasks, task_ids))
         check_choices(self, split=COLLECTED_SPLITS)
@@ -124,12 +127,17 @@ class CollectionPlan:
             "image_size": self.image_size,
             "objects": self.objects,
             "adversarial_probability": self.adversarial_probability,
+            "adversarial_draw": self.adversarial_draw,
         }
 
     @property
     def _changed_settings(self) -> dict[str, Any]:
-        """Settings of the scenes that are not the paper's. The others are left out, as they always were."""
-        settings = {"objects": "all", "adversarial_probability": ADVERSARIAL_PROBABILITY}
+        """Settings of the scenes that are not the default. The others are left out, as they always were."""
+        settings = {
+            "objects": "all",
+            "adversarial_probability": ADVERSARIAL_PROBABILITY,
+            "adversarial_draw": "each",
+        }
         return {name: getattr(self, name) for name, own in settings.items() if getattr(self, name) != own}
 
     @property

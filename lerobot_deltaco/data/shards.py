@@ -174,14 +174,9 @@ def _check_arguments(job: Job, shard: Shard) -> None:
             )
         return
     begun, wanted = read_checked_json(_plan_file(job), _PLAN_REMEDY), _identity(job.plan, shard)
-    differences = [
-        f"{name}: {begun.get(name)} there, {value} now"
-        for name, value in wanted.items()
-        if begun.get(name) != value
-    ]
-    if differences:
+    if differing := collection.differences(begun, wanted):
         raise CollectionError(
-            f"{job.root} holds shard {shard} of other arguments ({'; '.join(differences)}). Use the same "
+            f"{job.root} holds shard {shard} of other arguments ({'; '.join(differing)}). Use the same "
             "arguments and versions for all shards, or delete the folder and collect the shard again."
         )
 

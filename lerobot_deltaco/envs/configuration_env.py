@@ -44,6 +44,8 @@ class DeltacoEnv(EnvConfig):
             "scenario_a_train" for the tasks scenario_a_clean_train.
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape: 0.6 in the paper's data, 0 in the authors' evaluation in training.
+        adversarial_draw: Scope of a draw with that probability: "each", one distractor; or "scene", both
+            distractors of a scene, as in the authors' code.
         instructions: CSV file with sentences for the tasks, as `deltaco-instructions` fetches or checks it.
             The instruction of an episode is then one of its task's, drawn by the episode's seed. By default,
             it is the benchmark's template.
@@ -60,6 +62,7 @@ class DeltacoEnv(EnvConfig):
     render_size: int = 96
     objects: str | None = None
     adversarial_probability: float = ADVERSARIAL_PROBABILITY
+    adversarial_draw: str = "each"
     instructions: str | None = None
     instructions_split: str = "all"
     instruction: str | None = None
@@ -70,7 +73,7 @@ class DeltacoEnv(EnvConfig):
         task_ids = select_tasks(self.task)
         if self.objects is None:
             self.objects = default_objects(self.task)
-        check_scenes(task_ids, self.objects, self.adversarial_probability)
+        check_scenes(task_ids, self.objects, self.adversarial_probability, self.adversarial_draw)
         check_ranges(self, ENV_RANGES)
         check_choices(self, ambiguity=AMBIGUITIES)
         # The file is read when environments are made.
@@ -99,6 +102,7 @@ class DeltacoEnv(EnvConfig):
             "max_episode_steps": self.episode_length,
             "objects": self.objects,
             "adversarial_probability": self.adversarial_probability,
+            "adversarial_draw": self.adversarial_draw,
             "instructions": self._sentences(),
         }
 

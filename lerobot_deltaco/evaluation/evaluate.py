@@ -135,6 +135,7 @@ class Evaluation:
             episode_length=plan.episode_length,
             objects=plan.objects,
             adversarial_probability=plan.adversarial_probability,
+            adversarial_draw=plan.adversarial_draw,
         )
         check_policy_fits(policy.config, env_config, _rename_map(preprocessor))
         if plan.counterfactual == "demo" and not self._uses_demo:
@@ -427,7 +428,9 @@ def _scene_info(plan: EvaluationPlan, task_id: int, seed: int) -> dict[str, Any]
     """What the environment will say of a scene, as far as it is drawn, without building the scene."""
     rng, _ = seeding.np_random(seed)
     labels = select_objects(plan.objects or "all")
-    layout = sample_layout(get_task(task_id), plan.ambiguity, rng, labels, plan.adversarial_probability)
+    layout = sample_layout(
+        get_task(task_id), plan.ambiguity, rng, labels, plan.adversarial_probability, plan.adversarial_draw
+    )
     return {
         "objects": [item.label.index for item in layout.objects],
         "container_quadrants": [item.quadrant for item in layout.containers],

@@ -9,7 +9,7 @@ from pathlib import Path
 from gym_deltaco import EPISODE_STEPS
 from gym_deltaco.instructions import choose_instructions
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity
-from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, check_scenes, default_objects
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, AdversarialDraw, check_scenes, default_objects
 from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.common.checks import check_choices
 from lerobot_deltaco.common.env_ranges import ENV_RANGES
@@ -35,6 +35,8 @@ class EvaluationPlan:
         objects: Objects that scenes are made of, as `--env.objects` takes them; None is the task set's own.
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1.
+        adversarial_draw: Scope of a draw with that probability: "each", one distractor; or "scene", both
+            distractors of a scene, as in the authors' code.
         instructions: CSV file with sentences for the tasks, as `deltaco-instructions` downloads or checks it;
             the trials of a task use its sentences in turn. By default, the benchmark's templates.
         instructions_split: Split of that file: "all"; "held_out", the last sentence of each task; or "train",
@@ -54,6 +56,7 @@ class EvaluationPlan:
     episode_length: int = EPISODE_STEPS
     objects: str | None = None
     adversarial_probability: float = ADVERSARIAL_PROBABILITY
+    adversarial_draw: AdversarialDraw = "each"
     instructions: str | None = None
     instructions_split: str = "all"
     instruction: str | None = None
@@ -67,7 +70,7 @@ class EvaluationPlan:
         check_ranges(self, {"trials": (1, 1_000_000), "seed": (0, 2**63 - 1), **ranges})
         objects = default_objects(self.tasks) if self.objects is None else self.objects
         object.__setattr__(self, "objects", objects)
-        check_scenes(task_ids, objects, self.adversarial_probability)
+        check_scenes(task_ids, objects, self.adversarial_probability, self.adversarial_draw)
         check_choices(self, counterfactual=COUNTERFACTUALS, ambiguity=AMBIGUITIES)
         if self.sentences is not None and self.counterfactual == "instruction":
             raise ValueError(

@@ -9,11 +9,12 @@ from __future__ import annotations
 import json
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 from gym_deltaco import EPISODE_STEPS
 from gym_deltaco.atomic_files import write_json
-from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, N_INDICES
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, N_INDICES, AdversarialDraw
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.common.typed_fields import in_words, is_a, type_hints
 
@@ -28,6 +29,8 @@ COUNTERFACTUALS: tuple[Counterfactual, ...] = get_args(Counterfactual)
 BENCHMARK = "benchmark"
 # The `wording` of an evaluation with the benchmark's own instructions.
 TEMPLATES = "templates"
+# Fields that the first records of format 2 do not have, and what was so in all of them.
+_ADDED_TO_FORMAT_2 = MappingProxyType({"wording": TEMPLATES, "adversarial_draw": "each"})
 
 
 class RecordError(ValueError):
@@ -103,6 +106,8 @@ class EvaluationRecord:
         objects: Name of the set of objects that the scenes are made of.
         adversarial_probability: Probability that a distractor is drawn from the objects that share the
             target's color or shape, 0..1.
+        adversarial_draw: Scope of a draw with that probability: "each", one distractor; or "scene", both
+            distractors of a scene, as in the authors' code.
         wording: In whose words the instructions were: "templates", the benchmark's own; a file of sentences
             with its split and SHA-256; or the one sentence that all tasks had.
     """
@@ -125,6 +130,7 @@ class EvaluationRecord:
     episode_length: int = EPISODE_STEPS
     objects: str = "all"
     adversarial_probability: float = ADVERSARIAL_PROBABILITY
+    adversarial_draw: AdversarialDraw = "each"
     wording: str = TEMPLATES
 
     @property
@@ -168,7 +174,7 @@ def read_record(path: Path) -> EvaluationRecord:
         )
     del content["format"]
     is_older = found < RECORD_FORMAT
-    content.setdefault("wording", TEMPLATES)  # which the first records of format 2 do not have
+    content = {**_ADDED_TO_FORMAT_2, **content}
     content = _check_fields(path, content, EvaluationRecord, but="episodes", is_older=is_older)
     if BENCHMARK not in content["versions"]:
         raise RecordError(f"{path} does not say of which version of the benchmark it is (`versions`).")

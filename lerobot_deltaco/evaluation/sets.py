@@ -68,6 +68,7 @@ def run_set(
         ambiguity=plan.ambiguity,
         objects=plan.objects or default_objects(plan.tasks),
         adversarial_probability=plan.adversarial_probability,
+        adversarial_draw=plan.adversarial_draw,
         tasks=plan.tasks,
         trials=plan.trials,
         episodes=[outcome.result for outcome in outcomes],

@@ -203,7 +203,7 @@ class ExperimentRun:
                 "env.ambiguity": self.config.evaluation.get("ambiguity", "container"),
                 **{
                     f"env.{name}": self.config.evaluation[name]
-                    for name in ("objects", "adversarial_probability")
+                    for name in ("objects", "adversarial_probability", "adversarial_draw")
                     if name in self.config.evaluation
                 },
                 "eval.n_episodes": self.config.evaluation["trials"],

@@ -88,11 +88,13 @@ def _introduction(report: Report) -> str:
 
 def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
     example = group[0].sets[0]
+    is_drawn_once = example.record.adversarial_draw == "scene"
     header = (
         f"{len(example.task_ids)} tasks (`{example.record.tasks}`), {example.record.trials} trials of each "
         f"in an evaluation set; evaluation seed {example.record.evaluation_seed}; ambiguity scheme "
         f"`{example.record.ambiguity}`; scenes of the objects `{example.record.objects}`, with adversarial "
-        f"distractors at a probability of {example.record.adversarial_probability:g}.{_architecture(group)}"
+        f"distractors at a probability of {example.record.adversarial_probability:g}"
+        f"{', decided by one draw for both of a scene' if is_drawn_once else ''}.{_architecture(group)}"
     )
     rates = markdown_table(
         [

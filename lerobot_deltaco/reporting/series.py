@@ -264,6 +264,7 @@ def check_same_scenes(records: str, group: Sequence[Series]) -> None:
         group,
         lambda item: item.record.adversarial_probability,
     )
+    _check_same("draw of adversarial distractors", records, group, lambda item: item.record.adversarial_draw)
 
 
 def _check_same(

@@ -255,6 +255,7 @@ class InMemoryTraining:
                 episode_length=config.env.episode_length,
                 objects=config.env.objects,
                 adversarial_probability=config.env.adversarial_probability,
+                adversarial_draw=config.env.adversarial_draw,
                 instructions=config.env.instructions,
                 instructions_split=config.env.instructions_split,
                 instruction=config.env.instruction,
