@@ -68,3 +68,16 @@ def test_an_error_that_a_user_can_act_on_is_one_line(error, status, message, cap
 def test_a_bug_shows_its_traceback():
     with pytest.raises(TypeError), exit_on_error(argparse.ArgumentParser("deltaco"), ValueError):
         raise TypeError
+
+
+def test_a_system_without_file_locks_is_told_so(tmp_path):
+    code = (
+        "import sys; sys.modules['fcntl'] = None\n"
+        "from lerobot_deltaco.commands.collect import main\n"
+        "main(['--tasks', '4', '--episodes-per-task', '1', '--root', 'new'])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 1
+    assert result.stderr.startswith("deltaco-collect: Collecting datasets needs file locks of POSIX systems")
+    assert len(result.stderr.splitlines()) == 1
+    assert not (tmp_path / "new").exists()

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from gym_deltaco.errors import SimulatorMissingError
+from lerobot_deltaco.common.errors import UnsupportedSystemError
 
 
 @contextmanager
@@ -22,7 +23,7 @@ def exit_on_error(
         errors: Errors whose messages a user can act on. Others are bugs, and show a traceback.
         interrupted: Message after an interrupt.
     """
-    actionable: tuple[type[Exception], ...] = (SimulatorMissingError, *errors)
+    actionable: tuple[type[Exception], ...] = (SimulatorMissingError, UnsupportedSystemError, *errors)
     try:
         yield
     except actionable as error:

@@ -10,7 +10,6 @@ All files of that folder are written with their checksums, and read only if they
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -28,6 +27,7 @@ from typing import Any
 from gym_deltaco import ENV_ID
 from gym_deltaco.atomic_files import json_text, write_json
 from gym_deltaco.tasks import get_task
+from lerobot_deltaco.common import file_locks
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import (
     EPISODE_LENGTH,
@@ -316,14 +316,14 @@ def locked(staging: Path) -> Iterator[None]:
     staging.mkdir(exist_ok=True)
     with (staging / LOCK).open("w") as lock, (staging / WORKERS_LOCK).open("w") as workers_lock:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            file_locks.lock(lock, wait=False)
         except BlockingIOError:
             raise CollectionError(
                 f"Another process is collecting into {staging.parent}. Wait for it, or end it."
             ) from None
         # If a former main process was killed, its workers end by themselves, but may need a moment.
-        fcntl.flock(workers_lock, fcntl.LOCK_EX)
-        fcntl.flock(workers_lock, fcntl.LOCK_UN)
+        file_locks.lock(workers_lock)
+        file_locks.unlock(workers_lock)
         yield
 
 

@@ -6,7 +6,6 @@ worker joins them.
 
 from __future__ import annotations
 
-import fcntl
 import io
 import json
 import multiprocessing
@@ -27,6 +26,7 @@ from tqdm import tqdm
 
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.tasks import get_task
+from lerobot_deltaco.common import file_locks
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import (
     EPISODE_LENGTH,
@@ -213,7 +213,7 @@ def _end_with_main_process(lock_file: Path) -> None:
     main = multiprocessing.parent_process()
     assert main is not None
     lock = os.open(lock_file, os.O_RDWR)  # closed when the process ends
-    fcntl.flock(lock, fcntl.LOCK_SH)
+    file_locks.lock(lock, shared=True)
 
     def watch() -> None:
         main.join()

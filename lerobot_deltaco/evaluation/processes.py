@@ -12,6 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 
 from tqdm import tqdm
 
+from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.evaluation.evaluate import EpisodeOutcome, Evaluation
 from lerobot_deltaco.lerobot_internals import without_rollout_progress
 
@@ -30,7 +31,7 @@ def default_processes(device: str) -> int:
     n_threads = os.environ.get("OMP_NUM_THREADS", "")
     if n_threads.isdecimal() and int(n_threads) > 0:
         return int(n_threads)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return available_cores()
 
 
 def check_processes(processes: int, device: str) -> None:

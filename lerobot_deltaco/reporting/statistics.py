@@ -1,4 +1,4 @@
-"""The statistics of evaluations: the paper's success rate, intervals, breakdowns and what behaviour followed.
+"""The statistics of evaluations: the paper's success rate, intervals, breakdowns and what behavior followed.
 
 Rates are shares, 0..1. Nothing here reads or writes a file.
 """
@@ -169,7 +169,7 @@ CUES: tuple[Cue, ...] = ("scene", "demonstration", "instruction")
 
 
 class Followed(NamedTuple):
-    """How often behaviour was what a cue asks for.
+    """How often behavior was what a cue asks for.
 
     Attributes:
         aspect: "object": the one that the gripper held last. "container": the only one in which something
@@ -187,7 +187,7 @@ class Followed(NamedTuple):
 
 
 def followed(episodes: Sequence[EpisodeResult], counterfactual: Counterfactual) -> list[Followed]:
-    """What behaviour followed when demonstration and instruction are of different tasks.
+    """What behavior followed when demonstration and instruction are of different tasks.
 
     A task asks for those objects of the scene that it describes, whatever the scene is for, and for those
     containers that its word describes. Two tasks may agree in one of the two; and what a task asks for may
