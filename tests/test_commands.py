@@ -11,7 +11,11 @@ import pytest
 from gym_deltaco.errors import SimulatorMissingError
 from lerobot_deltaco.commands.command_errors import exit_on_error
 
-MAX_HELP_SECONDS = 1.5  # of the processor
+# Packages that take a second or more to import; `benchmarks/minute.py` measures how long each command takes.
+SLOW_PACKAGES = {
+    *("av", "datasets", "lerobot", "matplotlib", "pandas", "pyarrow", "pybullet", "scipy"),
+    *("sentence_transformers", "sklearn", "torch", "torchvision", "transformers"),
+}
 # `deltaco-train --help` is LeRobot's, which takes 10 s.
 COMMANDS = sorted(
     (script.name, script.value.partition(":")[0])
@@ -19,22 +23,20 @@ COMMANDS = sorted(
     if script.group == "console_scripts" and script.name != "deltaco-train"
 )
 HELP = """
-import resource, runpy, sys
+import runpy, sys
 sys.argv = [{name!r}, "--help"]
 try:
     runpy.run_module({module!r}, run_name="__main__")
 except SystemExit:
     pass
-usage = resource.getrusage(resource.RUSAGE_SELF)
-print("SECONDS", usage.ru_utime + usage.ru_stime)
-print("SLOW", *sorted({{"torch", "lerobot", "pybullet", "sentence_transformers"}} & set(sys.modules)))
+print("SLOW", *sorted({packages} & set(sys.modules)))
 """
 
 
 @pytest.mark.parametrize(("name", "module"), COMMANDS, ids=[name for name, _ in COMMANDS])
 def test_help_is_quick_and_complete(name, module):
     result = subprocess.run(
-        [sys.executable, "-c", HELP.format(name=name, module=module)],
+        [sys.executable, "-c", HELP.format(name=name, module=module, packages=SLOW_PACKAGES)],
         capture_output=True,
         text=True,
         check=True,
@@ -42,9 +44,8 @@ def test_help_is_quick_and_complete(name, module):
     assert f"usage: {name}" in result.stdout
     assert result.stderr == ""
     assert re.search(r"^SLOW$", result.stdout, re.MULTILINE)
-    assert float(re.search(r"^SECONDS (.+)$", result.stdout, re.MULTILINE)[1]) < MAX_HELP_SECONDS
     # Every argument is explained.
-    options = result.stdout.partition("options:")[2].partition("SECONDS")[0]
+    options = result.stdout.partition("options:")[2].partition("SLOW")[0]
     for paragraph in re.split(r"\n(?=  -)", options)[1:]:
         assert re.search(r"\S  +\S|\n {10,}\S", paragraph.strip()), paragraph
 

@@ -14,7 +14,6 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from gym_deltaco.atomic_files import write_json
 from lerobot_deltaco.common.run_folder import last_policy, last_step, last_train_config
-from lerobot_deltaco.data.finished_dataset import is_finished
 from lerobot_deltaco.evaluation.record import RECORDS_FOLDER, read_record, record_path
 from lerobot_deltaco.experiments.command_runner import CommandRunner, ExperimentError
 from lerobot_deltaco.experiments.config import BEST_SEED, SAME_SEED, ExperimentConfig
@@ -114,6 +113,9 @@ class ExperimentRun:
         Raises:
             ExperimentError: One is missing, or its collection is not finished.
         """
+        # Only here, since it takes seconds to import.
+        from lerobot_deltaco.data.finished_dataset import is_finished
+
         plans = (self.config.data, self.config.demonstrations)
         for root in dict.fromkeys(dataset_folder(self.outputs, plan) for plan in plans):
             if not is_finished(root):
