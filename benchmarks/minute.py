@@ -136,9 +136,8 @@ def _measure_recipe(out: Path, encoder: str) -> list[Line]:
     }
     arguments = [f"--{name}={value}" for name, value in settings.items()]
     times = out / "times.json"
-    # This notes the times of each step.
-    script = str(Path(__file__).with_name("processes.py"))
-    clock, processor, _ = _run(script, f"--times={times}", *arguments, OMP_NUM_THREADS="1")
+    script = str(Path(__file__).with_name("step_times.py"))
+    clock, processor, _ = _run(script, str(times), *arguments, OMP_NUM_THREADS="1")
     ends = json.loads(times.read_text())[WARM_UP - 1 :]
     step, step_cpu = (
         statistics.median(later[which] - earlier[which] for earlier, later in itertools.pairwise(ends))

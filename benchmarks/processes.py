@@ -16,10 +16,8 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.common.cores import available_cores
@@ -30,6 +28,8 @@ from lerobot_deltaco.data.collection_plan import CollectionPlan
 PLAN = CollectionPlan("0-15", episodes_per_task=4)
 ENCODERS = ("attention", "correspondence")
 LANGUAGE_ENCODER = "all-MiniLM-L6-v2"
+# The training of which the steps are timed.
+STEP_TIMES = Path(__file__).with_name("step_times.py")
 # Steps before those that are measured: they warm up.
 WARM_UP = 5
 
@@ -50,13 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=2, help="runs of each kind (%(default)s)")
     parser.add_argument("--encoders", nargs="+", choices=("cnn", *ENCODERS), default=list(ENCODERS))
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to this file")
-    parser.add_argument("--times", type=Path, help=argparse.SUPPRESS)  # in the processes that train
-    options, rest = parser.parse_known_args(arguments)
-    if options.times:
-        _train(options.times, rest)
-        return
-    if rest:
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    options = parser.parse_args(arguments)
     if options.processes < 2 or options.batch_size % 16 or min(options.steps, options.rounds) < 1:
         parser.error("--processes must be at least 2, --batch-size a multiple of 16, the others at least 1.")
 
@@ -133,7 +127,7 @@ def _measure(
     }
     launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={n_processes}"]
     times = output.with_suffix(".json")
-    command = [sys.executable, *launcher, __file__, "--times", str(times)]
+    command = [sys.executable, *launcher, str(STEP_TIMES), str(times)]
     settings = {"OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo", "HF_HUB_OFFLINE": "1"}
     result = subprocess.run(
         [*command, *(f"--{name}={value}" for name, value in arguments.items())],
@@ -149,27 +143,6 @@ def _measure(
         for which in (0, 1)
     )
     return Rate(n_processes * options.batch_size / clock, options.batch_size / processor)
-
-
-def _train(times: Path, arguments: list[str]) -> None:
-    """Trains as one of the processes. The first writes when each step ended, and its processor seconds."""
-    from lerobot.scripts import lerobot_train
-
-    from lerobot_deltaco.training.loop import InMemoryTraining
-
-    update = lerobot_train.update_policy
-    ends: list[tuple[float, float]] = []
-
-    def noted(*positional: Any, **named: Any) -> Any:
-        result = update(*positional, **named)
-        ends.append((time.perf_counter(), time.process_time()))
-        return result
-
-    sys.argv = ["deltaco-train", *arguments]
-    with patch.object(lerobot_train, "update_policy", noted), InMemoryTraining().active():
-        lerobot_train.main()
-    if os.environ.get("RANK", "0") == "0":
-        times.write_text(json.dumps(ends))
 
 
 if __name__ == "__main__":
