@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
-from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.scripts import lerobot_train
 from PIL import Image
 from safetensors.torch import load_file
@@ -34,16 +33,24 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture
-def train(dataset, tmp_path, monkeypatch):
+def train(train_any):
+    """Runs a training of our policy in this process, and returns the folder of its checkpoints."""
+    ours = ["--policy.type=deltaco", "--policy.image_size=16", "--policy.backbone=strided"]
+
+    def train(*arguments, **options):
+        return train_any(*ours, *arguments, **options)
+
+    return train
+
+
+@pytest.fixture
+def train_any(dataset, tmp_path, monkeypatch):
     """Runs a training in this process, and returns the folder of its checkpoints."""
 
-    def train(*arguments, name="run", in_memory=True):
+    def train_any(*arguments, name="run", in_memory=True):
         folder = tmp_path / name
         defaults = {
-            "policy.type": "deltaco",
             "policy.device": "cpu",
-            "policy.image_size": "16",
-            "policy.backbone": "strided",
             "dataset.repo_id": REPO_ID,
             "dataset.root": str(dataset.root),
             "batch_size": "6",
@@ -54,7 +61,10 @@ def train(dataset, tmp_path, monkeypatch):
             "output_dir": str(folder),
         }
         given = dict(argument.removeprefix("--").split("=", 1) for argument in arguments)
-        options = given if "resume" in given else {**defaults, **given}
+        if "resume" in given:
+            options = {name: value for name, value in given.items() if not name.startswith("policy.")}
+        else:
+            options = {**defaults, **given}
         monkeypatch.setattr(sys, "argv", ["train", *(f"--{key}={value}" for key, value in options.items())])
         if in_memory:
             with InMemoryTraining().active():
@@ -63,7 +73,7 @@ def train(dataset, tmp_path, monkeypatch):
             lerobot_train.main()
         return folder / "checkpoints"
 
-    return train
+    return train_any
 
 
 def weights(checkpoint):
@@ -212,10 +222,38 @@ def test_what_cannot_be_is_refused_before_training(train, options, message):
         train(*options)
 
 
-def test_other_policies_are_sent_to_lerobots_command():
-    config = SimpleNamespace(policy=ACTConfig(push_to_hub=False))
-    with pytest.raises(ValueError, match="--policy.type=deltaco alone. Use `lerobot-train`"):
-        InMemoryTraining().make_datasets(config)
+ACT = ["--policy.type=act", "--policy.dim_model=16", "--policy.n_heads=2", "--policy.dim_feedforward=16"]
+ACT += ["--policy.n_encoder_layers=1", "--policy.n_vae_encoder_layers=1", "--policy.chunk_size=5"]
+ACT += ["--policy.n_action_steps=5", "--policy.pretrained_backbone_weights=null"]
+ACT += ["--policy.push_to_hub=false"]
+
+
+def test_any_policy_trains_as_with_lerobots_own_loop(train_any):
+    stock = train_any(*ACT, name="stock", in_memory=False)
+    memory = train_any(*ACT, name="memory")
+    assert_same(weights(stock / "000004"), weights(memory / "000004"))
+
+
+def test_windows_of_frames_equal_those_that_lerobot_reads(dataset):
+    camera = "observation.images.wrist"
+    seconds = {"action": [0.0, 0.1, 0.2, 0.5], "observation.state": [-0.1, 0.0], camera: [-0.2, 0.0]}
+    chosen = LeRobotDataset(
+        REPO_ID, root=dataset.root, episodes=[1, 4], delta_timestamps=seconds, return_uint8=True
+    )
+    places = list(range(len(chosen)))
+    expected = batch_of(chosen, places)
+    found = FramesInMemory(chosen).batch(torch.tensor(places))
+    assert found.keys() == expected.keys()
+    assert expected["action_is_pad"].any()
+    for name in ("action", "action_is_pad", "observation.state", f"{camera}_is_pad"):
+        assert torch.equal(found[name], expected[name]), name
+    assert found[camera].shape[:2] == (len(places), 2)
+    assert torch.equal(found[camera].to(torch.float32) / 255, expected[camera])
+
+
+def test_reward_models_are_sent_to_lerobots_command():
+    with pytest.raises(ValueError, match="Use `lerobot-train` for reward models"):
+        InMemoryTraining().make_datasets(SimpleNamespace(policy=None))
 
 
 def test_too_many_frames_are_refused_before_they_are_read(dataset, monkeypatch):

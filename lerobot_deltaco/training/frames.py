@@ -13,6 +13,7 @@ import psutil
 import pyarrow as pa
 import torch
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.feature_utils import get_delta_indices
 from lerobot.utils.constants import ACTION, OBS_STATE
 from numpy.typing import NDArray
 from PIL import Image
@@ -42,6 +43,8 @@ class FramesInMemory:
         dataset: The dataset; its `episodes` are those that are held.
         device: Device of the batches, and of the frames if they fit.
         image_size: Height and width to which images are scaled, None for their own.
+
+    A batch has the windows of frames that the dataset's `delta_timestamps` ask for, as LeRobot's has.
 
     Raises:
         MemoryError: The frames do not fit into the memory of this machine.
@@ -78,6 +81,13 @@ class FramesInMemory:
         numbers, first = np.unique(episodes, return_index=True)
         last = len(episodes) - 1 - np.unique(episodes[::-1], return_index=True)[1]
         self.spans = {int(n): (int(a), int(b)) for n, a, b in zip(numbers, first, last, strict=True)}
+        self._first, self._last = (
+            torch.from_numpy(rows[np.searchsorted(numbers, episodes)]).to(self.held_on)
+            for rows in (first, last)
+        )
+        # Of each feature of which a sample has a window of frames: their distances from the sample's frame.
+        deltas = get_delta_indices(dataset.delta_timestamps or {}, dataset.fps)
+        self._windows = {name: torch.tensor(delta, device=self.held_on) for name, delta in deltas.items()}
 
     def __len__(self) -> int:
         return len(self._task_of)
@@ -94,13 +104,20 @@ class FramesInMemory:
             indices: Places of frames in the dataset, (batch,) int64.
 
         Returns:
-            Every feature, (batch, ...), on the device; "task" and other texts as lists.
+            Every feature, (batch, ...), on the device; "task" and other texts as lists. A feature with a
+            window of frames is (batch, window, ...), where frames beyond the episode repeat its first or
+            last one, and "<feature>_is_pad", (batch, window) bool, says which do.
         """
         places = indices.tolist()
         rows = indices.to(self.held_on)
-        found: dict[str, Any] = {
-            name: values[rows].to(self.device, non_blocking=True) for name, values in self.columns.items()
-        }
+        found: dict[str, Any] = {}
+        for name, values in self.columns.items():
+            chosen = rows
+            if name in self._windows:
+                wanted = rows[:, None] + self._windows[name]  # (batch, window)
+                chosen = wanted.clamp(self._first[rows][:, None], self._last[rows][:, None])
+                found[f"{name}_is_pad"] = (chosen != wanted).to(self.device, non_blocking=True)
+            found[name] = values[chosen].to(self.device, non_blocking=True)
         for name, texts in self.texts.items():
             found[name] = [texts[place] for place in places]
         found["task"] = [self.task_names[self._task_of[place]] for place in places]

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from draccus.utils import ParsingError
 from huggingface_hub import HfApi
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.policies import PreTrainedPolicy
@@ -131,39 +132,47 @@ class InMemoryTraining:
         """LeRobot's datasets, the first of them read into memory.
 
         Raises:
-            ValueError: The policy is another one, or the data cannot be held in memory.
+            ValueError: No policy is trained, or the data cannot be held in memory.
             FileNotFoundError: There is no network, and no dataset in a folder.
             MemoryError: The frames do not fit.
         """
-        if not isinstance(config.policy, DeltacoConfig):
-            raise ValueError(
-                "`deltaco-train` trains --policy.type=deltaco alone. Use `lerobot-train` for others."
-            )
+        policy = config.policy
+        if policy is None:
+            raise ValueError("`deltaco-train` trains policies. Use `lerobot-train` for reward models.")
         if config.dataset.streaming:
             raise ValueError("`deltaco-train` holds all frames in memory: leave out --dataset.streaming.")
         # Both before hours of decoding.
         check_dataset_folder("--dataset.root", config.dataset.root)
-        check_dataset_folder("--policy.demo_root", config.policy.demo_root)
+        if isinstance(policy, DeltacoConfig):
+            check_dataset_folder("--policy.demo_root", policy.demo_root)
         self._config = config
         # The loader has nothing to do: it gives places, and the frames are gathered on the device.
         config.num_workers = 0
         train, evaluation = self._make_datasets(config)
-        # Scaled beforehand where that takes less memory than the images as they are.
-        size = config.policy.image_size
-        shapes = [train.meta.features[camera]["shape"] for camera in train.meta.camera_keys]
-        is_smaller = any(3 * size**2 < np.prod(shape) for shape in shapes)
-        self._frames = FramesInMemory(train, self._device(config.policy), size if is_smaller else None)
+        image_size = None
+        if isinstance(policy, DeltacoConfig):
+            # Scaled beforehand where that takes less memory than the images as they are.
+            shapes = [train.meta.features[camera]["shape"] for camera in train.meta.camera_keys]
+            if any(3 * policy.image_size**2 < np.prod(shape) for shape in shapes):
+                image_size = policy.image_size
+        elif train.meta.depth_keys or train.meta.has_language_columns:
+            raise ValueError(
+                "The dataset has depth images or columns of messages, which only `lerobot-train` prepares "
+                f"for --policy.type={policy.type}."
+            )
+        self._frames = FramesInMemory(train, self._device(policy), image_size)
         return FrameIndexDataset(train), evaluation
 
     def make_policy(self, **arguments: Any) -> PreTrainedPolicy:
-        """LeRobot's policy, which draws its demonstrations from the frames in memory."""
+        """LeRobot's policy; ours draws its demonstrations from the frames in memory."""
         policy = self._make_policy(**arguments)
         config, frames = policy.config, self._frames
         assert self._config is not None
         if isinstance(self._config.env, DeltacoEnv):
             # Now, and not at the first evaluation.
-            check_policy_fits(config, self._config.env)
-        assert isinstance(policy, DeltacoPolicy)
+            check_policy_fits(config, self._config.env, self._config.rename_map)
+        if not isinstance(policy, DeltacoPolicy):
+            return policy
         assert frames is not None
         if (config.uses_demo or config.locates_goals) and config.demo_episodes is None:
             policy.set_train_demonstrations(
@@ -183,7 +192,9 @@ class InMemoryTraining:
             **options,
         )
         assert self._frames is not None
-        config: DeltacoConfig = self._config.policy
+        config = self._config.policy
+        if not isinstance(config, DeltacoConfig):
+            return stock
         if not config.tasks_per_batch:
             if config.frames_after_release is not None:
                 raise ValueError(
@@ -282,10 +293,11 @@ class InMemoryTraining:
     @staticmethod
     def _records(config: TrainPipelineConfig) -> bool:
         # With wandb, LeRobot's own evaluation, since its videos are uploaded there.
-        return isinstance(config.env, DeltacoEnv) and not config.wandb.enable
+        is_ours = isinstance(config.env, DeltacoEnv) and isinstance(config.policy, DeltacoConfig)
+        return is_ours and not config.wandb.enable
 
     @staticmethod
-    def _device(config: DeltacoConfig) -> torch.device:
+    def _device(config: PreTrainedConfig) -> torch.device:
         if config.device == "cpu":
             return torch.device("cpu")
         # The one that accelerate gives to this process.

@@ -31,7 +31,7 @@ def check_remote_job(config: TrainPipelineConfig, is_on_hub: Callable[[str], boo
     Raises:
         RemoteJobError: It needs something else.
     """
-    policy, target = config.policy, config.job.target
+    target = config.job.target
     if config.job.image == JobConfig().image:
         raise RemoteJobError(
             f"--job.image is LeRobot's own image {config.job.image}, in which lerobot_policy_deltaco is not "
@@ -43,15 +43,14 @@ def check_remote_job(config: TrainPipelineConfig, is_on_hub: Callable[[str], boo
             f"--policy.path={path} is a folder of this machine, which a job on {target} does not see. Push "
             "the policy to the Hub, and give its name."
         )
-    if policy is not None and not isinstance(policy, DeltacoConfig):
-        raise RemoteJobError("`deltaco-train` trains --policy.type=deltaco alone. Use `lerobot-train`.")
-    if policy is not None and policy.demo_root is not None:
+    ours = config.policy if isinstance(config.policy, DeltacoConfig) else None
+    if ours is not None and ours.demo_root is not None:
         raise RemoteJobError(
-            f"--policy.demo_root={policy.demo_root} is a folder of this machine, which a job on {target} "
-            f"does not see. Push the demonstrations (deltaco-push --root {policy.demo_root} --repo-id "
+            f"--policy.demo_root={ours.demo_root} is a folder of this machine, which a job on {target} "
+            f"does not see. Push the demonstrations (deltaco-push --root {ours.demo_root} --repo-id "
             "USER/NAME), and give --policy.demo_repo_id=USER/NAME alone."
         )
-    files = {} if policy is None else {f"policy.{name}": getattr(policy, name) for name in PATHS}
+    files = {} if ours is None else {f"policy.{name}": getattr(ours, name) for name in PATHS}
     if isinstance(config.env, DeltacoEnv):
         files["env.instructions"] = config.env.instructions
     for option, value in files.items():
@@ -61,8 +60,8 @@ def check_remote_job(config: TrainPipelineConfig, is_on_hub: Callable[[str], boo
                 f"into the image (see {DOCKERFILE}), and give its path there."
             )
     needed = {"dataset": (config.dataset.repo_id, config.dataset.root)}
-    if policy is not None and policy.demo_repo_id is not None:
-        needed["policy.demo"] = (policy.demo_repo_id, None)
+    if ours is not None and ours.demo_repo_id is not None:
+        needed["policy.demo"] = (ours.demo_repo_id, None)
     for option, (repo_id, root) in needed.items():
         # LeRobot itself pushes a dataset that is in its cache, but not one from another folder.
         if (option != "dataset" or root is not None) and not is_on_hub(repo_id):
