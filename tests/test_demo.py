@@ -57,6 +57,22 @@ def test_a_failed_step_is_named_and_done_again(demo, tmp_path):
     assert demo.seconds()["greet"] > first["greet_so_far"]
 
 
+def test_steps_that_run_together_are_done_once_and_each_has_a_log(demo, tmp_path):
+    flag, log = tmp_path / "flag", tmp_path / "log"
+    greet = [sys.executable, "-c", f"print('hello'); open({str(log)!r}, 'a').write('x')"]
+    fail = [sys.executable, "-c", f"import os, sys; sys.exit(0 if os.path.exists({str(flag)!r}) else 3)"]
+    commands = {"greet": greet, "fail": fail}
+    with pytest.raises(DemoError, match="(?s)fail failed .exit status 3.*logs/fail.txt.*continues from here"):
+        demo._do_together("both", "Both", commands)
+    assert "both" not in demo.seconds()
+    flag.touch()
+    for again in (demo, Demo(demo.folder)):
+        again._do_together("both", "Both", commands)
+    assert demo.seconds()["both"] > demo.seconds()["greet"]
+    assert log.read_text() == "x"
+    assert (demo.folder / "logs" / "greet.txt").read_text() == "hello\n"
+
+
 def test_a_demo_with_other_settings_is_not_mixed_with_this_one(demo):
     with pytest.raises(DemoError, match="other settings. Move that folder away"):
         Demo(demo.folder, {"steps": 1})
@@ -127,7 +143,7 @@ def test_the_whole_demo_at_a_tiny_size(tmp_path):
         "counterfactual_trials": 1,
     }
     demo = Demo(tmp_path / "demo", settings)
-    for step in (demo.collect, demo.train, demo.evaluate, demo.evaluate_counterfactuals):
+    for step in (demo.collect, demo.train, demo.evaluate):
         step()
     page = write_page(demo)
     summary = json.loads((demo.folder / "summary.json").read_text())
@@ -146,6 +162,6 @@ def test_the_whole_demo_at_a_tiny_size(tmp_path):
             assert Image.open(demo.folder / name).width > 600
     # Everything is done: nothing runs again.
     before = demo.seconds()
-    for step in (demo.collect, demo.train, demo.evaluate, demo.evaluate_counterfactuals):
+    for step in (demo.collect, demo.train, demo.evaluate):
         step()
     assert demo.seconds() == before

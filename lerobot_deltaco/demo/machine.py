@@ -9,18 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import make_policy, make_pre_post_processors
-from torch.utils.data import DataLoader
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.networks import FilmResNet
 from lerobot_deltaco.policy.options import BACKBONES
+from lerobot_deltaco.training.frames import FramesInMemory
 
 # bfloat16 is chosen only if it is clearly faster.
 _MIN_GAIN = 1.15
 _BATCH_SIZE, _N_STEPS = 48, 5
-_N_TRIED_STEPS = 40
+_N_TRIED_STEPS, _N_EPISODES = 40, 100
 
 
 def fast_dtype() -> str:
@@ -45,7 +46,7 @@ def _seconds(dtype: torch.dtype) -> float:
 
 
 def seconds_per_step(repo_id: str, root: Path, policy: Mapping[str, Any], batch_size: int) -> float:
-    """Seconds of a step of `lerobot-train`, from reading the batch to the optimizer, measured on a few.
+    """Seconds of a step of `deltaco-train`, from gathering the batch to the optimizer, measured on a few.
 
     Args:
         repo_id: Repository id of the training dataset.
@@ -53,17 +54,28 @@ def seconds_per_step(repo_id: str, root: Path, policy: Mapping[str, Any], batch_
         policy: Options of the policy.
         batch_size: Batch size of the training.
     """
-    dataset = LeRobotDataset(repo_id, root=root)
+    n_episodes = LeRobotDatasetMetadata(repo_id, root=root).total_episodes
+    # A part of it, since all images are decoded.
+    episodes = list(range(0, n_episodes, max(1, n_episodes // _N_EPISODES)))
+    dataset = LeRobotDataset(repo_id, root=root, episodes=episodes, return_uint8=True)
+    frames = FramesInMemory(dataset)
     config = DeltacoConfig(**{name: value for name, value in policy.items() if name != "type"})
     network = make_policy(config, ds_meta=dataset.meta)
+    assert isinstance(network, DeltacoPolicy)
+    if config.uses_demo:
+        network.set_train_demonstrations(
+            frames.demonstrations(config.cameras[0], config.image_size, config.n_demo_frames), None
+        )
     network.train()
     preprocessor, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
     optimizer = config.get_optimizer_preset().build(network.get_optim_params())
-    batches = iter(DataLoader(dataset, batch_size, shuffle=True))
     times = []
-    for _ in range(min(_N_TRIED_STEPS, len(dataset) // batch_size)):
+    for places in torch.randperm(len(frames)).split(batch_size)[:_N_TRIED_STEPS]:
         start = time.perf_counter()
-        batch = preprocessor(next(batches))
+        batch = frames.batch(places)
+        # As LeRobot's loop does.
+        batch |= {camera: batch[camera].to(torch.float32) / 255 for camera in dataset.meta.camera_keys}
+        batch = preprocessor(batch)
         with torch.autocast("cpu", torch.bfloat16, enabled=config.dtype == "bfloat16"):
             loss, _ = network(batch)
         loss.backward()
@@ -71,5 +83,5 @@ def seconds_per_step(repo_id: str, root: Path, policy: Mapping[str, Any], batch_
         optimizer.step()
         optimizer.zero_grad()
         times.append(time.perf_counter() - start)
-    # The first also read the demonstrations.
+    # The first also makes what later ones use again.
     return statistics.mean(times[1:])

@@ -33,10 +33,7 @@ STEP_NAMES = {
     "demonstrate": "collecting the demonstrations",
     "measure": "measuring this machine's speed",
     "train": "training",
-    "evaluate_trained": "evaluation in new scenes",
-    "evaluate_new": "evaluation on new combinations",
-    "other_demo": "another task's demonstration",
-    "other_instruction": "another task's instruction",
+    "evaluate": "evaluation in new scenes, on new combinations, and with another task's inputs",
 }
 
 

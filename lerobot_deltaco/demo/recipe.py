@@ -15,14 +15,14 @@ TRAINED_TASKS = tuple(
 )
 ALL_TASKS = (*TRAINED_TASKS, *NEW_COMBINATIONS)
 
-EPISODES_PER_TASK = 200
+EPISODES_PER_TASK = 150
 # A demonstration of each task, new combinations included, for the evaluation.
 DEMONSTRATIONS_PER_TASK = 1
 # The expert is done after 10 of 30 steps in the median, and then holds still over what it has placed, which
 # looks as if it were about to grasp it. A policy that learned much of that hovers.
 DROPPED_FRAMES = 19
 # As many steps as the machine does in this time, within bounds. A short measurement may be 40 % too good.
-TRAINING_SECONDS = 420
+TRAINING_SECONDS = 210
 LEAST_STEPS, MOST_STEPS = 2000, 12000
 SAVE_EVERY = 400
 BATCH_SIZE = 48

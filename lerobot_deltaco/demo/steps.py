@@ -9,11 +9,16 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from gym_deltaco.atomic_files import write_json
+from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.common.run_folder import last_policy, last_train_config
 from lerobot_deltaco.demo import recipe
 from lerobot_deltaco.demo.machine import fast_dtype, seconds_per_step
@@ -118,7 +123,7 @@ class Demo:
         )
 
     def train(self) -> None:
-        """Trains with `lerobot-train`, from the last checkpoint if there is one."""
+        """Trains with `deltaco-train`, from the last checkpoint if there is one."""
         if self.settings["steps"] is None:
             self.settings["steps"] = self._affordable_steps()
             self._write_settings()
@@ -140,12 +145,11 @@ class Demo:
                 "steps": steps,
                 "save_freq": min(self.settings["save_every"], steps),
                 "log_freq": 100,
-                "num_workers": 0,
                 "job_name": "demo",
                 "output_dir": self.run,
             }
             arguments = [f"--{name}={value}" for name, value in options.items()]
-        self._do("train", f"Training for {steps} steps", self._lerobot("train", arguments))
+        self._do("train", f"Training for {steps} steps", self._deltaco("train", *arguments))
 
     def _affordable_steps(self) -> int:
         """Number of training steps that this machine manages in the time for them."""
@@ -160,7 +164,11 @@ class Demo:
         return int(min(max(steps, recipe.LEAST_STEPS), recipe.MOST_STEPS))
 
     def evaluate(self) -> None:
-        """Evaluates with `lerobot-eval`, on new scenes of trained tasks and of new combinations."""
+        """Evaluates on new scenes of trained tasks, on new combinations, and with counterfactual inputs.
+
+        As many run at a time as there are cores, since most of their time is the start of LeRobot.
+        """
+        evaluations = {}
         for name, tasks in (("trained", "tasks"), ("new", "new_combinations")):
             trials = self.settings["trials"][name]
             options = {
@@ -174,20 +182,22 @@ class Demo:
                 "output_dir": self.folder / "evaluation" / name,
             }
             arguments = [f"--{key}={value}" for key, value in options.items()]
-            text = {"trained": "in new scenes", "new": "on combinations that it was not trained on"}[name]
-            self._do(f"evaluate_{name}", f"Evaluating {text}", self._lerobot("eval", arguments))
-
-    def evaluate_counterfactuals(self) -> None:
-        """Evaluates with another task's demonstration, and with another task's instruction."""
+            evaluations[f"evaluate_{name}"] = self._lerobot("eval", arguments)
         everything = recipe.selection((*self.settings["tasks"], *self.settings["new_combinations"]))
+        trials = str(self.settings["counterfactual_trials"])
         for what in ("demo", "instruction"):
-            arguments = ("--tasks", everything, "--steps", "last", "--counterfactual", what)
-            trials = ("--trials", str(self.settings["counterfactual_trials"]))
-            self._do(
-                f"other_{what}",
-                f"Giving it another task's {what}",
-                self._deltaco("evaluate", self.run, *arguments, *trials),
-            )
+            arguments = [
+                "--tasks",
+                everything,
+                "--steps",
+                "last",
+                "--counterfactual",
+                what,
+                "--trials",
+                trials,
+            ]
+            evaluations[f"other_{what}"] = self._deltaco("evaluate", self.run, *arguments)
+        self._do_together("evaluate", "Evaluating", evaluations)
 
     def _do(self, name: str, what: str, command: Sequence[Any]) -> None:
         """Runs a command, unless it was run to its end before."""
@@ -198,18 +208,54 @@ class Demo:
         words = [str(word) for word in command]
         sys.stdout.write(f"\n[demo] {what}:\n{shlex.join(['python', *words[1:]])}\n")
         sys.stdout.flush()
+        with self._timed(name):
+            code = subprocess.run(words, check=False, env=_OFFLINE).returncode
+            if code != 0:
+                raise DemoError(_failure(what, code, words, "above"))
+
+    def _do_together(self, name: str, what: str, commands: Mapping[str, Sequence[Any]]) -> None:
+        """Runs commands, as many at a time as there are cores, unless they were run to their ends before.
+
+        The output of each goes to a file of its own.
+        """
+        seconds = self.seconds()
+        if name in seconds:
+            sys.stdout.write(f"[demo] {what}: done before.\n")
+            return
+        left = {part: list(map(str, command)) for part, command in commands.items() if part not in seconds}
+        n_workers = min(available_cores(), len(left))
+        logs = self.folder / "logs"
+        logs.mkdir(exist_ok=True)
+        sys.stdout.write(f"\n[demo] {what}, {n_workers} at a time; their output is in {logs}:\n")
+        sys.stdout.writelines(f"{shlex.join(['python', *words[1:]])}\n" for words in left.values())
+        sys.stdout.flush()
+        environment = {**_OFFLINE, "OMP_NUM_THREADS": str(max(1, available_cores() // n_workers))}
+
+        def run(part: str) -> tuple[str, int]:
+            with (logs / f"{part}.txt").open("w") as log:
+                words = left[part]
+                result = subprocess.run(words, check=False, env=environment, stdout=log, stderr=log)
+            return part, result.returncode
+
+        with self._timed(name), ThreadPoolExecutor(n_workers) as threads:
+            runs = [threads.submit(run, part) for part in left]
+            for finished in tqdm(as_completed(runs), what, total=len(runs), unit="evaluation"):
+                part, code = finished.result()
+                if code != 0:
+                    for waiting in runs:
+                        waiting.cancel()
+                    raise DemoError(_failure(part, code, left[part], str(logs / f"{part}.txt")))
+                self._note(part, 0.0)
+
+    @contextmanager
+    def _timed(self, name: str) -> Iterator[None]:
+        """Notes a step as finished, with its seconds, those of interrupted attempts included."""
         start = time.monotonic()
         try:
-            code = subprocess.run(words, check=False, env=_OFFLINE).returncode
+            yield
         finally:
             self._note(f"{name}_so_far", time.monotonic() - start)
-        if code != 0:
-            raise DemoError(
-                f"{what} failed (exit status {code}); see above for why. The command was\n"
-                f"{shlex.join(words)}\nAfter fixing the cause, run the demo again: it continues from here."
-            )
-        so_far = self.seconds().get(f"{name}_so_far", 0.0)
-        self._note(name, so_far)
+        self._note(name, self.seconds()[f"{name}_so_far"])
 
     def _note(self, name: str, seconds: float) -> None:
         everything = self.seconds()
@@ -223,3 +269,10 @@ class Demo:
     @staticmethod
     def _lerobot(command: str, arguments: Sequence[str]) -> list[str]:
         return [sys.executable, "-m", f"lerobot.scripts.lerobot_{command}", *arguments]
+
+
+def _failure(what: str, code: int, words: Sequence[str], where: str) -> str:
+    return (
+        f"{what} failed (exit status {code}); see {where} for why. The command was\n{shlex.join(words)}\n"
+        "After fixing the cause, run the demo again: it continues from here."
+    )
