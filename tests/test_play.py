@@ -634,7 +634,7 @@ def test_only_what_was_learned_is_offered(actions, checkpoints, name, choices, r
     assert re.search(reason, session.uses.reason)
     if name != "either":
         with pytest.raises(PlayError, match="This checkpoint can use both"):
-            actions.choose_use(session, DEMONSTRATION_ALONE, "go")
+            actions.choose_use(session, DEMONSTRATION_ALONE)
 
 
 @pytest.fixture
@@ -645,8 +645,7 @@ def either(actions, checkpoints):
 
 
 def test_without_the_instruction_it_does_not_matter_and_none_is_needed(actions, either):
-    session = actions.choose_use(either, DEMONSTRATION_ALONE, "what I wrote")
-    assert session.sentence == "what I wrote"
+    session = actions.choose_use(either, DEMONSTRATION_ALONE)
     runs = [last(actions.run(session, sentence)).latest for sentence in ("", "put it in the red bin")]
     assert "Instruction: left out\nDemonstration: Put" in runs[0].title
     assert runs[0].title == runs[1].title
@@ -657,7 +656,7 @@ def test_without_the_instruction_it_does_not_matter_and_none_is_needed(actions, 
 
 
 def test_without_the_demonstration_it_does_not_matter_and_none_is_needed(actions, either):
-    session = actions.choose_use(either, INSTRUCTION_ALONE, "go")
+    session = actions.choose_use(either, INSTRUCTION_ALONE)
     others = replace(session, demonstration=None)
     runs = [last(actions.run(each, "go")).latest for each in (session, others)]
     assert "Instruction: go\nDemonstration: left out" in runs[0].title
@@ -674,14 +673,14 @@ def test_a_run_leaves_the_checkpoints_own_option(actions, either, engine):
         return engine.call(either.checkpoint, lambda player: player.policy.config.leave_out)
 
     plain = last(actions.run(either, "go")).latest.moment
-    session = actions.choose_use(either, INSTRUCTION_ALONE, "go")
+    session = actions.choose_use(either, INSTRUCTION_ALONE)
     stream = actions.run(session, "go")
     next(stream)
     stream.close()  # a user who leaves in the middle
     assert option() is None
     last(actions.run(session, "go"))
     assert option() is None
-    again = last(actions.run(actions.choose_use(session, BOTH, "go"), "go")).latest.moment
+    again = last(actions.run(actions.choose_use(session, BOTH), "go")).latest.moment
     assert np.array_equal(plain.view, again.view)
 
 

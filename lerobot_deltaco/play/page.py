@@ -58,15 +58,22 @@ def build_page(engine: Engine) -> gr.Blocks:
                 instruction = lay_out_instruction()
         earlier, latest = lay_out_runs()
 
-        def everything(session: Session) -> Updates:
-            """Updates of all components, so that what is shown is what the session holds."""
-            return {
+        def everything(session: Session, *sentences: str) -> Updates:
+            """Updates of all components, so that what is shown is what the session holds.
+
+            The sentence is left alone if it is one of those that the page knows: meanwhile, the user may have
+            gone on writing.
+            """
+            updates = {
                 **show_scene(scene, session),
                 **show_demonstration(demonstration, session, files),
                 **show_instruction(instruction, session),
                 **show_run(earlier, session.earlier),
                 **show_run(latest, session.latest),
             }
+            if session.sentence in sentences:
+                del updates[instruction.sentence]
+            return updates
 
         def shown_message(text: str) -> Updates:
             return {instruction.message: gr.update(value=text, visible=bool(text))}
@@ -75,11 +82,12 @@ def build_page(engine: Engine) -> gr.Blocks:
             """An action that changes the session at once, as a handler of an event."""
 
             def on_event(session: Session, *inputs: Any) -> Updates:
+                before = session.sentence
                 try:
                     session = action(session, *inputs)
                 except Exception as error:  # whatever it is, the page says so and goes on
                     return shown_message(_explained(error))
-                return {session_state: session, **everything(session), **shown_message("")}
+                return {session_state: session, **everything(session, before), **shown_message("")}
 
             return on_event
 
@@ -88,13 +96,14 @@ def build_page(engine: Engine) -> gr.Blocks:
 
             def on_event(session: Session, *inputs: Any) -> Iterator[Updates]:
                 is_first = True
+                known = (session.sentence, *inputs)
                 yield shown_message("")
                 try:
                     for running in action(session, *inputs):
                         session = running
                         step = show_run(latest, session.latest)
                         yield (
-                            everything(session)
+                            everything(session, *known)
                             if is_first
                             else {part: step[part] for part in (latest.image, latest.text)}
                         )
@@ -102,7 +111,7 @@ def build_page(engine: Engine) -> gr.Blocks:
                 except Exception as error:  # whatever it is, the page says so and goes on
                     yield shown_message(_explained(error))
                     return
-                yield {session_state: session, **everything(session)}
+                yield {session_state: session, **everything(session, session.sentence)}
 
             return on_event
 
@@ -152,7 +161,7 @@ def build_page(engine: Engine) -> gr.Blocks:
             changes(actions.open_dataset),
             demonstration.source,
         )
-        on([instruction.use.input], changes(actions.choose_use), instruction.use, instruction.sentence)
+        on([instruction.use.input], changes(actions.choose_use), instruction.use)
         on([instruction.load.click, instruction.source.submit], open_checkpoint, instruction.source)
         quiet = {"show_progress": "hidden"}
         on(

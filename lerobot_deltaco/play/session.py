@@ -113,11 +113,11 @@ class Actions:
             task = next(iter(counts), "")
         return self.choose_demonstration(session, task, 1) if task else session
 
-    def choose_use(self, session: Session, use: str, sentence: str) -> Session:
-        """Takes the demonstration, the instruction, or both for the next run, and keeps what is written."""
+    def choose_use(self, session: Session, use: str) -> Session:
+        """Takes the demonstration, the instruction, or both for the next run."""
         if use not in session.uses.choices:
             raise PlayError(f"This checkpoint can use {' or '.join(session.uses.choices)}. Got {use!r}.")
-        return replace(session, use=use, sentence=sentence)
+        return replace(session, use=use)
 
     def random_scene(self, session: Session) -> Session:
         """Draws a scene of a task that there are demonstrations of, with one of them."""
