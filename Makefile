@@ -35,7 +35,7 @@ help: ## List the targets
 
 install: $(INSTALLED) ## Only set up the environment, in .venv
 
-demo: $(INSTALLED) ## Collect, train and evaluate on a few tasks, in a quarter of an hour: outputs/demo
+demo: $(INSTALLED) ## Collect, train and evaluate on a few tasks, in a few minutes: outputs/demo
 	$(BIN)/deltaco-demo --out outputs/demo
 
 play: $(INSTALLED) ## Play with the trained policy in the browser: http://127.0.0.1:7860

@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), help="parts to measure")
     parser.add_argument("--encoder", default="correspondence", help="demo_encoder (%(default)s)")
-    parser.add_argument("--demo", action="store_true", help="also run deltaco-demo, for a quarter of an hour")
+    parser.add_argument("--demo", action="store_true", help="also run deltaco-demo, for several minutes")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to this file")
     options = parser.parse_args(arguments)
 

@@ -1,1 +1,1 @@
-"""`make demo`: the whole way in a quarter of an hour, on a small set of tasks."""
+"""`make demo`: the whole way in a few minutes, on a small set of tasks."""
