@@ -28,7 +28,7 @@ from lerobot_deltaco.common.cores import available_cores
 ROOT = Path(__file__).parents[1]
 PARTS = ("start", "expert", "collection", "training", "evaluation")
 TASKS, EPISODES_PER_TASK = "0-15", 4
-EXPERT_EPISODES = 120  # the first ones make the objects, once in a process
+EXPERT_EPISODES = 120  # so many that making the objects, once in each process, matters little
 STEPS, WARM_UP, BATCH_SIZE = 25, 5, 64
 EVALUATED, TRIALS = "0-7", 2
 # One process of the expert. It prints its seconds on the clock and those of the processor.

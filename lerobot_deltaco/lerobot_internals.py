@@ -2,6 +2,7 @@
 
 - LeRobot's training loop has no hook for datasets, samplers and evaluation. `deltaco-train` therefore
   replaces some of the functions that the loop calls, while it runs.
+- A dataset gives windows of frames or single ones, as it was made.
 - Neither the policy nor its card learns which episodes of a dataset are trained on; they are read from the
   command line or the configuration file, as LeRobot reads it.
 - A processor step keeps the transition that it processes in an attribute, which several threads overwrite.
@@ -30,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
     from lerobot.processor import ProcessorStep
 
 logger = logging.getLogger(__name__)
@@ -144,6 +146,20 @@ def _names_in(code: CodeType) -> set[str]:
     """Global names that a function uses, those of the functions inside it included."""
     inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
     return set(code.co_names).union(*map(_names_in, inner))
+
+
+# Datasets
+
+
+@contextmanager
+def single_frames(dataset: LeRobotDataset) -> Iterator[None]:
+    """Lets a dataset give single frames, whatever its `delta_timestamps` are, while the context is open."""
+    reader = dataset.reader
+    windows, reader.delta_indices = reader.delta_indices, None
+    try:
+        yield
+    finally:
+        reader.delta_indices = windows
 
 
 # Arguments of `lerobot-train`

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_train
 from PIL import Image
@@ -249,6 +250,38 @@ def test_windows_of_frames_equal_those_that_lerobot_reads(dataset):
         assert torch.equal(found[name], expected[name]), name
     assert found[camera].shape[:2] == (len(places), 2)
     assert torch.equal(found[camera].to(torch.float32) / 255, expected[camera])
+
+
+@pytest.mark.parametrize("seconds", [[-0.1, 0.0], [0.0]], ids=["two frames", "one frame"])
+def test_windows_of_videos_equal_those_that_lerobot_reads(tmp_path, seconds):
+    camera = "observation.images.top"
+    features = {
+        camera: {"dtype": "video", "shape": (32, 48, 3), "names": ["height", "width", "channels"]},
+        "action": {"dtype": "float32", "shape": (2,), "names": None},
+    }
+    encoder = RGBEncoderConfig(vcodec="h264")
+    written = LeRobotDataset.create("test/video", 10, features, root=tmp_path / "video", rgb_encoder=encoder)
+    for episode in range(2):
+        for step in range(4):
+            image = np.full((32, 48, 3), 100 * episode + 20 * step, np.uint8)
+            written.add_frame({camera: image, "action": np.ones(2, np.float32) * step, "task": "wave"})
+        written.save_episode()
+    written.finalize()
+    windows = {camera: seconds, "action": [0.0, 0.1]}
+    read = LeRobotDataset(
+        "test/video",
+        root=written.root,
+        delta_timestamps=windows,
+        return_uint8=True,
+        video_backend="pyav",
+    )
+    expected = batch_of(read, list(range(8)))
+    found = FramesInMemory(read).batch(torch.arange(8))
+    assert found.keys() == expected.keys()
+    for name in (camera, f"{camera}_is_pad", "action", "action_is_pad"):
+        assert torch.equal(found[name], expected[name]), name
+    # The dataset still gives windows.
+    assert torch.equal(read[3][camera], expected[camera][3])
 
 
 def test_reward_models_are_sent_to_lerobots_command():

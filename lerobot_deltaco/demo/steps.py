@@ -90,7 +90,10 @@ class Demo:
         return last_policy(self.run)
 
     def seconds(self) -> dict[str, float]:
-        """Seconds of each finished step, without interruptions."""
+        """Seconds of each finished step and of its unfinished attempts, by name.
+
+        Commands that run together have no seconds of their own: 0.
+        """
         file = self.folder / _DONE
         return json.loads(file.read_text()) if file.exists() else {}
 
@@ -223,7 +226,7 @@ class Demo:
             sys.stdout.write(f"[demo] {what}: done before.\n")
             return
         left = {part: list(map(str, command)) for part, command in commands.items() if part not in seconds}
-        n_workers = min(available_cores(), len(left))
+        n_workers = max(1, min(available_cores(), len(left)))
         logs = self.folder / "logs"
         logs.mkdir(exist_ok=True)
         sys.stdout.write(f"\n[demo] {what}, {n_workers} at a time; their output is in {logs}:\n")
@@ -239,13 +242,20 @@ class Demo:
 
         with self._timed(name), ThreadPoolExecutor(n_workers) as threads:
             runs = [threads.submit(run, part) for part in left]
-            for finished in tqdm(as_completed(runs), what, total=len(runs), unit="evaluation"):
-                part, code = finished.result()
-                if code != 0:
-                    for waiting in runs:
-                        waiting.cancel()
-                    raise DemoError(_failure(part, code, left[part], str(logs / f"{part}.txt")))
-                self._note(part, 0.0)
+            failure: DemoError | None = None
+            try:
+                for finished in tqdm(as_completed(runs), what, total=len(runs), unit="evaluation"):
+                    part, code = finished.result()
+                    if code == 0:
+                        self._note(part, 0.0)
+                    else:
+                        log = str(logs / f"{part}.txt")
+                        failure = failure or DemoError(_failure(part, code, left[part], log))
+            except BaseException:  # such as an interrupt: what waits must not start
+                threads.shutdown(wait=False, cancel_futures=True)
+                raise
+            if failure is not None:
+                raise failure
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:

@@ -61,8 +61,10 @@ def build_page(engine: Engine) -> gr.Blocks:
         def everything(session: Session, *sentences: str) -> Updates:
             """Updates of all components, so that what is shown is what the session holds.
 
-            The sentence is left alone if it is one of those that the page knows: meanwhile, the user may have
-            gone on writing.
+            Args:
+                session: The session to show.
+                sentences: What the page already has. If the session's sentence is among them, its box is left
+                    alone: the user may be writing in it.
             """
             updates = {
                 **show_scene(scene, session),

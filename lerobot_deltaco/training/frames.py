@@ -21,6 +21,7 @@ from torch import Tensor
 from torchvision.io import ImageReadMode, decode_image
 from tqdm import tqdm
 
+from lerobot_deltaco.lerobot_internals import single_frames
 from lerobot_deltaco.policy.demonstrations import (
     DemonstrationSet,
     RobotData,
@@ -43,6 +44,7 @@ class FramesInMemory:
         dataset: The dataset; its `episodes` are those that are held.
         device: Device of the batches, and of the frames if they fit.
         image_size: Height and width to which images are scaled, None for their own.
+        may_use_gpu: Whether frames may be held on a GPU, next to a policy that needs little of its memory.
 
     A batch has the windows of frames that the dataset's `delta_timestamps` ask for, as LeRobot's has.
 
@@ -52,15 +54,20 @@ class FramesInMemory:
     """
 
     def __init__(
-        self, dataset: LeRobotDataset, device: torch.device | str = "cpu", image_size: int | None = None
+        self,
+        dataset: LeRobotDataset,
+        device: torch.device | str = "cpu",
+        image_size: int | None = None,
+        may_use_gpu: bool = True,
     ) -> None:
         if dataset.image_transforms is not None:
             raise ValueError(
                 "Frames in memory are decoded once and cannot be transformed at random each time. Leave out "
-                "--dataset.image_transforms (the policy has `crop_padding`), or train with `lerobot-train`."
+                "--dataset.image_transforms (`--policy.type=deltaco` has `crop_padding`), or train with "
+                "`lerobot-train`."
             )
         self.device = torch.device(device)
-        self.held_on = self._choose_device(dataset, image_size)
+        self.held_on = self._choose_device(dataset, image_size, may_use_gpu)
         cameras = dataset.meta.camera_keys
         self.columns: dict[str, Tensor] = {}
         self.texts: dict[str, list[str]] = {}
@@ -86,6 +93,7 @@ class FramesInMemory:
             for rows in (first, last)
         )
         # Of each feature of which a sample has a window of frames: their distances from the sample's frame.
+        self._videos = set(dataset.meta.video_keys)
         deltas = get_delta_indices(dataset.delta_timestamps or {}, dataset.fps)
         self._windows = {name: torch.tensor(delta, device=self.held_on) for name, delta in deltas.items()}
 
@@ -117,6 +125,8 @@ class FramesInMemory:
                 wanted = rows[:, None] + self._windows[name]  # (batch, window)
                 chosen = wanted.clamp(self._first[rows][:, None], self._last[rows][:, None])
                 found[f"{name}_is_pad"] = (chosen != wanted).to(self.device, non_blocking=True)
+                if name in self._videos:
+                    chosen = chosen.squeeze(1)  # as LeRobot, if the window is one frame
             found[name] = values[chosen].to(self.device, non_blocking=True)
         for name, texts in self.texts.items():
             found[name] = [texts[place] for place in places]
@@ -170,10 +180,12 @@ class FramesInMemory:
                 use[release + 1 + n_after : last + 1] = False
         return use
 
-    def _choose_device(self, dataset: LeRobotDataset, image_size: int | None) -> torch.device:
+    def _choose_device(
+        self, dataset: LeRobotDataset, image_size: int | None, may_use_gpu: bool
+    ) -> torch.device:
         needed = needed_bytes(dataset, image_size)
         allowed = {"cpu": int(psutil.virtual_memory().available * GREATEST_SHARE["cpu"])}
-        if self.device.type == "cuda":
+        if self.device.type == "cuda" and may_use_gpu:
             allowed["cuda"] = int(torch.cuda.mem_get_info(self.device)[0] * GREATEST_SHARE["cuda"])
         if needed <= allowed.get(self.device.type, 0):
             return self.device
@@ -290,7 +302,8 @@ def _read_images(dataset: LeRobotDataset, camera: str) -> Reader:
 
     def read(rows: range) -> Callable[[range], Tensor]:
         # One after another: a decoder is not to be shared by threads.
-        images = [to_uint8(dataset[row][camera]) for row in rows]
+        with single_frames(dataset):
+            images = [to_uint8(dataset[row][camera]) for row in rows]
         return lambda part: torch.stack([images[number] for number in part])
 
     return read

@@ -149,18 +149,20 @@ class InMemoryTraining:
         # The loader has nothing to do: it gives places, and the frames are gathered on the device.
         config.num_workers = 0
         train, evaluation = self._make_datasets(config)
+        if train.meta.depth_keys or train.meta.has_language_columns:
+            raise ValueError(
+                "The dataset has depth images or columns of messages, which only `lerobot-train` prepares."
+            )
         image_size = None
         if isinstance(policy, DeltacoConfig):
             # Scaled beforehand where that takes less memory than the images as they are.
             shapes = [train.meta.features[camera]["shape"] for camera in train.meta.camera_keys]
             if any(3 * policy.image_size**2 < np.prod(shape) for shape in shapes):
                 image_size = policy.image_size
-        elif train.meta.depth_keys or train.meta.has_language_columns:
-            raise ValueError(
-                "The dataset has depth images or columns of messages, which only `lerobot-train` prepares "
-                f"for --policy.type={policy.type}."
-            )
-        self._frames = FramesInMemory(train, self._device(policy), image_size)
+        # Other policies may need all of a GPU's memory.
+        self._frames = FramesInMemory(
+            train, self._device(policy), image_size, may_use_gpu=isinstance(policy, DeltacoConfig)
+        )
         return FrameIndexDataset(train), evaluation
 
     def make_policy(self, **arguments: Any) -> PreTrainedPolicy:
@@ -171,8 +173,12 @@ class InMemoryTraining:
         if isinstance(self._config.env, DeltacoEnv):
             # Now, and not at the first evaluation.
             check_policy_fits(config, self._config.env, self._config.rename_map)
-        if not isinstance(policy, DeltacoPolicy):
+        if not isinstance(config, DeltacoConfig):
             return policy
+        if not isinstance(policy, DeltacoPolicy):
+            raise ValueError(
+                "`deltaco-train` does not train adapters (PEFT) of this policy. Use `lerobot-train`."
+            )
         assert frames is not None
         if (config.uses_demo or config.locates_goals) and config.demo_episodes is None:
             policy.set_train_demonstrations(
