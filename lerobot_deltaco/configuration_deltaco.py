@@ -44,6 +44,7 @@ PATHS = (
     "vision_encoder_weights",
     "demo_features_dir",
 )
+GOAL_DETAILS = (1, 2, 4, 8)  # by which `goal_image_size` may be larger than `image_size`
 MAX_LAYER_SIZE = 100_000  # of `language_head` and `demo_head`
 # The least and the greatest valid value. Beyond them, memory would not do, or arithmetic would overflow.
 RANGES = MappingProxyType(
@@ -54,6 +55,7 @@ RANGES = MappingProxyType(
         "demo_variants": (1, 1000),
         "demo_feature_dim": (1, 1_000_000),
         "image_size": (16, 1024),
+        "goal_image_size": (16, 8192),
         "motion_modes": (1, 1000),
         "gripper_weight": (0, 1e6),
         "encoder_loss_weight": (0, 1e6),
@@ -156,6 +158,9 @@ class DeltacoConfig(PreTrainedConfig):
             default, the first.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation, with
             `demo_encoder=correspondence`.
+        goal_image_size: Height and width to which the first image of an episode and those of the
+            demonstrations are scaled for finding goals: `image_size`, or 2, 4 or 8 times as much, so that
+            small objects of the same color can be told apart by their shapes. By default, `image_size`.
         goal_noise: Standard deviation of the noise on goals in training, in coordinates in which an image's
             edges are at -1 and 1; 0.04 is a pixel of 48.
         grasp_depth: Whether goals include the depth of the grasp (`policy/goal_states.py`), estimated from
@@ -244,6 +249,7 @@ class DeltacoConfig(PreTrainedConfig):
     demo_crop_padding: int = 4
     demo_camera: str | None = None
     n_demonstrations: int = 1
+    goal_image_size: int | None = None
     goal_noise: float = 0.04
     grasp_depth: bool = True
     depth_noise: float = 0.1
@@ -424,6 +430,10 @@ class DeltacoConfig(PreTrainedConfig):
         if self.locates_goals:
             self._check_correspondence(film, concat, encoder_loss)
             return
+        if self.goal_image_size is not None:
+            raise ValueError(
+                f"`goal_image_size` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that one."
+            )
         if film == concat == "none":
             raise ValueError("`film` and `concat` are both 'none': the policy would get no task.")
         if encoder_loss != "none" and not self.uses_demo:
@@ -433,6 +443,12 @@ class DeltacoConfig(PreTrainedConfig):
             )
 
     def _check_correspondence(self, film: str, concat: str, encoder_loss: str) -> None:
+        if self.demo_image_size not in (factor * self.image_size for factor in GOAL_DETAILS):
+            sizes = [factor * self.image_size for factor in GOAL_DETAILS]
+            raise ValueError(
+                f"`goal_image_size` must be `image_size` times {', '.join(map(str, GOAL_DETAILS))}: one of "
+                f"{sizes}. Got {self.goal_image_size}."
+            )
         if self.method not in GOAL_SOURCES:
             raise ValueError(
                 f"`demo_encoder` cannot be {CORRESPONDENCE!r} in the method {self.method!r}. It can in "
@@ -454,6 +470,16 @@ class DeltacoConfig(PreTrainedConfig):
     def takes_either_modality(self) -> bool:
         """Whether the policy has learned to do without a demonstration, or without an instruction."""
         return self.demo_dropout > 0 or self.instruction_dropout > 0
+
+    @property
+    def goal_detail(self) -> int:
+        """Factor by which images in which goals are found are larger than those of the policy's network."""
+        return self.demo_image_size // self.image_size
+
+    @property
+    def demo_image_size(self) -> int:
+        """Height and width of the images of demonstrations, px."""
+        return self.goal_image_size or self.image_size
 
     @property
     def n_goals(self) -> int:

@@ -240,7 +240,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         samples = GoalSamples(images, episodes, rows, tasks, instructions)
         if not self.training:
             inputs = validation_goals(
-                self.goal_trainer, samples, lambda: self._find_goals(images[:, 0], tasks, [0] * len(tasks))
+                self.goal_trainer,
+                samples,
+                lambda: self._find_goals(self.scenes(batch), tasks, [0] * len(tasks)),
             )
             return self._imitation_loss(batch, inputs.images, film, concat, inputs.places, inputs.depths)
         if not self._train_demonstrations_are_complete:
@@ -281,7 +283,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         tasks = instructions_of(batch)
         images = self._images(batch)
         with autocast(self.config.dtype, images.device):
-            task = self._episode_tasks.conditioning(tasks, lambda tasks: self.encode_task(tasks, images))
+            task = self._episode_tasks.conditioning(
+                tasks, lambda tasks: self.encode_task(tasks, self.scenes(batch))
+            )
             places, depths = (None, None) if task.goals is None else task.goals[:2]
             concatenated = self._concatenated(batch, task.concat, places, depths)
             motion, gripper = task.model(images, task.film, concatenated, places)
@@ -293,12 +297,12 @@ class DeltacoPolicy(PreTrainedPolicy):
         """The action as a chunk of one, (batch, 1, action)."""
         return self.select_action(batch, **kwargs).unsqueeze(1)
 
-    def encode_task(self, tasks: tuple[str, ...], images: Tensor) -> TaskConditioning:
+    def encode_task(self, tasks: tuple[str, ...], scenes: Tensor) -> TaskConditioning:
         """Encodes the demonstrations and instructions of the tasks of a batch, at the start of an episode.
 
         Args:
             tasks: Instruction of each sample.
-            images: Images of the scenes, (batch, cameras, 3, size, size) in 0..1, in which goals are found.
+            scenes: First images of the episodes, as `scenes` gives them, in which goals are found.
 
         Raises:
             ValueError: A task has no demonstration.
@@ -306,21 +310,21 @@ class DeltacoPolicy(PreTrainedPolicy):
         trials = self._episode_tasks.count_trials(tasks)
         demo = language = goals = None
         if self.goals is not None:
-            goals = self._find_goals(images[:, 0], tasks, trials)
+            goals = self._find_goals(scenes, tasks, trials)
         elif self.config.uses_demo:
             demonstrations, rows = self._choose_demonstrations(tasks, trials)
             generator = torch.Generator().manual_seed(self.config.seed)
             demo = self._embedder.embed_demonstrations(demonstrations, rows, generator, self.training)
         if self.config.language_is_input:
-            language = self._embedder.embed_instructions(tasks, images.device)
+            language = self._embedder.embed_instructions(tasks, scenes.device)
         if self.config.method == "mcil":
             assert language is not None
             assert demo is not None
             # The trials of a task use the instruction and the demonstration in turn.
-            by_language = torch.tensor(trials, device=images.device) % 2 == 0
+            by_language = torch.tensor(trials, device=scenes.device) % 2 == 0
             either = torch.where(by_language[:, None], language, demo)
             return TaskConditioning(tasks, either, None, self._acting_model())
-        film, concat = self._embedder.conditioning_inputs(tasks, demo, language, images.device)
+        film, concat = self._embedder.conditioning_inputs(tasks, demo, language, scenes.device)
         return TaskConditioning(tasks, film, concat, self._acting_model(), goals)
 
     def _acting_model(self) -> nn.Module:
@@ -328,6 +332,14 @@ class DeltacoPolicy(PreTrainedPolicy):
         return self.model if self.training else self._folded.network()
 
     # Inputs of the network
+
+    def scenes(self, batch: dict[str, Any]) -> Tensor:
+        """Images of the first camera as goals are found in them, (batch, 3, size, size) in 0..1.
+
+        Args:
+            batch: As in `select_action`. The size is `goal_image_size`, or `image_size` without it.
+        """
+        return stacked_images(batch, self.config.cameras[:1], self.config.demo_image_size)[:, 0]
 
     def _images(self, batch: dict[str, Any]) -> Tensor:
         """Images of all cameras, that of the demonstrations first, (batch, cameras, 3, size, size)."""

@@ -11,6 +11,7 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.calibration import MIN_EPISODES, StateToImage
 from lerobot_deltaco.policy.correspondence import GoalLocator, goal_loss, peak_places
+from lerobot_deltaco.policy.demonstrations import load_demonstrations
 from lerobot_deltaco.policy.goal_states import GoalStates
 from lerobot_deltaco.policy.grasp_depth import DepthEstimator
 from lerobot_deltaco.policy.keyframes import find_keyframes, follows_gripper, release_frames
@@ -58,26 +59,35 @@ def episodes():
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory, episodes):
     """Two things on a table, of which one is moved: grasped in frame 2, released in frame 5."""
+
+    def draw(task, thing, other):
+        other_color = next(color for name, color in COLORS.items() if name != task)
+        return image_with((COLORS[task], thing), (other_color, other))
+
+    return table_dataset(tmp_path_factory.mktemp("data") / "table", episodes, draw)
+
+
+def table_dataset(root, episodes, draw):
+    """Episodes of a thing that is moved on a table, in images that `draw` makes of a task and two places."""
+    size = len(draw(*episodes[0][:3]))
     features = {
         "observation.image": {
             "dtype": "image",
-            "shape": (SIZE, SIZE, 3),
+            "shape": (size, size, 3),
             "names": ["height", "width", "channels"],
         },
         "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "c"]},
         "action": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "gripper"]},
     }
-    root = tmp_path_factory.mktemp("data") / "table"
     dataset = LeRobotDataset.create("test/table", 10, features, root=root, use_videos=False)
     home = np.zeros(2)
     for task, start, other, end in episodes:
-        other_color = next(color for name, color in COLORS.items() if name != task)
         for step in range(LENGTH):
             place = (home, start, start, start, end, end, home)[step]
             thing = start if step < 4 else end
             dataset.add_frame(
                 {
-                    "observation.image": image_with((COLORS[task], thing), (other_color, other)),
+                    "observation.image": draw(task, thing, other),
                     "observation.state": state_of(place),
                     "action": np.array([*(place - home), (1, 1, -1, -1, -1, 1, 1)[step]], np.float32),
                     "task": task,
@@ -366,7 +376,7 @@ def share_found(policy, dataset, episodes):
     """
     held_out = range(40, 60)
     batch = batch_of(dataset, [episode * LENGTH for episode in held_out])
-    conditioning = policy.encode_task(tuple(batch["task"]), batch["observation.image"][:, None])
+    conditioning = policy.encode_task(tuple(batch["task"]), policy.scenes(batch))
     true = torch.from_numpy(np.stack([np.stack(episodes[n][1::2]) for n in held_out])).float()
     errors = (conditioning.goals.places - true) * SIZE / 2
     found = torch.stack([errors[:, 0].norm(dim=1) < 3, errors[:, 1, 0].abs() < 3])
@@ -376,6 +386,65 @@ def share_found(policy, dataset, episodes):
 def test_it_learns_to_find_what_a_demonstration_moved(dataset, episodes):
     policy = trained_to_find(dataset, 60)
     assert share_found(policy, dataset, episodes)[0] > 0.85  # the right one of two things
+
+
+@pytest.fixture(scope="module")
+def large_dataset(tmp_path_factory, episodes):
+    """The same table in images of twice the size."""
+
+    def draw(task, thing, other):
+        other_color = next(color for name, color in COLORS.items() if name != task)
+        return image_with((COLORS[task], thing), (other_color, other)).repeat(2, axis=0).repeat(2, axis=1)
+
+    return table_dataset(tmp_path_factory.mktemp("data") / "large", episodes, draw)
+
+
+def test_it_learns_to_find_goals_in_larger_images(large_dataset, episodes, tmp_path):
+    policy = trained_to_find(large_dataset, 60, goal_image_size=2 * SIZE)
+    assert share_found(policy, large_dataset, episodes)[0] > 0.85
+    batch = batch_of(large_dataset, [0])
+    assert policy.scenes(batch).shape == (1, 3, 2 * SIZE, 2 * SIZE)
+    policy.save_pretrained(tmp_path)
+    loaded = DeltacoPolicy.from_pretrained(tmp_path).eval()
+    assert share_found(loaded, large_dataset, episodes) == share_found(policy, large_dataset, episodes)
+
+
+def test_frames_in_memory_give_larger_demonstrations_than_they_are_held_in(large_dataset):
+    frames = FramesInMemory(large_dataset, image_size=SIZE)
+    root = large_dataset.root
+    episodes = [3, 1, 40]
+    held = frames.demonstrations("observation.image", 2 * SIZE, 2, episodes)
+    read = load_demonstrations("test/table", root, episodes, "observation.image", 2 * SIZE, 2)
+    assert torch.equal(held.frames, read.frames)
+    assert held.tasks == read.tasks
+
+
+def test_only_the_grasp_depends_on_the_detail_of_larger_images():
+    locator = GoalLocator("demo", "condition", 5, 8, 8, detail=2).eval()
+    rough = torch.rand(2, 2, 3, SIZE, SIZE).repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
+    fine = rough + 0.1 * torch.tensor([[1.0, -1.0], [-1.0, 1.0]]).repeat(
+        SIZE, SIZE
+    )  # 0 on the mean of 2 x 2 px
+    found = []
+    for images in (rough, fine):
+        description = locator.describe(images)
+        found.append(locator(images[:, 0], images[:, 0], description, torch.ones(2, 5)))
+        assert found[-1].logits.shape == (2, 2, SIZE // 2, SIZE // 2)
+    assert not torch.allclose(found[0].logits[:, 0], found[1].logits[:, 0])
+    torch.testing.assert_close(found[0].logits[:, 1], found[1].logits[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"goal_image_size": 3 * SIZE}, "times 1, 2, 4, 8: one of .* Got 72"),
+        ({"goal_image_size": SIZE // 2 + 8}, "times 1, 2, 4, 8"),
+        ({"demo_encoder": "attention", "goal_image_size": SIZE}, "is for `demo_encoder=correspondence`"),
+    ],
+)
+def test_sizes_of_images_for_goals_are_checked(options, message):
+    with pytest.raises(ValueError, match=message):
+        DeltacoConfig(**{**CORRESPONDENCE, **options})
 
 
 def test_it_learns_to_do_without_a_demonstration_or_an_instruction(dataset, episodes):
@@ -391,7 +460,7 @@ def test_what_is_left_out_does_not_matter(dataset):
     policy, _, _ = small_policy(dataset, **CORRESPONDENCE, **demos, demo_dropout=0.2, instruction_dropout=0.2)
     policy.forward(batch_of(dataset, [0, LENGTH]))
     policy.eval()
-    images = batch_of(dataset, [0])["observation.image"][:, None]
+    images = batch_of(dataset, [0])["observation.image"]
 
     def goals(instruction, leave_out, episode):
         policy.config.leave_out, policy.config.demo_episode = leave_out, episode
@@ -517,7 +586,7 @@ def test_the_margin_is_added_to_depths(dataset):
         policy, _, _ = small_policy(dataset, **CORRESPONDENCE, depth_margin=margin)
         batch = batch_of(dataset, [0, LENGTH])
         policy.forward(batch)
-        goals = policy.eval().encode_task(tuple(batch["task"]), batch["observation.image"][:, None]).goals
+        goals = policy.eval().encode_task(tuple(batch["task"]), batch["observation.image"]).goals
         found.append(goals.depths)
     torch.testing.assert_close(found[1], found[0] + 0.5)
 
@@ -528,7 +597,7 @@ def test_depths_can_be_left_out(dataset):
     loss, logged = policy.forward(batch)
     assert loss.isfinite()
     assert logged["depth_loss"] == 0
-    goals = policy.eval().encode_task(tuple(batch["task"]), batch["observation.image"][:, None]).goals
+    goals = policy.eval().encode_task(tuple(batch["task"]), batch["observation.image"]).goals
     assert goals.depths is None
     assert policy.select_action(batch).shape == (2, 3)
 
@@ -539,7 +608,7 @@ def test_several_demonstrations_are_combined(dataset):
     one, _, _ = small_policy(dataset, **CORRESPONDENCE, **demos)
     three, _, _ = small_policy(dataset, **CORRESPONDENCE, **demos, n_demonstrations=3)
     three.load_state_dict(one.state_dict())
-    images = batch_of(dataset, [0])["observation.image"][:, None]
+    images = batch_of(dataset, [0])["observation.image"]
     found = [policy.eval().encode_task((list(COLORS)[0],), images).goals for policy in (one, three)]
     assert not torch.equal(found[0].logits[:, 0], found[1].logits[:, 0])
     torch.testing.assert_close(found[0].logits[:, 1], found[1].logits[:, 1])

@@ -64,7 +64,7 @@ def seconds_per_step(repo_id: str, root: Path, policy: Mapping[str, Any], batch_
     assert isinstance(network, DeltacoPolicy)
     if config.uses_demo:
         network.set_train_demonstrations(
-            frames.demonstrations(config.cameras[0], config.image_size, config.n_demo_frames), None
+            frames.demonstrations(config.cameras[0], config.demo_image_size, config.n_demo_frames), None
         )
     network.train()
     preprocessor, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)

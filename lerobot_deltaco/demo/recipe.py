@@ -15,7 +15,7 @@ TRAINED_TASKS = tuple(
 )
 ALL_TASKS = (*TRAINED_TASKS, *NEW_COMBINATIONS)
 
-EPISODES_PER_TASK = 150
+EPISODES_PER_TASK = 200
 # A demonstration of each task, new combinations included, for the evaluation.
 DEMONSTRATIONS_PER_TASK = 1
 # The expert is done after 10 of 30 steps in the median, and then holds still over what it has placed, which

@@ -149,7 +149,7 @@ def check_stored_frames(stored: StoredDemonstrations, path: Path, config: Deltac
         TaskFileError: They have other numbers of frames or pixels.
     """
     n_kept = len(kept_frame_indices(0, 0, config.n_demo_frames))
-    check_demonstrations(path, stored, config.image_size, n_kept)
+    check_demonstrations(path, stored, config.demo_image_size, n_kept)
 
 
 def stored_demonstrations(

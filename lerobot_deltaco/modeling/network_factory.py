@@ -67,7 +67,10 @@ def make_goal_conditioning(config: DeltacoConfig) -> GoalConditioning | None:
     if config.uses_language:
         condition_dim = config.embedding_dim
     locator = GoalLocator(
-        *GOAL_SOURCES[config.method], condition_dim, takes_either=config.takes_either_modality
+        *GOAL_SOURCES[config.method],
+        condition_dim,
+        takes_either=config.takes_either_modality,
+        detail=config.goal_detail,
     )
     return GoalConditioning(
         locator, _state_dim(config), condition_dim, config.grasp_depth, config.depth_margin

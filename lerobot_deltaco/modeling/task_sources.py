@@ -39,7 +39,7 @@ def read_demonstrations(
         ValueError: The dataset has no such camera or episode.
     """
     camera = config.cameras[0]
-    return load_demonstrations(repo_id, root, episodes, camera, config.image_size, config.n_demo_frames)
+    return load_demonstrations(repo_id, root, episodes, camera, config.demo_image_size, config.n_demo_frames)
 
 
 def read_training_demonstrations(

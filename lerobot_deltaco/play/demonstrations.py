@@ -95,7 +95,7 @@ def demonstration_of(
         fps: Frames per second.
     """
     last = len(images) - 1
-    kept = resize_images(images[kept_frame_indices(0, last, config.n_demo_frames)], config.image_size)
+    kept = resize_images(images[kept_frame_indices(0, last, config.n_demo_frames)], config.demo_image_size)
     grasp_state = None
     if robot is not None:
         grasp_state = find_keyframes(*robot, [(0, last)]).grasp_states[0].numpy()

@@ -33,7 +33,7 @@ from lerobot_deltaco.play.demonstrations import (
 )
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.play.modalities import BOTH, DEMONSTRATION_ALONE, INSTRUCTION_ALONE, using
-from lerobot_deltaco.policy.demonstrations import DemonstrationSet, resize_images
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals
 from lerobot_deltaco.policy.language import LanguageEncoderError
 
@@ -320,13 +320,10 @@ class Player:
     @torch.no_grad()
     def _find_goals(self, observation: dict[str, NDArray[Any]], sentence: str) -> FoundGoals | None:
         """The goals that the policy will have in the episode; None if it finds none."""
-        image = self._batch(observation, sentence)[_CAMERA]
-        size = self.policy.config.image_size
-        if image.shape[-1] != size:
-            image = resize_images(image, size).float() / 255
+        scenes = self.policy.scenes(self._batch(observation, sentence))
         self.policy.begin_evaluation()
         try:
-            goals = self.policy.encode_task((sentence,), image[:, None]).goals
+            goals = self.policy.encode_task((sentence,), scenes).goals
         except (ValueError, LanguageEncoderError) as error:
             raise PlayError(str(error)) from error
         self.policy.begin_evaluation()

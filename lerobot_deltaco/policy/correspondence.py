@@ -67,8 +67,9 @@ class Located(NamedTuple):
     """Where the goals of scenes may be.
 
     Attributes:
-        logits: Maps of the grasp and the release over places, (batch, 2, H / 2, W / 2).
-        features: Features of the scenes' places, (batch, descriptor_dim, H / 2, W / 2).
+        logits: Maps of the grasp and the release over places, (batch, 2, h, w), where h and w are the height
+            and width of the images divided by `2 * detail`.
+        features: Features of the scenes' places, (batch, descriptor_dim, h, w).
     """
 
     logits: Tensor
@@ -84,12 +85,14 @@ class GoalLocator(nn.Module):
         release_source: Source of where it is to go; the same.
         condition_dim: Size of the condition, 0 for none. With a condition, it also weighs the channels of
             what a demonstration describes.
-        channels: Number of channels of the maps, which have half the side of the image.
+        channels: Number of channels of the maps.
         descriptor_dim: Size of a descriptor.
         bottleneck: Number of values through which the condition weighs a descriptor.
         condition_noise: Standard deviation of the noise on each number of the condition in training.
         takes_either: Whether a demonstration, a condition, or both describe the task. With both, the
             demonstration says what to grasp, and the condition where to release it.
+        detail: Factor by which images are larger than those that the maps have half the side of: a power of
+            2. Only the features see the images as they are: what needs detail is the shape of objects.
     """
 
     def __init__(
@@ -102,6 +105,7 @@ class GoalLocator(nn.Module):
         bottleneck: int = 3,
         condition_noise: float = 0.02,
         takes_either: bool = False,
+        detail: int = 1,
     ) -> None:
         super().__init__()
         if takes_either and (grasp_source, release_source) != ("demo", "condition"):
@@ -109,7 +113,8 @@ class GoalLocator(nn.Module):
         self.grasp_source, self.release_source = grasp_source, release_source
         self.takes_either = takes_either
         self.condition_noise, self.descriptor_dim = condition_noise, descriptor_dim
-        self.trunk = _Trunk(channels, descriptor_dim)
+        self.detail = detail
+        self.trunk = _Trunk(channels, descriptor_dim, detail)
         self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
         if "demo" in (grasp_source, release_source):
             self.attend = nn.Sequential(
@@ -132,7 +137,8 @@ class GoalLocator(nn.Module):
 
     def describe(self, frames: Tensor) -> Description:
         """Describes demonstrations, from their first and last images (batch, 2, 3, H, W) in 0..1."""
-        weights = spatial_weights(self.attend(_channels_last(frames.flatten(1, 2))))  # (batch, 2, h, w)
+        small = self._without_detail(frames.flatten(1, 2))
+        weights = spatial_weights(self.attend(_channels_last(small)))  # (batch, 2, h, w)
         moved = (self.trunk(frames[:, 0]) * weights[:, :1]).sum(dim=(2, 3))  # (batch, descriptor_dim)
         if self.release_source != "demo" and not self.takes_either:
             return Description(moved, None, weights)
@@ -196,7 +202,12 @@ class GoalLocator(nn.Module):
             assert description is not None
             condition = description.target
         assert condition is not None
-        return Located(torch.stack([grasp, self.release(plain_scenes, condition)], dim=1), features)
+        release = self.release(self._without_detail(plain_scenes), condition)
+        return Located(torch.stack([grasp, release], dim=1), features)
+
+    def _without_detail(self, images: Tensor) -> Tensor:
+        """Images (batch, channels, H, W) at the size that the maps have half the side of."""
+        return images if self.detail == 1 else F.avg_pool2d(images, self.detail)
 
 
 class ReleaseNetwork(nn.Module):
@@ -231,11 +242,12 @@ class ReleaseNetwork(nn.Module):
 
 
 class _Trunk(nn.Module):
-    """Features of places, for scenes and demonstrations alike: (batch, 3, H, W) to (batch, dim, H/2, W/2)."""
+    """Features of places, for scenes and demonstrations alike: (batch, 3, H, W) to (batch, dim, h, w)."""
 
-    def __init__(self, channels: int, dim: int) -> None:
+    def __init__(self, channels: int, dim: int, detail: int) -> None:
         super().__init__()
-        self.stem = nn.Sequential(_convolution(3, 32, 5, 2), _convolution(32, channels))
+        halvings = [_convolution(32, 32, 3, 2) for _ in range(detail.bit_length() - 1)]
+        self.stem = nn.Sequential(_convolution(3, 32, 5, 2), *halvings, _convolution(32, channels))
         self.block = nn.Sequential(_convolution(channels, channels), _convolution(channels, channels))
         self.project = nn.Conv2d(channels, dim, 1)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lerobot_deltaco.policy.calibration import StateToImage
 from lerobot_deltaco.policy.correspondence import Given
-from lerobot_deltaco.policy.demonstrations import DemonstrationSet, RobotData
+from lerobot_deltaco.policy.demonstrations import DemonstrationSet, RobotData, resize_images
 from lerobot_deltaco.policy.goal_conditioning import Demonstrations, GoalConditioning
 from lerobot_deltaco.policy.keyframes import follows_gripper
 from lerobot_deltaco.policy.networks import random_shifts, shift_images
@@ -98,10 +98,12 @@ class GoalTrainer:
         to_image = conditioning.states.to_image
         if to_image is None:
             to_image = StateToImage(states.shape[1]).to(device)
+        self._detail = conditioning.locator.detail
+        size = frames.shape[-1] // self._detail  # that of the maps' cells is what the calibration is made for
         self.goals: TrainingGoals = find_training_goals(
             to_image,
-            frames[:, 0],
-            frames[:, -1],
+            resize_images(frames[:, 0], size),
+            resize_images(frames[:, -1], size),
             states,
             gripper,
             robot_data.spans,
@@ -171,7 +173,7 @@ class GoalTrainer:
         Args:
             batch: The samples.
             uses_demonstrations: Whether they are found by a demonstration, which is another episode.
-            crop_padding: Largest random shift of scenes and demonstrations, px.
+            crop_padding: Largest random shift of scenes and demonstrations, px of images without detail.
             color_blind_tasks: Regular expression that is found in the tasks in which color does not count.
             generator: Source of the draws, on the CPU.
 
@@ -180,6 +182,7 @@ class GoalTrainer:
             no goals.
         """
         known, own = self._demonstrations, batch.rows
+        crop_padding *= self._detail
         plain = known.frames[own, 0].float() / 255  # (batch, 3, H, W)
         plain, places = self._shifted(plain, self.goals.places[own], crop_padding, generator)
         scenes, demonstrations, others = plain, None, None

@@ -66,7 +66,7 @@ class FramesInMemory:
                 "--dataset.image_transforms (`--policy.type=deltaco` has `crop_padding`), or train with "
                 "`lerobot-train`."
             )
-        self.device = torch.device(device)
+        self.device, self._dataset = torch.device(device), dataset
         self.held_on = self._choose_device(dataset, image_size, may_use_gpu)
         cameras = dataset.meta.camera_keys
         self.columns: dict[str, Tensor] = {}
@@ -146,7 +146,13 @@ class FramesInMemory:
         """
         episodes = list(self.spans) if episodes is None else list(episodes)
         rows = torch.stack([kept_frame_indices(*self.spans[episode], n_demo_frames) for episode in episodes])
-        images = self.columns[camera][rows.to(self.held_on)]  # (episodes, kept, 3, h, w)
+        images = self.columns[camera]
+        if image_size > min(images.shape[-2:]):
+            # They may be larger in the dataset than they are held.
+            images = _camera_images(self._dataset, camera, image_size, self.held_on, rows.flatten().tolist())
+            images = images.unflatten(0, rows.shape)
+        else:
+            images = images[rows.to(self.held_on)]  # (episodes, kept, 3, h, w)
         tasks = [self.task_names[self._task_of[self.spans[episode][0]]] for episode in episodes]
         return DemonstrationSet(resize_images(images, image_size), tasks, episodes).to(self.device)
 
@@ -244,41 +250,47 @@ def _flat_numbers(values: pa.Array) -> NDArray[Any] | None:
 
 
 def _camera_images(
-    dataset: LeRobotDataset, camera: str, image_size: int | None, device: torch.device
+    dataset: LeRobotDataset,
+    camera: str,
+    image_size: int | None,
+    device: torch.device,
+    wanted: Sequence[int] | None = None,
 ) -> Tensor:
-    """Images of a camera, (frames, 3, H, W) uint8."""
+    """Images of a camera, (frames, 3, H, W) uint8, of the wanted rows of a dataset or of all."""
     is_image = dataset.meta.features[camera]["dtype"] == "image"
     read = _stored_images(dataset, camera) if is_image else _read_images(dataset, camera)
-    n_frames = dataset.num_frames
+    wanted = range(dataset.num_frames) if wanted is None else wanted
+    n_frames = len(wanted)
     images: Tensor | None = None
     with (
         ThreadPoolExecutor(os.cpu_count()) as threads,
         tqdm(total=n_frames, desc=f"Decoding {camera}", unit="frame") as progress,
     ):
         for start in range(0, n_frames, CHUNK):
-            rows = range(start, min(start + CHUNK, n_frames))
+            rows = wanted[start : start + CHUNK]
             parts = [range(first, min(first + PART, len(rows))) for first in range(0, len(rows), PART)]
             chunk = torch.cat(list(threads.map(read(rows), parts)))
             if image_size is not None:
                 chunk = resize_images(chunk, image_size)
             if images is None:
                 images = torch.empty(n_frames, *chunk.shape[1:], dtype=torch.uint8, device=device)
-            images[rows.start : rows.stop] = chunk.to(device)
+            images[start : start + len(rows)] = chunk.to(device)
             progress.update(len(rows))
     assert images is not None
     return images
 
 
 # For rows of a dataset, a function that gives the images of some of them, (images, 3, H, W) uint8.
-Reader = Callable[[range], Callable[[range], Tensor]]
+Reader = Callable[[Sequence[int]], Callable[[range], Tensor]]
 
 
 def _stored_images(dataset: LeRobotDataset, camera: str) -> Reader:
     """Reads images of an `image` feature: the stored files are decoded."""
     table = dataset.hf_dataset.with_format("arrow")
 
-    def read(rows: range) -> Callable[[range], Tensor]:
-        files = table[rows.start : rows.stop][camera].to_pylist()
+    def read(rows: Sequence[int]) -> Callable[[range], Tensor]:
+        chosen = slice(rows.start, rows.stop) if isinstance(rows, range) else list(rows)
+        files = table[chosen][camera].to_pylist()
 
         return lambda part: torch.stack([decoded(files[number]["bytes"]) for number in part])
 
@@ -300,7 +312,7 @@ def decoded(file: bytes) -> Tensor:
 def _read_images(dataset: LeRobotDataset, camera: str) -> Reader:
     """Reads images of a `video` feature, as LeRobot does."""
 
-    def read(rows: range) -> Callable[[range], Tensor]:
+    def read(rows: Sequence[int]) -> Callable[[range], Tensor]:
         # One after another: a decoder is not to be shared by threads.
         with single_frames(dataset):
             images = [to_uint8(dataset[row][camera]) for row in rows]

@@ -182,7 +182,7 @@ class InMemoryTraining:
         assert frames is not None
         if (config.uses_demo or config.locates_goals) and config.demo_episodes is None:
             policy.set_train_demonstrations(
-                frames.demonstrations(config.cameras[0], config.image_size, config.n_demo_frames),
+                frames.demonstrations(config.cameras[0], config.demo_image_size, config.n_demo_frames),
                 frames.robot_data() if config.locates_goals else None,
             )
         return policy
