@@ -224,6 +224,8 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
         "random shifts of observations": f"up to {config.crop_padding} pixels",
         "precision": config.dtype,
     }
+    if config.goal_image_size is not None:
+        options["image size for finding goals"] = f"{config.goal_image_size} x {config.goal_image_size}"
     if config.gripper_index is not None:
         kind = config.gripper_loss.replace("_", " ")
         options["gripper loss"] = f"{kind}, weight {config.gripper_weight:g}"
