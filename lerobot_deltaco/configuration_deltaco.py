@@ -34,6 +34,7 @@ from lerobot_deltaco.policy.options import (
 )
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS, VISION_INPUTS
 from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAdamWConfig
+from lerobot_deltaco.training.task_batches import count_upsampled_tasks
 
 # Options that may be files and folders of this machine.
 PATHS = (
@@ -370,6 +371,7 @@ class DeltacoConfig(PreTrainedConfig):
                 "`upsampled_tasks` get a share of the tasks of a batch: `tasks_per_batch` must be at least "
                 f"2. Got {self.tasks_per_batch}."
             )
+        count_upsampled_tasks(self.upsampled_share, self.tasks_per_batch)  # now, not after the decoding
 
     def _check_dropout(self) -> None:
         dropouts = {"demo": self.demo_dropout, "instruction": self.instruction_dropout}

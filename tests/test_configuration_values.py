@@ -57,11 +57,12 @@ def test_numbers_beyond_their_range_are_refused_by_name(name):
         {"image_size": 2**31},
         {"gripper": 1},
         {"upsampled_share": None},
+        {"upsampled_share": 0.2, "upsampled_tasks": "wave", "tasks_per_batch": 16},
     ],
     ids=str,
 )
 def test_absurd_values_are_refused_by_name(options):
-    (name,) = options
+    name = next(iter(options))
     with pytest.raises(ValueError, match=f"`{name}` must be"):
         DeltacoConfig(device="cpu", **options)
 

@@ -84,7 +84,7 @@ def test_frames_that_are_not_used_are_not_drawn():
         ),
         (
             {"batch_size": 8, "tasks_per_batch": 4, "upsampled": [0, 1], "upsampled_share": 0.4},
-            "0.4 of 4 tasks is not a whole number",
+            "1 to 3 of them, such as 0.5. Got 0.4, which is 1.6 tasks",
         ),
     ],
 )

@@ -65,12 +65,7 @@ class TaskBatchSampler:
         present = list(self._frames_of)
         groups = [(present, tasks_per_batch)]
         if upsampled:
-            n_upsampled = round(share * tasks_per_batch)
-            if abs(n_upsampled - share * tasks_per_batch) > 1e-6 or not 0 < n_upsampled < tasks_per_batch:
-                raise ValueError(
-                    f"A share of {share} of {tasks_per_batch} tasks is not a whole number of them between 1 "
-                    f"and {tasks_per_batch - 1}. Change `upsampled_share` or `tasks_per_batch`."
-                )
+            n_upsampled = count_upsampled_tasks(share, tasks_per_batch)
             groups = [
                 ([task for task in present if task in upsampled], n_upsampled),
                 ([task for task in present if task not in upsampled], tasks_per_batch - n_upsampled),
@@ -136,3 +131,24 @@ def _rounds(
         turns.append(np.concatenate([turn[first], np.delete(turn, first)]))
         n_drawn += len(members)
     return np.concatenate(turns)[:n_chosen].reshape(n_batches, per_batch)
+
+
+def count_upsampled_tasks(share: float, tasks_per_batch: int) -> int:
+    """Number of the upsampled tasks in a batch.
+
+    Args:
+        share: Share of the batch for them.
+        tasks_per_batch: Number of tasks in a batch.
+
+    Raises:
+        ValueError: It is not a whole number, or no other task is left.
+    """
+    n_upsampled = round(share * tasks_per_batch)
+    if abs(n_upsampled - share * tasks_per_batch) > 1e-6 or not 0 < n_upsampled < tasks_per_batch:
+        nearest = min(max(n_upsampled, 1), tasks_per_batch - 1) / tasks_per_batch
+        raise ValueError(
+            f"`upsampled_share` must be a whole number of the {tasks_per_batch} tasks of a batch, 1 to "
+            f"{tasks_per_batch - 1} of them, such as {nearest:g}. Got {share}, which is "
+            f"{share * tasks_per_batch:g} tasks."
+        )
+    return n_upsampled
