@@ -5,7 +5,8 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 from lerobot.datasets import LeRobotDataset
-from small_policies import batch_of, small_policy
+from PIL import Image
+from small_policies import batch_of, observation, small_policy
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
@@ -60,21 +61,29 @@ def episodes():
 def dataset(tmp_path_factory, episodes):
     """Two things on a table, of which one is moved: grasped in frame 2, released in frame 5."""
 
-    def draw(task, thing, other):
-        other_color = next(color for name, color in COLORS.items() if name != task)
-        return image_with((COLORS[task], thing), (other_color, other))
-
-    return table_dataset(tmp_path_factory.mktemp("data") / "table", episodes, draw)
+    return table_dataset(tmp_path_factory.mktemp("data") / "table", episodes, image=table_with)
 
 
-def table_dataset(root, episodes, draw):
-    """Episodes of a thing that is moved on a table, in images that `draw` makes of a task and two places."""
-    size = len(draw(*episodes[0][:3]))
+def table_with(task, thing, other):
+    """The table with a task's thing and the other one at these places."""
+    other_color = next(color for name, color in COLORS.items() if name != task)
+    return image_with((COLORS[task], thing), (other_color, other))
+
+
+def table_dataset(root, episodes, **cameras):
+    """Episodes of a thing that is moved on a table.
+
+    Each camera is a function that draws an image of a task and the places of its thing and the other one.
+    """
+    images = {f"observation.{camera}": draw for camera, draw in cameras.items()}
     features = {
-        "observation.image": {
-            "dtype": "image",
-            "shape": (size, size, 3),
-            "names": ["height", "width", "channels"],
+        **{
+            name: {
+                "dtype": "image",
+                "shape": draw(*episodes[0][:3]).shape,
+                "names": ["height", "width", "channels"],
+            }
+            for name, draw in images.items()
         },
         "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "c"]},
         "action": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "gripper"]},
@@ -87,7 +96,7 @@ def table_dataset(root, episodes, draw):
             thing = start if step < 4 else end
             dataset.add_frame(
                 {
-                    "observation.image": draw(task, thing, other),
+                    **{name: draw(task, thing, other) for name, draw in images.items()},
                     "observation.state": state_of(place),
                     "action": np.array([*(place - home), (1, 1, -1, -1, -1, 1, 1)[step]], np.float32),
                     "task": task,
@@ -392,11 +401,10 @@ def test_it_learns_to_find_what_a_demonstration_moved(dataset, episodes):
 def large_dataset(tmp_path_factory, episodes):
     """The same table in images of twice the size."""
 
-    def draw(task, thing, other):
-        other_color = next(color for name, color in COLORS.items() if name != task)
-        return image_with((COLORS[task], thing), (other_color, other)).repeat(2, axis=0).repeat(2, axis=1)
+    def draw(*scene):
+        return table_with(*scene).repeat(2, axis=0).repeat(2, axis=1)
 
-    return table_dataset(tmp_path_factory.mktemp("data") / "large", episodes, draw)
+    return table_dataset(tmp_path_factory.mktemp("data") / "large", episodes, image=draw)
 
 
 def test_it_learns_to_find_goals_in_larger_images(large_dataset, episodes, tmp_path):
@@ -407,6 +415,28 @@ def test_it_learns_to_find_goals_in_larger_images(large_dataset, episodes, tmp_p
     policy.save_pretrained(tmp_path)
     loaded = DeltacoPolicy.from_pretrained(tmp_path).eval()
     assert share_found(loaded, large_dataset, episodes) == share_found(policy, large_dataset, episodes)
+
+
+@pytest.mark.slow
+def test_it_learns_to_find_goals_in_one_of_two_cameras_of_256_px(tmp_path_factory, episodes):
+    rng = np.random.default_rng(0)
+
+    def front(*scene):
+        return np.asarray(Image.fromarray(table_with(*scene)).resize((256, 256), Image.Resampling.NEAREST))
+
+    def wrist(*_):
+        return np.kron(rng.integers(0, 255, (8, 8, 3), np.uint8), np.ones((32, 32, 1), np.uint8))
+
+    dataset = table_dataset(
+        tmp_path_factory.mktemp("data") / "two_cameras",
+        episodes,
+        **{"images.wrist": wrist, "images.front": front},
+    )
+    options = {"demo_camera": "observation.images.front", "goal_image_size": 4 * SIZE}
+    policy = trained_to_find(dataset, 60, **options)
+    assert share_found(policy, dataset, episodes)[0] > 0.85
+    assert policy.scenes(batch_of(dataset, [0])).shape == (1, 3, 4 * SIZE, 4 * SIZE)
+    assert policy.select_action(observation(dataset, list(COLORS))).shape == (2, 3)
 
 
 def test_frames_in_memory_give_larger_demonstrations_than_they_are_held_in(large_dataset):
