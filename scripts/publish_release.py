@@ -27,7 +27,7 @@ from lerobot_deltaco.data.hub import (
     push_files,
 )
 
-CHECKPOINT = ROOT / "checkpoints" / "small_a_correspondence"
+CHECKPOINT = ROOT / "checkpoints" / "pick_place"
 ENVIRONMENT = ROOT / "envhub"
 PARTS = ("package", "policy", "environment", "datasets")
 

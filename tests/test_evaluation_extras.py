@@ -21,7 +21,7 @@ from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.processes import EvaluationError, default_processes, run_tasks
 from lerobot_deltaco.evaluation.record import EpisodeResult, read_record, record_path
 
-CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "small_a_correspondence"
+CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "pick_place"
 STEP = 8_000
 TASKS = "24,26,35"
 
@@ -48,7 +48,7 @@ def evaluated(tmp_path_factory):
 
 def test_a_checkpoint_alone_is_evaluated_into_another_folder(evaluated, capsys):
     _, record = evaluated
-    assert (record.experiment, record.run_seed, record.step) == ("small_a_correspondence", 0, STEP)
+    assert (record.experiment, record.run_seed, record.step) == ("pick_place", 0, STEP)
     assert not (CHECKPOINT / "evaluations").exists()
     with pytest.raises(SystemExit):
         evaluate_command.main([str(CHECKPOINT), "--tasks", TASKS])
@@ -168,7 +168,7 @@ def test_the_demonstration_or_the_instruction_is_left_out(tmp_path, capsys):
         out = tmp_path / modality
         record = command(out, "--leave-out", modality, "--processes", "1", tasks="24")
         assert record.policy["leave_out"] == modality
-        assert record.experiment == f"small_a_correspondence_without_{modality}"
+        assert record.experiment == f"pick_place_without_{modality}"
         assert {episode.demonstration for episode in record.episodes} == {demonstration}
         with pytest.raises(SystemExit):
             command(out, tasks="24")

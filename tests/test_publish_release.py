@@ -52,7 +52,7 @@ def test_a_release_is_published_and_everything_in_it_can_be_used(dist, dataset, 
             assert result.returncode == 0, result.stdout + result.stderr
         assert result.stdout.splitlines() == [
             "Published package lerobot_policy_deltaco",
-            f"Published {hub.url}/{USER}/deltaco_small_a_correspondence",
+            f"Published {hub.url}/{USER}/deltaco_pick_place",
             f"Published {hub.url}/{USER}/deltaco",
             f"Published {hub.url}/datasets/{USER}/deltaco_two_tasks",
         ]
@@ -72,7 +72,7 @@ from lerobot.envs import close_envs, make_env
 assert lerobot_deltaco.__file__.startswith({str(target)!r})
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 dataset = LeRobotDataset("{USER}/deltaco_two_tasks")
-policy = DeltacoPolicy.from_pretrained("{USER}/deltaco_small_a_correspondence")
+policy = DeltacoPolicy.from_pretrained("{USER}/deltaco_pick_place")
 envs = make_env("{USER}/deltaco:scenario_b_test.py", trust_remote_code=True)
 print(dataset.num_episodes, policy.config.demo_encoder, *(len(group) for group in envs.values()))
 close_envs(envs)
@@ -83,13 +83,13 @@ close_envs(envs)
 
         cards = {
             name: hub.repos["model", f"{USER}/{name}"].files()["README.md"].decode()
-            for name in ("deltaco", "deltaco_small_a_correspondence")
+            for name in ("deltaco", "deltaco_pick_place")
         }
         assert "USER/NAME" not in cards["deltaco"]
         assert f'make_env("{USER}/deltaco"' in cards["deltaco"]
         assert (
-            f"lerobot-eval --policy.path={USER}/deltaco_small_a_correspondence"
-            in cards["deltaco_small_a_correspondence"]
+            f"lerobot-eval --policy.path={USER}/deltaco_pick_place"
+            in cards["deltaco_pick_place"]
         )
 
 
@@ -108,7 +108,7 @@ def test_a_part_that_fails_names_what_is_left_and_can_be_repeated(dist, dataset,
         result = publish(USER, "--dist", dist, "--datasets", dataset, *left, environment=environment)
         assert result.returncode == 0, result.stderr
         assert set(hub.repos) == {
-            ("model", f"{USER}/deltaco_small_a_correspondence"),
+            ("model", f"{USER}/deltaco_pick_place"),
             ("model", f"{USER}/deltaco"),
             ("dataset", f"{USER}/deltaco_two_tasks"),
         }

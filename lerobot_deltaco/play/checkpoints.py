@@ -13,7 +13,7 @@ from pathlib import Path
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.play.sources import CHECKPOINT, find_folder, read_json
 
-DEFAULT_NAME = "small_a_correspondence"
+DEFAULT_NAME = "pick_place"
 
 _CONFIG = "config.json"
 _PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
