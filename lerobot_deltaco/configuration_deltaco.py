@@ -153,15 +153,16 @@ class DeltacoConfig(PreTrainedConfig):
         encoder_loss_weight: Weight of the encoder loss, alpha_d in the paper's equation 3.
         temperature: Temperature of the contrastive loss.
         crop_padding: Largest random shift of observations in training, in pixels; 0 for none.
-        demo_crop_padding: Largest random shift of demonstrations in training, in pixels; 0 for none. Without
-            it, the encoder overfits to a small dataset.
+        demo_crop_padding: Largest random shift of demonstrations in training, in pixels of images of
+            `image_size`; 0 for none. Without it, the encoder overfits to a small dataset.
         demo_camera: Name of the camera for demonstrations and goals, such as "observation.images.front". By
             default, the first.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation, with
             `demo_encoder=correspondence`.
         goal_image_size: Height and width to which the first image of an episode and those of the
-            demonstrations are scaled for finding goals: `image_size`, or 2, 4 or 8 times as much, so that
-            small objects of the same color can be told apart by their shapes. By default, `image_size`.
+            demonstrations are scaled for finding goals: `image_size`, or 2, 4 or 8 times as much. The
+            dataset's images must be at least as large. By default, `image_size`. On the benchmark, 96
+            instead of 48 did not help.
         goal_noise: Standard deviation of the noise on goals in training, in coordinates in which an image's
             edges are at -1 and 1; 0.04 is a pixel of 48.
         grasp_depth: Whether goals include the depth of the grasp (`policy/goal_states.py`), estimated from
@@ -608,6 +609,13 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 f"`demo_camera` must be one of the dataset's cameras, {', '.join(self.image_features)}. Got "
                 f"{self.demo_camera!r}."
+            )
+        height, width = shapes[self.cameras[0]][1:]
+        if self.goal_image_size is not None and min(height, width) < self.goal_image_size:
+            raise ValueError(
+                f"`goal_image_size` is {self.goal_image_size}, but the images of {self.cameras[0]} have "
+                f"{height} x {width} pixels. It must be at most {min(height, width)}; leave it out to find "
+                "goals in the images that the policy's network gets."
             )
         if self.locates_goals and (self.gripper_index is None or self.robot_state_feature is None):
             raise ValueError(

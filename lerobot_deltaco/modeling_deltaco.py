@@ -373,6 +373,9 @@ class DeltacoPolicy(PreTrainedPolicy):
             robot_data: States and actions of the robot in them, for `demo_encoder=correspondence`.
         """
         self.train_demonstrations = demonstrations
+        # Each of several processes has its own copy, which PyTorch would otherwise send again at every step.
+        names = [name for name, _ in self.named_buffers() if name.startswith("train_demonstrations.")]
+        self._ddp_params_and_buffers_to_ignore = names
         self._train_demonstrations_are_complete = True
         if self.goals is not None:
             assert robot_data is not None

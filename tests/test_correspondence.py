@@ -449,6 +449,16 @@ def test_frames_in_memory_give_larger_demonstrations_than_they_are_held_in(large
     assert held.tasks == read.tasks
 
 
+def test_smaller_images_than_goals_are_found_in_are_refused(dataset, large_dataset):
+    with pytest.raises(ValueError, match="`goal_image_size` is 48, but the images .* have 24 x 24 pixels"):
+        small_policy(dataset, **CORRESPONDENCE, goal_image_size=2 * SIZE)
+    demos = {"demo_repo_id": "test/table", "demo_root": str(dataset.root)}
+    with pytest.raises(
+        ValueError, match="have images of 24 x 24 pixels, but the policy finds goals in .* 48"
+    ):
+        small_policy(large_dataset, **CORRESPONDENCE, **demos, goal_image_size=2 * SIZE)
+
+
 def test_only_the_grasp_depends_on_the_detail_of_larger_images():
     locator = GoalLocator("demo", "condition", 5, 8, 8, detail=2).eval()
     rough = torch.rand(2, 2, 3, SIZE, SIZE).repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)

@@ -87,10 +87,7 @@ close_envs(envs)
         }
         assert "USER/NAME" not in cards["deltaco"]
         assert f'make_env("{USER}/deltaco"' in cards["deltaco"]
-        assert (
-            f"lerobot-eval --policy.path={USER}/deltaco_pick_place"
-            in cards["deltaco_pick_place"]
-        )
+        assert f"lerobot-eval --policy.path={USER}/deltaco_pick_place" in cards["deltaco_pick_place"]
 
 
 @pytest.mark.slow

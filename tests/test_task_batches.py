@@ -1,11 +1,12 @@
 """Batches of tasks: what is in them, and that their order is a function of the seed."""
 
+import re
 from collections import Counter
 
 import numpy as np
 import pytest
 
-from lerobot_deltaco.training.task_batches import TaskBatchSampler
+from lerobot_deltaco.training.task_batches import TaskBatchSampler, count_upsampled_tasks
 
 # 7 tasks of 10, 20, ... 70 frames.
 TASKS = np.repeat(np.arange(7), np.arange(10, 80, 10))
@@ -84,10 +85,20 @@ def test_frames_that_are_not_used_are_not_drawn():
         ),
         (
             {"batch_size": 8, "tasks_per_batch": 4, "upsampled": [0, 1], "upsampled_share": 0.4},
-            "1 to 3 of them, such as 0.5. Got 0.4, which is 1.6 tasks",
+            "1 to 3 of the 4 in a batch, such as 0.5 for 2. Got 0.4, which is 1.6 tasks",
         ),
     ],
 )
 def test_numbers_that_do_not_fit_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         TaskBatchSampler(TASKS, **arguments)
+
+
+@pytest.mark.parametrize("n_tasks", range(2, 25))
+def test_the_share_that_an_error_suggests_is_accepted(n_tasks):
+    for share in (0.01, 0.31, 0.99):
+        try:
+            count_upsampled_tasks(share, n_tasks)
+        except ValueError as error:
+            suggested = float(re.search(r"such as ([0-9.]+) for", str(error))[1])
+            assert 1 <= count_upsampled_tasks(suggested, n_tasks) < n_tasks

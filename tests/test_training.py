@@ -14,7 +14,9 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_train
 from PIL import Image
 from safetensors.torch import load_file
-from small_policies import REPO_ID, TASKS, batch_of, write_dataset
+from small_policies import REPO_ID, TASKS, batch_of, small_policy, write_dataset
+from torch import distributed
+from torch.nn.parallel import DistributedDataParallel
 
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import load_demonstrations
@@ -282,6 +284,44 @@ def test_windows_of_videos_equal_those_that_lerobot_reads(tmp_path, seconds):
         assert torch.equal(found[name], expected[name]), name
     # The dataset still gives windows.
     assert torch.equal(read[3][camera], expected[camera][3])
+
+
+def test_larger_demonstrations_are_decoded_from_videos(tmp_path):
+    camera = "observation.images.top"
+    features = {
+        camera: {"dtype": "video", "shape": (48, 48, 3), "names": ["height", "width", "channels"]},
+        "action": {"dtype": "float32", "shape": (2,), "names": None},
+    }
+    encoder = RGBEncoderConfig(vcodec="h264")
+    written = LeRobotDataset.create("test/video", 10, features, root=tmp_path / "video", rgb_encoder=encoder)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        for _ in range(4):
+            image = np.kron(rng.integers(0, 255, (6, 6, 3), np.uint8), np.ones((8, 8, 1), np.uint8))
+            written.add_frame({camera: image, "action": np.ones(2, np.float32), "task": "wave"})
+        written.save_episode()
+    written.finalize()
+    options = {"root": written.root, "return_uint8": True, "video_backend": "pyav"}
+    dataset = LeRobotDataset("test/video", episodes=[0, 2], **options)
+    held = FramesInMemory(dataset, image_size=16).demonstrations(camera, 48, 2)
+    for row, episode in enumerate((0, 2)):
+        for frame, step in enumerate((0, 3)):
+            expected = LeRobotDataset("test/video", **options)[4 * episode + step][camera]
+            assert torch.equal(held.frames[row, frame], expected)
+
+
+def test_processes_do_not_send_each_other_demonstrations(dataset, tmp_path):
+    frames = FramesInMemory(dataset)
+    policy, _, _ = small_policy(dataset)
+    policy.set_train_demonstrations(frames.demonstrations("observation.images.top", 16, 2))
+    store = distributed.FileStore(str(tmp_path / "store"), 1)
+    distributed.init_process_group("gloo", store=store, rank=0, world_size=1)
+    try:
+        sent = {buffer.data_ptr() for buffer in DistributedDataParallel(policy).modules_buffers}
+    finally:
+        distributed.destroy_process_group()
+    assert policy.step.data_ptr() in sent
+    assert not sent & {buffer.data_ptr() for buffer in policy.train_demonstrations.buffers()}
 
 
 def test_reward_models_are_sent_to_lerobots_command():

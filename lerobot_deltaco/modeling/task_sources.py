@@ -36,10 +36,18 @@ def read_demonstrations(
 
     Raises:
         FileNotFoundError: There is no network, and no dataset in the folder.
-        ValueError: The dataset has no such camera or episode.
+        ValueError: The dataset has no such camera or episode, or its images are too small for finding goals.
     """
     camera = config.cameras[0]
-    return load_demonstrations(repo_id, root, episodes, camera, config.demo_image_size, config.n_demo_frames)
+    return load_demonstrations(
+        repo_id,
+        root,
+        episodes,
+        camera,
+        config.demo_image_size,
+        config.n_demo_frames,
+        may_enlarge=config.goal_image_size is None,
+    )
 
 
 def read_training_demonstrations(

@@ -101,6 +101,12 @@ class EpisodeDataset:
                 f"The dataset {self._name!r} has no camera {camera!r}, which the checkpoint expects. Its "
                 f"cameras are {', '.join(meta.camera_keys) or 'none'}."
             )
+        _, *sides = sorted(meta.features[camera]["shape"])  # without the channels
+        if config.goal_image_size is not None and min(sides) < config.goal_image_size:
+            raise PlayError(
+                f"The dataset {self._name!r} has images of {sides[0]} x {sides[1]} pixels. The checkpoint "
+                f"finds goals in images of {config.goal_image_size}."
+            )
         if not _needs_robot(config):
             return
         for key, feature in ((OBS_STATE, config.robot_state_feature), (ACTION, config.action_feature)):

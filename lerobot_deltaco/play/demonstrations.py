@@ -24,7 +24,8 @@ class Demonstration:
 
     Attributes:
         title: Description for the page.
-        frames: Kept images, the first and the last among them, (kept, H, W, 3), at the policy's size.
+        frames: Kept images, the first and the last among them, (kept, H, W, 3), of the policy's
+            `demo_image_size`.
         grasp_state: Robot state when the gripper closed, (state,); NaN if it never did, None if it is not
             known.
         video: All of its images as an MP4 file; None if they are not known.

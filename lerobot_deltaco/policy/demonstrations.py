@@ -262,6 +262,7 @@ def load_demonstrations(
     camera: str,
     image_size: int,
     n_demo_frames: int,
+    may_enlarge: bool = True,
 ) -> DemonstrationSet:
     """Reads demonstrations from a LeRobotDataset.
 
@@ -272,16 +273,24 @@ def load_demonstrations(
         camera: Key of the images, such as "observation.image".
         image_size: Height and width to which images are scaled, px.
         n_demo_frames: Number of frames per demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
+        may_enlarge: Whether images may be smaller than that.
 
     Raises:
         FileNotFoundError: There is no network, and no dataset in the folder.
-        ValueError: The dataset has no such camera or episode.
+        ValueError: The dataset has no such camera or episode, or smaller images.
     """
     check_dataset_folder("--policy.demo_root", root)
     dataset = LeRobotDataset(repo_id, root=root, return_uint8=True)
     if camera not in dataset.meta.camera_keys:
         raise ValueError(
             f"The demonstrations in {repo_id} have no camera {camera!r}, only {dataset.meta.camera_keys}."
+        )
+    _, *sides = sorted(dataset.meta.features[camera]["shape"])  # without the channels
+    if min(sides) < image_size and not may_enlarge:
+        raise ValueError(
+            f"The demonstrations in {repo_id} have images of {sides[0]} x {sides[1]} pixels, but the policy "
+            f"finds goals in images of {image_size} (`goal_image_size`). Name a dataset with images of that "
+            "size."
         )
     total = dataset.meta.total_episodes
     episodes = list(range(total)) if episodes is None else list(episodes)

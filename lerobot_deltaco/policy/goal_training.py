@@ -18,6 +18,8 @@ from lerobot_deltaco.policy.networks import random_shifts, shift_images
 from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
 from lerobot_deltaco.policy.training_goals import TrainingGoals, find_training_goals
 
+_RESIZED_AT_A_TIME = 256
+
 
 class GoalBatch(NamedTuple):
     """Samples on which goals are learned to be found.
@@ -99,11 +101,11 @@ class GoalTrainer:
         if to_image is None:
             to_image = StateToImage(states.shape[1]).to(device)
         self._detail = conditioning.locator.detail
-        size = frames.shape[-1] // self._detail  # that of the maps' cells is what the calibration is made for
+        size = frames.shape[-1] // self._detail  # without the detail, of which the calibration needs none
         self.goals: TrainingGoals = find_training_goals(
             to_image,
-            resize_images(frames[:, 0], size),
-            resize_images(frames[:, -1], size),
+            _resized(frames[:, 0], size),
+            _resized(frames[:, -1], size),
             states,
             gripper,
             robot_data.spans,
@@ -219,3 +221,8 @@ class GoalTrainer:
         height, width = images.shape[-2:]
         moved = (shifts * 2 / torch.tensor([width, height])).to(places.device)  # (batch, 2)
         return shift_images(images, shifts, padding), places + moved[:, None]
+
+
+def _resized(images: Tensor, size: int) -> Tensor:
+    """Images (n, 3, H, W), uint8, as (n, 3, size, size): a few at a time, since they are floats meanwhile."""
+    return torch.cat([resize_images(part, size) for part in images.split(_RESIZED_AT_A_TIME)])

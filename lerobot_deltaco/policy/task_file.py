@@ -146,7 +146,7 @@ def check_demonstrations(
     Args:
         path: The file.
         demonstrations: Demonstrations of the file.
-        image_size: Height and width of the policy's images, px.
+        image_size: Height and width of the policy's images of demonstrations, px.
         n_kept: Number of frames that the policy keeps of each demonstration.
 
     Raises:

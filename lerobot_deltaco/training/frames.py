@@ -45,6 +45,7 @@ class FramesInMemory:
         device: Device of the batches, and of the frames if they fit.
         image_size: Height and width to which images are scaled, None for their own.
         may_use_gpu: Whether frames may be held on a GPU, next to a policy that needs little of its memory.
+        reserved_bytes: Memory that is left free beside the frames, for larger demonstrations.
 
     A batch has the windows of frames that the dataset's `delta_timestamps` ask for, as LeRobot's has.
 
@@ -59,6 +60,7 @@ class FramesInMemory:
         device: torch.device | str = "cpu",
         image_size: int | None = None,
         may_use_gpu: bool = True,
+        reserved_bytes: int = 0,
     ) -> None:
         if dataset.image_transforms is not None:
             raise ValueError(
@@ -67,7 +69,7 @@ class FramesInMemory:
                 "`lerobot-train`."
             )
         self.device, self._dataset = torch.device(device), dataset
-        self.held_on = self._choose_device(dataset, image_size, may_use_gpu)
+        self.held_on = self._choose_device(needed_bytes(dataset, image_size) + reserved_bytes, may_use_gpu)
         cameras = dataset.meta.camera_keys
         self.columns: dict[str, Tensor] = {}
         self.texts: dict[str, list[str]] = {}
@@ -147,9 +149,12 @@ class FramesInMemory:
         episodes = list(self.spans) if episodes is None else list(episodes)
         rows = torch.stack([kept_frame_indices(*self.spans[episode], n_demo_frames) for episode in episodes])
         images = self.columns[camera]
-        if image_size > min(images.shape[-2:]):
-            # They may be larger in the dataset than they are held.
-            images = _camera_images(self._dataset, camera, image_size, self.held_on, rows.flatten().tolist())
+        _, *sides = sorted(self._dataset.meta.features[camera]["shape"])  # without the channels
+        if image_size > min(images.shape[-2:]) < min(sides):
+            # They are larger in the dataset than they are held.
+            images = _camera_images(
+                self._dataset, camera, image_size, self.held_on, rows.flatten().tolist(), "demonstrations, "
+            )
             images = images.unflatten(0, rows.shape)
         else:
             images = images[rows.to(self.held_on)]  # (episodes, kept, 3, h, w)
@@ -186,10 +191,7 @@ class FramesInMemory:
                 use[release + 1 + n_after : last + 1] = False
         return use
 
-    def _choose_device(
-        self, dataset: LeRobotDataset, image_size: int | None, may_use_gpu: bool
-    ) -> torch.device:
-        needed = needed_bytes(dataset, image_size)
+    def _choose_device(self, needed: int, may_use_gpu: bool) -> torch.device:
         allowed = {"cpu": int(psutil.virtual_memory().available * GREATEST_SHARE["cpu"])}
         if self.device.type == "cuda" and may_use_gpu:
             allowed["cuda"] = int(torch.cuda.mem_get_info(self.device)[0] * GREATEST_SHARE["cuda"])
@@ -198,7 +200,7 @@ class FramesInMemory:
         if needed <= allowed["cpu"]:
             return torch.device("cpu")
         raise MemoryError(
-            f"The {dataset.num_frames:,} frames take {needed / 1e9:.1f} GB of memory, and "
+            f"The {self._dataset.num_frames:,} frames take {needed / 1e9:.1f} GB of memory, and "
             f"{allowed['cpu'] / 1e9:.1f} GB may be used here. Train on fewer episodes (--dataset.episodes), "
             "or with `lerobot-train`, which reads them from the disk."
         )
@@ -255,6 +257,7 @@ def _camera_images(
     image_size: int | None,
     device: torch.device,
     wanted: Sequence[int] | None = None,
+    what: str = "",
 ) -> Tensor:
     """Images of a camera, (frames, 3, H, W) uint8, of the wanted rows of a dataset or of all."""
     is_image = dataset.meta.features[camera]["dtype"] == "image"
@@ -264,7 +267,7 @@ def _camera_images(
     images: Tensor | None = None
     with (
         ThreadPoolExecutor(os.cpu_count()) as threads,
-        tqdm(total=n_frames, desc=f"Decoding {camera}", unit="frame") as progress,
+        tqdm(total=n_frames, desc=f"Decoding {what}{camera}", unit="frame") as progress,
     ):
         for start in range(0, n_frames, CHUNK):
             rows = wanted[start : start + CHUNK]

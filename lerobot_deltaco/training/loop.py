@@ -41,6 +41,7 @@ from lerobot_deltaco.lerobot_internals import (
 )
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.dataset_folders import check_dataset_folder
+from lerobot_deltaco.policy.demonstrations import kept_frame_indices
 from lerobot_deltaco.training.frames import FramesInMemory
 from lerobot_deltaco.training.remote_job import check_remote_job
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
@@ -159,9 +160,17 @@ class InMemoryTraining:
             shapes = [train.meta.features[camera]["shape"] for camera in train.meta.camera_keys]
             if any(3 * policy.image_size**2 < np.prod(shape) for shape in shapes):
                 image_size = policy.image_size
+        larger = 0
+        if isinstance(policy, DeltacoConfig) and policy.goal_image_size is not None:
+            n_kept = len(kept_frame_indices(0, 0, policy.n_demo_frames))
+            larger = train.num_episodes * n_kept * 3 * policy.goal_image_size**2
         # Other policies may need all of a GPU's memory.
         self._frames = FramesInMemory(
-            train, self._device(policy), image_size, may_use_gpu=isinstance(policy, DeltacoConfig)
+            train,
+            self._device(policy),
+            image_size,
+            may_use_gpu=isinstance(policy, DeltacoConfig),
+            reserved_bytes=larger,
         )
         return FrameIndexDataset(train), evaluation
 

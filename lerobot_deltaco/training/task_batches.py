@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+_SHARE_TOLERANCE = 1e-3  # in tasks: a third may be written as 0.3333
+
 
 class TaskBatchSampler:
     """Frames in an order whose successive batches hold the same number of samples of each of a few tasks.
@@ -144,11 +146,11 @@ def count_upsampled_tasks(share: float, tasks_per_batch: int) -> int:
         ValueError: It is not a whole number, or no other task is left.
     """
     n_upsampled = round(share * tasks_per_batch)
-    if abs(n_upsampled - share * tasks_per_batch) > 1e-6 or not 0 < n_upsampled < tasks_per_batch:
-        nearest = min(max(n_upsampled, 1), tasks_per_batch - 1) / tasks_per_batch
+    if abs(n_upsampled - share * tasks_per_batch) > _SHARE_TOLERANCE or not 0 < n_upsampled < tasks_per_batch:
+        nearest = min(max(n_upsampled, 1), tasks_per_batch - 1)
         raise ValueError(
-            f"`upsampled_share` must be a whole number of the {tasks_per_batch} tasks of a batch, 1 to "
-            f"{tasks_per_batch - 1} of them, such as {nearest:g}. Got {share}, which is "
-            f"{share * tasks_per_batch:g} tasks."
+            f"`upsampled_share` must be the share of a whole number of tasks, 1 to {tasks_per_batch - 1} of "
+            f"the {tasks_per_batch} in a batch, such as {nearest / tasks_per_batch:g} for {nearest}. Got "
+            f"{share}, which is {share * tasks_per_batch:g} tasks."
         )
     return n_upsampled
