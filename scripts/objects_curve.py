@@ -26,7 +26,10 @@ def curves() -> dict[str, dict[int, Estimate]]:
     """Success of all tasks and of each kind, by the number of training objects."""
     found: dict[str, dict[int, Estimate]] = defaultdict(dict)
     for series in make_report(find_records([FOLDER / "records"])).regular:
-        n_objects = int(series.experiment.rpartition("_")[2])
+        number = series.experiment.rpartition("/objects_")[2]
+        if not number.isdecimal():
+            continue  # another policy, with as many objects
+        n_objects = int(number)
         groups: dict[str, list[EpisodeResult]] = {"all tasks": series.last_episodes}
         for kind in KINDS:
             groups[kind] = [item for item in series.last_episodes if get_task(item.task_id).kind == kind]
