@@ -118,6 +118,7 @@ _OWN_LABELS: Mapping[str, str] = MappingProxyType(
         "objects_24": "24 training objects",
         "objects_100": "100 training objects",
         "objects_400": "400 training objects",
+        "objects_400_either": "400 training objects, takes either input",
     }
 )
 # What experiments whose names begin so have in common.
