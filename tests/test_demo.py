@@ -96,7 +96,7 @@ def test_the_number_format_is_chosen_once(demo, monkeypatch):
 
 @pytest.mark.parametrize(
     ("seconds", "steps"),
-    [(0.1, recipe.TRAINING_SECONDS * 10), (9.0, recipe.LEAST_STEPS), (1e-3, recipe.MOST_STEPS)],
+    [(0.05, recipe.TRAINING_SECONDS * 20), (9.0, recipe.LEAST_STEPS), (1e-3, recipe.MOST_STEPS)],
 )
 def test_the_number_of_training_steps_fits_the_machine_and_is_chosen_once(demo, monkeypatch, seconds, steps):
     done = []
