@@ -453,9 +453,7 @@ def test_smaller_images_than_goals_are_found_in_are_refused(dataset, large_datas
     with pytest.raises(ValueError, match="`goal_image_size` is 48, but the images .* have 24 x 24 pixels"):
         small_policy(dataset, **CORRESPONDENCE, goal_image_size=2 * SIZE)
     demos = {"demo_repo_id": "test/table", "demo_root": str(dataset.root)}
-    with pytest.raises(
-        ValueError, match="have images of 24 x 24 pixels, but the policy finds goals in .* 48"
-    ):
+    with pytest.raises(ValueError, match="have images of 24 pixels, but the policy finds goals in .* 48"):
         small_policy(large_dataset, **CORRESPONDENCE, **demos, goal_image_size=2 * SIZE)
 
 

@@ -30,7 +30,7 @@ from lerobot_deltaco.play.demonstrations import Demonstration, check_number, dem
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.play.sources import DATASET, find_folder, read_json
 from lerobot_deltaco.policy.dataset_folders import INFO_FILE
-from lerobot_deltaco.policy.demonstrations import to_uint8
+from lerobot_deltaco.policy.demonstrations import shorter_side, to_uint8
 
 logger = logging.getLogger(__name__)
 
@@ -101,11 +101,11 @@ class EpisodeDataset:
                 f"The dataset {self._name!r} has no camera {camera!r}, which the checkpoint expects. Its "
                 f"cameras are {', '.join(meta.camera_keys) or 'none'}."
             )
-        _, *sides = sorted(meta.features[camera]["shape"])  # without the channels
-        if config.goal_image_size is not None and min(sides) < config.goal_image_size:
+        side = shorter_side(meta.features[camera]["shape"])
+        if config.goal_image_size is not None and side < config.goal_image_size:
             raise PlayError(
-                f"The dataset {self._name!r} has images of {sides[0]} x {sides[1]} pixels. The checkpoint "
-                f"finds goals in images of {config.goal_image_size}."
+                f"The dataset {self._name!r} has images of {side} pixels. The checkpoint finds goals in "
+                f"images of {config.goal_image_size}."
             )
         if not _needs_robot(config):
             return

@@ -285,12 +285,11 @@ def load_demonstrations(
         raise ValueError(
             f"The demonstrations in {repo_id} have no camera {camera!r}, only {dataset.meta.camera_keys}."
         )
-    _, *sides = sorted(dataset.meta.features[camera]["shape"])  # without the channels
-    if min(sides) < image_size and not may_enlarge:
+    side = shorter_side(dataset.meta.features[camera]["shape"])
+    if side < image_size and not may_enlarge:
         raise ValueError(
-            f"The demonstrations in {repo_id} have images of {sides[0]} x {sides[1]} pixels, but the policy "
-            f"finds goals in images of {image_size} (`goal_image_size`). Name a dataset with images of that "
-            "size."
+            f"The demonstrations in {repo_id} have images of {side} pixels, but the policy finds goals in "
+            f"images of {image_size} (`goal_image_size`). Name a dataset with images of that size."
         )
     total = dataset.meta.total_episodes
     episodes = list(range(total)) if episodes is None else list(episodes)
@@ -340,6 +339,11 @@ def load_robot_data(repo_id: str, root: str | Path | None, episodes: Sequence[in
     )
     starts, ends = (dataset.meta.episodes[f"dataset_{side}_index"][:] for side in ("from", "to"))
     return RobotData(states, actions, [(starts[episode], ends[episode] - 1) for episode in episodes])
+
+
+def shorter_side(shape: Sequence[int]) -> int:
+    """Shorter side of a dataset's images, px, whose shape is (H, W, 3) or (3, H, W)."""
+    return sorted(shape)[1]
 
 
 def kept_frame_indices(first: int, last: int, n_demo_frames: int) -> Tensor:

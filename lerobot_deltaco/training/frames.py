@@ -27,6 +27,7 @@ from lerobot_deltaco.policy.demonstrations import (
     RobotData,
     kept_frame_indices,
     resize_images,
+    shorter_side,
     to_uint8,
 )
 from lerobot_deltaco.policy.keyframes import release_frames
@@ -149,8 +150,8 @@ class FramesInMemory:
         episodes = list(self.spans) if episodes is None else list(episodes)
         rows = torch.stack([kept_frame_indices(*self.spans[episode], n_demo_frames) for episode in episodes])
         images = self.columns[camera]
-        _, *sides = sorted(self._dataset.meta.features[camera]["shape"])  # without the channels
-        if image_size > min(images.shape[-2:]) < min(sides):
+        stored_side = shorter_side(self._dataset.meta.features[camera]["shape"])
+        if image_size > min(images.shape[-2:]) < stored_side:
             # They are larger in the dataset than they are held.
             images = _camera_images(
                 self._dataset, camera, image_size, self.held_on, rows.flatten().tolist(), "demonstrations, "
