@@ -254,21 +254,30 @@ def test_windows_of_frames_equal_those_that_lerobot_reads(dataset):
     assert torch.equal(found[camera].to(torch.float32) / 255, expected[camera])
 
 
-@pytest.mark.parametrize("seconds", [[-0.1, 0.0], [0.0]], ids=["two frames", "one frame"])
-def test_windows_of_videos_equal_those_that_lerobot_reads(tmp_path, seconds):
-    camera = "observation.images.top"
+def write_videos(root, camera, episodes):
+    """A dataset whose images, (H, W, 3) uint8 in each list of `episodes`, are videos."""
     features = {
-        camera: {"dtype": "video", "shape": (32, 48, 3), "names": ["height", "width", "channels"]},
+        camera: {"dtype": "video", "shape": episodes[0][0].shape, "names": ["height", "width", "channels"]},
         "action": {"dtype": "float32", "shape": (2,), "names": None},
     }
     encoder = RGBEncoderConfig(vcodec="h264")
-    written = LeRobotDataset.create("test/video", 10, features, root=tmp_path / "video", rgb_encoder=encoder)
-    for episode in range(2):
-        for step in range(4):
-            image = np.full((32, 48, 3), 100 * episode + 20 * step, np.uint8)
-            written.add_frame({camera: image, "action": np.ones(2, np.float32) * step, "task": "wave"})
+    written = LeRobotDataset.create("test/video", 10, features, root=root, rgb_encoder=encoder)
+    for images in episodes:
+        for step, image in enumerate(images):
+            written.add_frame({camera: image, "action": np.full(2, step, np.float32), "task": "wave"})
         written.save_episode()
     written.finalize()
+    return written
+
+
+@pytest.mark.parametrize("seconds", [[-0.1, 0.0], [0.0]], ids=["two frames", "one frame"])
+def test_windows_of_videos_equal_those_that_lerobot_reads(tmp_path, seconds):
+    camera = "observation.images.top"
+    images = [
+        [np.full((32, 48, 3), 100 * episode + 20 * step, np.uint8) for step in range(4)]
+        for episode in range(2)
+    ]
+    written = write_videos(tmp_path / "video", camera, images)
     windows = {camera: seconds, "action": [0.0, 0.1]}
     read = LeRobotDataset(
         "test/video",
@@ -288,19 +297,10 @@ def test_windows_of_videos_equal_those_that_lerobot_reads(tmp_path, seconds):
 
 def test_larger_demonstrations_are_decoded_from_videos(tmp_path):
     camera = "observation.images.top"
-    features = {
-        camera: {"dtype": "video", "shape": (48, 48, 3), "names": ["height", "width", "channels"]},
-        "action": {"dtype": "float32", "shape": (2,), "names": None},
-    }
-    encoder = RGBEncoderConfig(vcodec="h264")
-    written = LeRobotDataset.create("test/video", 10, features, root=tmp_path / "video", rgb_encoder=encoder)
     rng = np.random.default_rng(0)
-    for _ in range(3):
-        for _ in range(4):
-            image = np.kron(rng.integers(0, 255, (6, 6, 3), np.uint8), np.ones((8, 8, 1), np.uint8))
-            written.add_frame({camera: image, "action": np.ones(2, np.float32), "task": "wave"})
-        written.save_episode()
-    written.finalize()
+    block = np.ones((8, 8, 1), np.uint8)
+    images = [[np.kron(rng.integers(0, 255, (6, 6, 3), np.uint8), block) for _ in range(4)] for _ in range(3)]
+    written = write_videos(tmp_path / "video", camera, images)
     options = {"root": written.root, "return_uint8": True, "video_backend": "pyav"}
     dataset = LeRobotDataset("test/video", episodes=[0, 2], **options)
     held = FramesInMemory(dataset, image_size=16).demonstrations(camera, 48, 2)
