@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, cast, get_args, get_origin
@@ -56,26 +56,36 @@ def type_hints(kind: type[Any]) -> dict[str, Any]:
 
 def is_a(value: Any, kind: Any) -> bool:
     """Whether a value is of a declared type."""
+    return _type_check(kind)(value)
+
+
+@cache
+def _type_check(kind: Any) -> Callable[[Any], bool]:
+    """The check of a declared type, made once: records have hundreds of thousands of values."""
     origin, options = get_origin(kind), get_args(kind)
     if kind is Any:
-        return True
+        return lambda value: True
     if origin is Literal:
-        return type(value) is str and value in options
+        return lambda value: type(value) is str and value in options
     if origin in (UnionType, Union):
-        return any(is_a(value, option) for option in options)
+        checks = [_type_check(option) for option in options]
+        return lambda value: any(check(value) for check in checks)
     if origin is list:
-        return isinstance(value, list) and all(is_a(item, options[0]) for item in value)
+        check_item = _type_check(options[0])
+        return lambda value: isinstance(value, list) and all(map(check_item, value))
     if origin is dict:
-        return isinstance(value, dict) and all(
-            is_a(name, options[0]) and is_a(item, options[1]) for name, item in value.items()
+        check_name, check_value = map(_type_check, options)
+        return lambda value: (
+            isinstance(value, dict)
+            and (all(map(check_name, value)) and all(map(check_value, value.values())))
         )
     if kind is NoneType:
-        return value is None
+        return lambda value: value is None
     if kind is float:
-        return type(value) in (int, float) and math.isfinite(value)
+        return lambda value: type(value) in (int, float) and math.isfinite(value)
     if kind in (int, bool):
-        return type(value) is kind  # True is no integer here
-    return isinstance(value, kind)
+        return lambda value: type(value) is kind  # True is no integer here
+    return lambda value: isinstance(value, kind)
 
 
 def in_words(kind: Any) -> str:

@@ -202,8 +202,8 @@ def _check_fields(
     if is_older:
         defaults = {field.name: field.default for field in fields(kind) if field.default is not MISSING}
         content = {**defaults, **content}
-    expected = {field.name for field in fields(kind)}
-    if set(content) != expected:
+    expected = type_hints(kind).keys()
+    if content.keys() != expected:
         missing, unknown = sorted(expected - set(content)), sorted(set(content) - expected)
         raise RecordError(
             f"{path} is damaged or of another version: {kind.__name__} lacks {missing or 'nothing'}, and has "

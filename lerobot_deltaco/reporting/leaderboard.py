@@ -97,9 +97,9 @@ def table(root: Path) -> str:
         RecordError: A record is damaged.
     """
     tasks, rows = read_rows(root / ROWS_FILE)
-    ranked = [(_cells(row, root, tasks), _rate(row, root)) for row in rows]
-    ranked.sort(key=lambda item: -item[1])  # stable: what was not run keeps its order
-    return markdown_table(_HEADER, [cells for cells, _ in ranked])
+    ranked = [(row, None if row.records is None else _series(row, root)) for row in rows]
+    ranked.sort(key=_rank)  # stable: what was not run keeps its order
+    return markdown_table(_HEADER, [_cells(row, series, tasks) for row, series in ranked])
 
 
 def updated(page: str, root: Path) -> str:
@@ -122,15 +122,15 @@ def _series(row: Row, root: Path) -> Series:
     return report.regular[0]
 
 
-def _rate(row: Row, root: Path) -> float:
-    return -1.0 if row.records is None else _series(row, root).last.rate or 0.0
+def _rank(item: tuple[Row, Series | None]) -> float:
+    _, series = item
+    return 1.0 if series is None else -(series.last.rate or 0.0)
 
 
-def _cells(row: Row, root: Path, tasks: str) -> Sequence[str]:
+def _cells(row: Row, series: Series | None, tasks: str) -> Sequence[str]:
     command = f"`{row.command}`"
-    if row.records is None:
+    if series is None:
         return [row.method, row.given, NOT_RUN, *("" for _ in KINDS), "", "", "", command]
-    series = _series(row, root)
     recorded = series.sets[-1].record
     if recorded.tasks != tasks:
         raise LeaderboardError(

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache, partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -53,11 +54,12 @@ def paper_tables(root: Path) -> str:
         ReportError: Records do not belong together.
         RecordError: A record is damaged.
     """
+    measured = cache(partial(_measured, root=root))
     sections = []
     for comparison, reference in _REFERENCES.items():
         rows = {name: result for name, result in PAPER_RESULTS.items() if name.startswith(f"{comparison}/")}
         table = markdown_table(
-            _HEADER, [_cells(name, result, reference, root) for name, result in rows.items()]
+            _HEADER, [_cells(name, result, reference, measured) for name, result in rows.items()]
         )
         sections.append(f"### {TITLES[comparison]}\n\n{table}")
     return "\n".join(sections)
@@ -72,12 +74,14 @@ def updated_paper_page(page: str, root: Path) -> str:
     return replaced(page, PAPER_BEGIN, PAPER_END, paper_tables(root))
 
 
-def _cells(name: str, published: PaperResult, reference: str, root: Path) -> list[str]:
+def _cells(
+    name: str, published: PaperResult, reference: str, find_measured: Callable[[str], Series | None]
+) -> list[str]:
     cells = [published.label, f"{100 * published.rate:.1f} ({100 * published.sd:.1f})"]
     paper_difference = ""
     if name != reference:
         paper_difference = f"{100 * (published.rate - PAPER_RESULTS[reference].rate):+.1f}"
-    measured, deltaco = _measured(name, root), _measured(reference, root)
+    measured, deltaco = find_measured(name), find_measured(reference)
     if measured is None:
         return [*cells, NOT_RUN, "", paper_difference, ""]
     difference = ""
