@@ -65,6 +65,7 @@ def test_less_than_one_environment_is_refused(tmp_path):
         load(FOLDER / "env.py", tmp_path, n_envs=0)
 
 
+@pytest.mark.slow  # a process that imports LeRobot
 def test_lerobot_loads_a_file_by_the_repositorys_id(tmp_path):
     with FakeHub() as hub:
         repo = hub.repos["model", f"{USER}/deltaco"] = Repo("public")

@@ -15,7 +15,7 @@ from gym_deltaco.tasks import N_TASKS
 
 ALL_TASKS_SEEDS = 50
 # Every 7th task meets every row and every column of the table.
-SAMPLE = list(range(0, N_TASKS, 7))
+SAMPLE = list(range(0, N_TASKS, 11))
 SAMPLE_SEEDS = 3
 
 

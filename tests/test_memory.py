@@ -31,6 +31,7 @@ print(faults() - before)
 HUGE_PAGES = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     platform.libc_ver()[0] != "glibc"
     or "LD_PRELOAD" in os.environ

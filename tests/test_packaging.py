@@ -15,40 +15,37 @@ LEROBOT_FILES = [*sorted((ROOT / "lerobot_deltaco").rglob("*.py")), ROOT / "lero
 DISTRIBUTION = "lerobot_policy_deltaco"
 
 
-# Both in one process: importing LeRobot takes 10 s.
-HELP = """
-import sys
+# One process imports LeRobot, which takes 10 s, but nothing of this project. Each command runs in a fork of it.
+PROGRAM = """
+import os, sys
 from lerobot.scripts import lerobot_eval, lerobot_train
 
-for name, main in (("train", lerobot_train.main), ("eval", lerobot_eval.main)):
-    sys.argv = [name, "--help"]
-    print(f"HELP OF {name}")
-    try:
-        main()
-    except SystemExit:
-        pass
-"""
-WITHOUT_A_MODULE = """
-import sys
-sys.modules["lerobot_deltaco.training.optimization"] = None
-from lerobot.scripts.lerobot_eval import main
-main()
+MISSING = "lerobot_deltaco.training.optimization"
+
+for name, main, words, missing in (
+    ("train --help", lerobot_train.main, ["--help"], None),
+    ("eval --help", lerobot_eval.main, ["--help"], None),
+    ("eval without a module", lerobot_eval.main, ["--env.type=deltaco"], MISSING),
+):
+    print(f"OUTPUT OF {name}", flush=True)
+    if os.fork():
+        os.wait()
+        continue
+    if missing is not None:
+        sys.modules[missing] = None
+    sys.argv = [name, *words]
+    main()
+    sys.exit()
 """
 
 
 @pytest.fixture(scope="module")
 def lerobot_outputs():
-    """What LeRobot's commands print, by command. The processes run at the same time."""
-    programs = {"help": [HELP], "eval without a module": [WITHOUT_A_MODULE, "--env.type=deltaco"]}
-    processes = {
-        name: subprocess.Popen(
-            [sys.executable, "-c", *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
-        for name, arguments in programs.items()
-    }
-    outputs = {name: process.communicate(timeout=900)[0] for name, process in processes.items()}
-    _, train, evaluate = re.split("^HELP OF .+$", outputs.pop("help"), flags=re.MULTILINE)
-    return {**outputs, "train --help": train, "eval --help": evaluate}
+    """What LeRobot's commands print, by command."""
+    command = [sys.executable, "-c", PROGRAM]
+    result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=900)
+    _, *parts = re.split("^OUTPUT OF (.+)$", result.stdout, flags=re.MULTILINE)
+    return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
 def test_lerobot_requires_the_distribution_name_to_have_underscores():
