@@ -15,7 +15,7 @@ LEROBOT_FILES = [*sorted((ROOT / "lerobot_deltaco").rglob("*.py")), ROOT / "lero
 DISTRIBUTION = "lerobot_policy_deltaco"
 
 
-# One process imports LeRobot, which takes 10 s, but nothing of this project. Each command runs in a fork of it.
+# One process imports LeRobot, which takes 10 s, and nothing of this project. Each command runs in a fork.
 PROGRAM = """
 import os, sys
 from lerobot.scripts import lerobot_eval, lerobot_train
