@@ -389,6 +389,13 @@ def test_the_experts_episode_becomes_the_demonstration(actions, session):
     assert "uccess" in last(actions.run(session, "go")).latest.moment.text
 
 
+def test_a_demonstration_of_an_expert_that_failed_says_so(actions, session):
+    session = last(actions.run_expert(actions.choose_scene(session, 85, 7183)))
+    assert session.latest.moment.text.startswith("Expert. No success.")
+    title = actions.use_recorded(session).demonstration.title
+    assert title == f"{TASKS[85].instruction} (by the expert, seed 7183; it failed)"
+
+
 @pytest.mark.parametrize(("name", "n_panels"), [("attention", 3), ("language", 1)])
 def test_other_policies_show_what_they_receive(checkpoints, actions, name, n_panels):
     session = actions.open_checkpoint(Session(), str(checkpoints / name))

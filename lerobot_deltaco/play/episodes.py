@@ -289,7 +289,8 @@ class Player:
                     yield Moment(video_images[-1], None, text)
         images = torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2)
         robot = torch.from_numpy(np.stack(states)), torch.tensor(gripper)
-        title = f"{task.instruction} (by the expert, seed {scene.seed})"
+        failed = "" if step.info["is_success"] else "; it failed"
+        title = f"{task.instruction} (by the expert, seed {scene.seed}{failed})"
         yield demonstration_of(title, images, robot, self.policy.config, video_images, CONTROL_FPS)
         yield Moment(video_images[-1], None, f"Expert. {outcome(step.info, -1)}")
 

@@ -26,6 +26,7 @@ CSS = """
 .gradio-container { max-width: 1280px !important; margin: 0 auto !important; }
 .message textarea { border: 2px solid #c45400 !important; }
 .pixels img { image-rendering: pixelated; }
+.gradio-container input[role="combobox"] { padding-right: 1.75rem !important; text-overflow: ellipsis; }
 """
 # Fonts of the system: the page needs no other server.
 THEME = gr.themes.Default(
