@@ -79,10 +79,15 @@ release: $(INSTALLED) ## Check everything that a release needs; publish it with 
 	$(BIN)/python scripts/check_release.py $(ARGS)
 	$(if $(HUB_USER),$(BIN)/python scripts/publish_release.py $(HUB_USER) --datasets $(DATASETS))
 
-lint: $(INSTALLED) ## Check style and types
+lint: $(INSTALLED) ## Check style, types, and the files that GitHub reads
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
+	$(BIN)/check-jsonschema --builtin-schema vendor.github-issue-config .github/ISSUE_TEMPLATE/config.yml
+	$(BIN)/check-jsonschema --builtin-schema vendor.github-issue-forms \
+		$(filter-out %/config.yml,$(wildcard .github/ISSUE_TEMPLATE/*.yml))
+	$(BIN)/check-jsonschema --builtin-schema vendor.citation-file-format CITATION.cff
 
 benchmark-env: $(INSTALLED) ## Measure the speed of the environment
 	$(BIN)/python benchmarks/env.py
