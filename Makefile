@@ -23,7 +23,7 @@ DATASETS ?=
 # Trainings at a time, of scenario A at a small scale
 JOBS ?= 2
 OUT ?= outputs/scenario_a
-REPORT ?= results/scenario_a
+REPORT ?= outputs/report_scenario_a
 
 export UV_PYTHON_DOWNLOADS := never
 

@@ -10,6 +10,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import redirect_stderr
+from dataclasses import fields
 from functools import cache
 from io import StringIO
 from pathlib import Path
@@ -91,7 +92,8 @@ def check_deltaco(words, monkeypatch):
     if words[0] == "deltaco-collect" and "--verify" not in words:
         from lerobot_deltaco.data.collection_plan import CollectionPlan
 
-        CollectionPlan(options.tasks, options.episodes_per_task)
+        known = {field.name for field in fields(CollectionPlan)}
+        CollectionPlan(**{name: value for name, value in vars(options).items() if name in known})
     if words[0] == "deltaco-experiment":
         for name in words[1 : next((n for n, word in enumerate(words) if word.startswith("--")), None)]:
             assert (ROOT / "experiments" / f"{name}.yaml").is_file(), name
@@ -213,6 +215,11 @@ def test_the_command_check_finds_mistakes(monkeypatch):
         check_deltaco(shlex.split("deltaco-collect --tasks 4 --episode-number 3 --root data"), monkeypatch)
     with pytest.raises(AssertionError, match="no target"):
         check_make(["make", "tests"], monkeypatch)
+    with pytest.raises(ValueError, match="of which the objects 'random:500' have none"):
+        check_deltaco(
+            shlex.split("deltaco-collect --tasks all --episodes-per-task 1 --root data --objects random:500"),
+            monkeypatch,
+        )
     with pytest.raises(Exception, match="colour"):
         check_lerobot(["lerobot-eval", "--env.type=deltaco", "--env.colour=1"], monkeypatch)
 

@@ -163,7 +163,7 @@ def _parser() -> argparse.ArgumentParser:
         "--tasks",
         required=True,
         help=f"task set (scenario_a_train, ...), named data set ({', '.join(DATA_SETS)}), or indices and "
-        "ranges of 0 to 299, such as 4,50-73",
+        "ranges, such as 4,50-73",
     )
     parser.add_argument(
         "--episodes-per-task", type=int, required=True, metavar="N", help="number of episodes of each task"

@@ -65,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
         "--tasks",
         default=DEFAULT_TASKS,
         metavar="SELECTION",
-        help="tasks to show: task set, such as scenario_a_test, or indices and ranges of 0 to 299, such as "
+        help="tasks to show: task set, such as scenario_a_test, or indices and ranges, such as "
         f"4,50-73; {MAX_SCENES} tasks are drawn at random from a larger selection (default: %(default)s)",
     )
     parser.add_argument(
