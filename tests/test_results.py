@@ -54,7 +54,8 @@ def own_options(experiment):
     """The options that an experiment's own file sets: what it is about."""
     path = EXPERIMENTS / f"{experiment}.yaml"
     content = yaml.safe_load(path.read_text()) if path.is_file() else {}
-    return set(content.get("policy", {}))
+    start = {"pretrained_path"} if "start_from" in content else set()
+    return start | set(content.get("policy", {}))
 
 
 def with_defaults(policy):
