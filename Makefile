@@ -143,7 +143,7 @@ $(INSTALLED): pyproject.toml Makefile
 	fi; \
 	touch $(INSTALLING); \
 	rm -f $@; \
-	echo "Installing. The first time, PyBullet is compiled, which takes 4 to 9 minutes, and PyTorch downloaded."; \
+	echo "Installing. The first time, PyBullet is compiled, which takes 3 to 9 minutes, and PyTorch downloaded."; \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'uv>=0.9'; \
 	$(BIN)/uv pip install --python $(BIN)/python -e '.[dev]'; \
 	if ! $(BIN)/python -c "import pybullet; assert pybullet.isNumpyEnabled()" >/dev/null 2>&1; then \
