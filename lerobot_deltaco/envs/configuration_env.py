@@ -30,8 +30,8 @@ class DeltacoEnv(EnvConfig):
 
     Args:
         task: Tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_a_validation,
-            scenario_b_test, scenario_b_train, all, ...), or indices and ranges, such as 4,50-73. The paper's tasks
-            are 0 to 299, those by color and shape 1000 to 1479.
+            scenario_b_test, scenario_b_train, all, ...), or indices and ranges, such as 4,50-73. The paper's
+            tasks are 0 to 299, those by color and shape 1000 to 1479.
         fps: Frames per second of the videos of episodes. The simulation has no frame rate of its own.
         episode_length: Number of steps after which an episode ends. The benchmark's is 30.
         ambiguity: "container" (the paper's scheme i: the instruction is clear, a demonstration leaves open
