@@ -17,8 +17,8 @@ TITLE = "DeL-TaCo: show it and say it"
 _INTRODUCTION = f"""# {TITLE}
 
 The policy puts one of three objects into one of two containers. It receives a **demonstration** (the first
-and the last image of an episode in another scene) and an **instruction**. Choose a scene, press *Run*, then swap
-one of the two and compare."""
+and the last image of an episode in another scene) and an **instruction**. Choose a scene, press *Run*, then
+swap one of the two and compare."""
 DEMO_SIZE = 192  # px
 _POLL_SECONDS = 1.0
 _SOURCE = "Folder, or USER/NAME on the Hugging Face Hub"
