@@ -76,8 +76,7 @@ def _type_check(kind: Any) -> Callable[[Any], bool]:
     if origin is dict:
         check_name, check_value = map(_type_check, options)
         return lambda value: (
-            isinstance(value, dict)
-            and (all(map(check_name, value)) and all(map(check_value, value.values())))
+            isinstance(value, dict) and all(map(check_name, value)) and all(map(check_value, value.values()))
         )
     if kind is NoneType:
         return lambda value: value is None
