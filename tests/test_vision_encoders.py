@@ -36,6 +36,7 @@ from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures, Variants
 from lerobot_deltaco.policy.heads import UnitHead
 from lerobot_deltaco.policy.language_encoders import CLIP, LanguageEncoderSpec
+from lerobot_deltaco.policy.precision import autocast
 from lerobot_deltaco.policy.vision import VisionEncoderError, load_vision_encoder, r3m_weights, square
 
 SIZE = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
@@ -284,6 +285,17 @@ def test_without_random_choices_there_is_one_variant(demonstrations):
     torch.testing.assert_close(drawn, expected, atol=1e-3, rtol=0)
 
 
+def test_features_do_not_depend_on_the_precision_of_the_training(demonstrations):
+    means, layer = CountingEncoder(), torch.nn.Linear(3, 3).requires_grad_(False)
+    found = []
+    for dtype in ("float32", "bfloat16"):
+        demonstrations.features = None
+        features = frozen(lambda images: layer(means(images)))
+        with autocast(dtype, torch.device("cpu")):
+            found.append(features.drawn(demonstrations, torch.arange(5), torch.Generator().manual_seed(0)))
+    assert torch.equal(*found)
+
+
 def test_features_are_kept_for_further_trainings(demonstrations, tmp_path):
     encoders = [CountingEncoder(), CountingEncoder(), CountingEncoder()]
     found = []
@@ -336,7 +348,7 @@ def make(dataset, folders, monkeypatch):
     "options",
     [
         {"demo_rows": 2, "demo_head": [8]},
-        {"demo_head": []},
+        {"demo_head": [], "dtype": "bfloat16"},
         {"method": "demo_only", "encoder_loss": "none"},
         {"film": "language", "concat": "demo", "encoder_loss": "none", "language_head": [8]},
         {"film": "demo+language", "concat": "none", "encoder_loss": "none"},

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +18,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
+from gym_deltaco.atomic_files import atomic_write
 from lerobot_deltaco.policy.demo_encoders import crop_demonstrations, frame_array
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.vision import BATCH_SIZE, VisionEncoder
@@ -111,6 +111,17 @@ class FrozenFeatures:
         if path is not None and path.exists():
             logger.info("The features of the demonstrations are read from %s.", path)
             return load_file(path)["features"].to(device)
+        # Features do not depend on the precision of the training that first asks for them.
+        with torch.autocast(device.type, enabled=False):
+            features = self._encoded(demonstrations, n_drawn)
+        if path is not None:
+            with atomic_write(path) as temporary:
+                save_file({"features": features.cpu()}, temporary)
+        return features
+
+    def _encoded(self, demonstrations: DemonstrationSet, n_drawn: int) -> Tensor:
+        """What `_computed` returns, by the encoder."""
+        device = demonstrations.frames.device
         generator = torch.Generator().manual_seed(self.variants.seed)
         n_episodes = len(demonstrations.tasks)
         columns = []
@@ -131,13 +142,7 @@ class FrozenFeatures:
                     parts.append(self.encoder(frame_array(frames, self.variants.n_rows)).half())
                     bar.update(len(rows))
                 columns.append(torch.cat(parts))
-        features = torch.stack(columns, dim=1)
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            unfinished = path.with_suffix(".unfinished")
-            save_file({"features": features.cpu()}, unfinished)
-            os.replace(unfinished, path)
-        return features.to(device)
+        return torch.stack(columns, dim=1)
 
     def _path(self, demonstrations: DemonstrationSet, n_drawn: int) -> Path | None:
         """File that keeps the features of a set; its name is a hash of all that they depend on."""
