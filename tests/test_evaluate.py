@@ -27,7 +27,8 @@ from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.envs.policy_fit import check_policy_fits
 from lerobot_deltaco.evaluation import sets
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
-from lerobot_deltaco.evaluation.evaluate import _scene_info, counterfactual_task, evaluate
+from lerobot_deltaco.evaluation.episodes import counterfactual_task, scene_info
+from lerobot_deltaco.evaluation.evaluate import evaluate
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import read_record, record_path
 from lerobot_deltaco.training.loop import InMemoryTraining
@@ -121,24 +122,24 @@ def test_distractors_are_drawn_each_or_together_as_the_plan_says(loaded, draw):
         rng, _ = seeding.np_random(episode.seed)
         layout = sample_layout(get_task(4), "container", rng, adversarial_draw=draw)
         assert episode.objects == [item.label.index for item in layout.objects]
-        assert _scene_info(plan, 4, episode.seed)["objects"] == episode.objects
+        assert scene_info(plan, get_task(4), episode.seed)["objects"] == episode.objects
 
 
 def test_the_outcome_is_that_of_the_scene_at_the_end(loaded, monkeypatch):
     # The policy's place is taken by the expert, which succeeds.
-    acting = {}
+    experts = []
     reset = PickPlaceEnv.reset
 
     def noted(self, **arguments):
         result = reset(self, **arguments)
-        acting["env"], acting["expert"] = self, Expert(self, np.random.default_rng(0), noise=0.0)
+        experts.append(Expert(self, np.random.default_rng(0), noise=0.0))
         return result
 
     monkeypatch.setattr(PickPlaceEnv, "reset", noted)
     monkeypatch.setattr(
         loaded.policy,
         "select_action",
-        lambda batch: torch.as_tensor(acting["expert"].act(), dtype=torch.float32)[None],
+        lambda batch: torch.as_tensor(np.stack([expert.act() for expert in experts]), dtype=torch.float32),
     )
     episodes = evaluate(*loaded, EvaluationPlan("4,14,55", trials=1), set_number=0)
     assert sum(episode.success for episode in episodes) >= 2

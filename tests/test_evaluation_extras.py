@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import av
@@ -13,17 +14,27 @@ from PIL import Image
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.commands import evaluate as evaluate_command
 from lerobot_deltaco.common.run_folder import RunError, checkpoints
+from lerobot_deltaco.evaluation import evaluate as evaluate_module
 from lerobot_deltaco.evaluation import processes
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.evaluation.episode_videos import KINDS, check_explainable, kind_of, write_videos
+from lerobot_deltaco.evaluation.episodes import batched
 from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
-from lerobot_deltaco.evaluation.processes import EvaluationError, default_processes, run_tasks
+from lerobot_deltaco.evaluation.processes import EvaluationError, default_processes, run_batches
 from lerobot_deltaco.evaluation.record import EpisodeResult, read_record, record_path
 
 CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "pick_place"
 STEP = 8_000
 TASKS = "24,26,35"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_batches():
+    """Several batches, though there are few episodes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate_module, "batched", partial(batched, size=2))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +93,7 @@ def test_episodes_are_the_same_with_any_number_of_processes(loaded, settings):
     plan = EvaluationPlan(TASKS, **{"trials": 2, **settings})
     expected = evaluate(*loaded, plan, STEP)
     with Evaluation(*loaded, plan, STEP) as evaluation:
-        assert [outcome.result for outcome in run_tasks(evaluation, 2)] == expected
+        assert [outcome.result for outcome in run_batches(evaluation, 2)] == expected
 
 
 def test_the_record_is_the_same_with_any_number_of_processes(evaluated, tmp_path):
@@ -100,12 +111,14 @@ def test_the_record_is_the_same_with_any_number_of_processes(evaluated, tmp_path
     assert texts[0] == texts[1]
 
 
-def test_tasks_may_be_run_in_any_order(loaded):
-    plan = EvaluationPlan(TASKS, trials=1, counterfactual="instruction")
+def test_batches_may_be_run_in_any_order(loaded):
+    plan = EvaluationPlan(TASKS, trials=2, counterfactual="instruction")
     expected = evaluate(*loaded, plan, STEP)
     with Evaluation(*loaded, plan, STEP) as evaluation:
-        found = {task_id: evaluation.run(task_id)[0].result for task_id in reversed(evaluation.task_ids)}
-    assert [found[episode.task_id] for episode in expected] == expected
+        numbers = range(len(evaluation.batches))
+        assert len(numbers) >= 3
+        outcomes = [outcome for number in reversed(numbers) for outcome in evaluation.run(number)]
+        assert [outcome.result for outcome in evaluation.in_task_order(outcomes)] == expected
 
 
 def test_an_error_in_a_process_is_the_commands(loaded):
@@ -114,18 +127,18 @@ def test_an_error_in_a_process_is_the_commands(loaded):
         Evaluation(*loaded, EvaluationPlan("0,24", trials=1), STEP) as evaluation,
         pytest.raises(ValueError, match="There is no demonstration of the task"),
     ):
-        run_tasks(evaluation, 2)
+        run_batches(evaluation, 2)
 
 
 def test_a_process_that_dies_is_reported(loaded, monkeypatch):
     import os
 
-    monkeypatch.setattr(processes.Evaluation, "run", lambda self, task_id: os._exit(9))
+    monkeypatch.setattr(processes.Evaluation, "run", lambda self, number: os._exit(9))
     with (
         Evaluation(*loaded, EvaluationPlan(TASKS, trials=1), STEP) as evaluation,
         pytest.raises(EvaluationError, match="fewer --processes"),
     ):
-        run_tasks(evaluation, 2)
+        run_batches(evaluation, 2)
 
 
 def test_the_default_is_all_cores_or_this_runs_share(monkeypatch):

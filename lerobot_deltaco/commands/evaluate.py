@@ -143,12 +143,12 @@ def _evaluate(
     if record is None or options.explain or options.videos:
         # Only here, since they take seconds to import.
         from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
+        from lerobot_deltaco.evaluation.demonstration_checks import check_combines
         from lerobot_deltaco.evaluation.episode_videos import (
             check_explainable,
             write_explanations,
             write_videos,
         )
-        from lerobot_deltaco.evaluation.evaluate import check_combines
         from lerobot_deltaco.evaluation.processes import default_processes
         from lerobot_deltaco.evaluation.sets import run_set
 

@@ -74,7 +74,7 @@ class VectorEnvPool:
     def _make(self) -> VectorEnv:
         env_fns = [self._make_env] * self.n_envs
         if not self._use_async_envs:
-            return SyncVectorEnv(env_fns, autoreset_mode=AutoresetMode.NEXT_STEP)
+            return make_sync_vector_env(env_fns)
         # Has no effect, and needs none, once the process that workers are forked from is running.
         commands = [name for name in _LEROBOT_COMMANDS if name in sys.modules]
         multiprocessing.set_forkserver_preload([*commands, __name__])
@@ -125,16 +125,10 @@ class TaskVectorEnv(VectorEnv):
             seed: The seed of the first environment (each next one has the next seed), or all of them.
             options: Passed on to the environments.
         """
-        return self.reset_with_seeds(self._episode_seeds(seed), options)
-
-    def reset_with_seeds(
-        self, seeds: Sequence[int | None], options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Starts the episodes that the environments' own seeds stand for, of `gym_deltaco.seeding`."""
         if self._running is None and not self.closed:
             self._running = self._pool.acquire()
         options = {**(options or {}), NEW_ROLLOUT_OPTION: True, "task_id": self.task_id}
-        return self._call_running("reset", seed=list(seeds), options=options)
+        return self._call_running("reset", seed=self._episode_seeds(seed), options=options)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Does one action, of shape (4,), in each environment."""
@@ -200,7 +194,7 @@ def make_task_vector_envs(
         use_async_envs: Whether each environment runs in a process of its own, if there are several.
         fps: Frames per second at which LeRobot's videos of episodes play.
     """
-    make_env = partial(_make_env, env_id, env_kwargs)
+    make_env = partial(make_single_env, env_id, env_kwargs)
     pool = VectorEnvPool(make_env, n_envs, use_async_envs)
     example = make_env()
     try:
@@ -209,8 +203,20 @@ def make_task_vector_envs(
         example.close()
 
 
-def _make_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
-    # The mask of LeRobot's metric includes the step after an episode's end. With the next-step autoreset and
-    # LeRobot's wrapper, which stays in the finished episode, no other episode is counted there.
+def make_single_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
+    """Makes an environment for LeRobot's rollout, which stays in the last step of an episode that has ended.
+
+    The mask of LeRobot's metric includes the step after an episode's end. With the next-step autoreset and
+    LeRobot's wrapper, which stays in the finished episode, no other episode is counted there.
+
+    Args:
+        env_id: Id of the environment, for `gymnasium.make`.
+        env_kwargs: Further arguments of `gymnasium.make`.
+    """
     env = gym.make(env_id, disable_env_checker=True, **env_kwargs)
     return FreezeAfterEpisodeEnd(env)
+
+
+def make_sync_vector_env(env_fns: Sequence[Callable[[], gym.Env]]) -> SyncVectorEnv:
+    """Makes a vector environment in this process, with the autoreset that `make_single_env` needs."""
+    return SyncVectorEnv(env_fns, autoreset_mode=AutoresetMode.NEXT_STEP)

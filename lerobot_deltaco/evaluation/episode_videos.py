@@ -223,17 +223,17 @@ class _NewFolder:
 def _run_again(
     loaded: LoadedPolicy, plan: EvaluationPlan, record: EvaluationRecord, chosen: Iterable[EpisodeResult]
 ) -> Iterator[RerunEpisode]:
-    """Runs episodes again as they were run, and renders them; those of a task one after the other."""
-    by_task: dict[int, dict[int, EpisodeResult]] = defaultdict(dict)
-    for episode in chosen:
-        by_task[episode.task_id][episode.trial] = episode
+    """Runs episodes again as they were run, in the same batches, and renders them."""
+    wanted = {(episode.task_id, episode.trial): episode for episode in chosen}
     evaluation = Evaluation(*loaded, plan, record.step, render_size=RENDER_SIZE)
     with evaluation, without_rollout_progress():
-        for task_id, wanted in by_task.items():
-            for outcome in evaluation.run(task_id, rendered=wanted):
+        for number, batch in enumerate(evaluation.batches):
+            rendered = [each for each in batch.episodes if (each.task_id, each.trial) in wanted]
+            for outcome in evaluation.run(number, rendered) if rendered else ():
                 if outcome.images is None:
                     continue
-                recorded, again = wanted[outcome.result.trial], outcome.result
+                again = outcome.result
+                recorded = wanted[again.task_id, again.trial]
                 is_repeated = (again.success, again.grasped_object, again.object_containers) == (
                     recorded.success,
                     recorded.grasped_object,

@@ -1,4 +1,4 @@
-"""Runs the tasks of an evaluation set in several processes; the outcomes are those of a single one."""
+"""Runs the batches of an evaluation set in several processes; the outcomes are those of a single one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import signal
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 
 from tqdm import tqdm
@@ -49,11 +49,11 @@ def check_processes(processes: int, device: str) -> None:
         )
 
 
-def run_tasks(evaluation: Evaluation, processes: int) -> list[EpisodeOutcome]:
-    """Runs all tasks of an evaluation set.
+def run_batches(evaluation: Evaluation, processes: int) -> list[EpisodeOutcome]:
+    """Runs all batches of an evaluation set.
 
     Args:
-        evaluation: The set, none of whose tasks has been run.
+        evaluation: The set.
         processes: Number of processes; with 1, all is run in this one.
 
     Returns:
@@ -64,23 +64,26 @@ def run_tasks(evaluation: Evaluation, processes: int) -> list[EpisodeOutcome]:
         ValueError: A task has no demonstration, or the number of processes is invalid.
     """
     check_processes(processes, str(evaluation.policy.config.device))
-    processes = min(processes, len(evaluation.task_ids))
-    outcomes: dict[int, list[EpisodeOutcome]] = {}
+    processes = min(processes, len(evaluation.batches))
+    outcomes: list[EpisodeOutcome] = []
     progress = tqdm(
-        total=len(evaluation.task_ids), desc=f"Evaluating step {evaluation.set_number}", unit="task"
+        total=sum(len(batch.episodes) for batch in evaluation.batches),
+        desc=f"Evaluating step {evaluation.set_number}",
+        unit="episode",
     )
     with progress, without_rollout_progress():
-        for task_id, found in _run_all(evaluation, processes):
-            outcomes[task_id] = found
-            progress.update()
-    return [outcome for task_id in evaluation.task_ids for outcome in outcomes[task_id]]
+        for found in _run_all(evaluation, processes):
+            outcomes += found
+            progress.update(len(found))
+    return evaluation.in_task_order(outcomes)
 
 
-def _run_all(evaluation: Evaluation, processes: int) -> Iterator[tuple[int, list[EpisodeOutcome]]]:
-    """The tasks and their episodes, in the order in which they are completed."""
+def _run_all(evaluation: Evaluation, processes: int) -> Iterator[list[EpisodeOutcome]]:
+    """The episodes of the batches, in the order in which these are completed."""
+    numbers = range(len(evaluation.batches))
     if processes == 1:
-        for task_id in evaluation.task_ids:
-            yield task_id, evaluation.run(task_id)
+        for number in numbers:
+            yield evaluation.run(number)
         return
     # Processes are forked, which shares the policy and takes no time: importing LeRobot takes 10 s.
     context = multiprocessing.get_context("fork")
@@ -89,11 +92,9 @@ def _run_all(evaluation: Evaluation, processes: int) -> Iterator[tuple[int, list
         with warnings.catch_warnings():
             # Of threads that hold locks: there are none but idle ones, and each process computes with one.
             warnings.filterwarnings("ignore", category=DeprecationWarning, message=".*fork")
-            tasks: dict[Future[list[EpisodeOutcome]], int] = {
-                executor.submit(_run, task_id): task_id for task_id in evaluation.task_ids
-            }
-        for future in as_completed(tasks):
-            yield tasks[future], future.result()
+            running = [executor.submit(_run, number) for number in numbers]
+        for future in as_completed(running):
+            yield future.result()
     except BrokenProcessPool:
         raise EvaluationError(
             "A process of the evaluation ended unexpectedly; the memory may be full. Run the command again "
@@ -108,11 +109,11 @@ _evaluation: Evaluation | None = None  # of this process, if it was forked for o
 
 def _start(evaluation: Evaluation) -> None:
     global _evaluation
-    # An interrupt is for the main process, which lets the running tasks end.
+    # An interrupt is for the main process, which lets the running batches end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _evaluation = evaluation
 
 
-def _run(task_id: int) -> list[EpisodeOutcome]:
+def _run(number: int) -> list[EpisodeOutcome]:
     assert _evaluation is not None
-    return _evaluation.run(task_id)
+    return _evaluation.run(number)

@@ -16,7 +16,7 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.evaluate import Evaluation, versions
 from lerobot_deltaco.evaluation.lerobot_info import write_lerobot_info
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
-from lerobot_deltaco.evaluation.processes import run_tasks
+from lerobot_deltaco.evaluation.processes import run_batches
 from lerobot_deltaco.evaluation.record import EvaluationRecord, extras_folder, record_path, write_record
 
 
@@ -56,7 +56,7 @@ def run_set(
     """
     start = time.monotonic()
     with Evaluation(policy, preprocessor, postprocessor, plan, step) as evaluation:
-        outcomes = run_tasks(evaluation, processes)
+        outcomes = run_batches(evaluation, processes)
     config = policy.config
     record = EvaluationRecord(
         experiment=experiment,

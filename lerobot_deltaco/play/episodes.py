@@ -22,7 +22,7 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.sheets import caption, down, to_image
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, Task, get_task
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
-from lerobot_deltaco.evaluation.evaluate import counterfactual_task
+from lerobot_deltaco.evaluation.episodes import counterfactual_task
 from lerobot_deltaco.evaluation.explanation import draw_explanation
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.play.demonstrations import (
