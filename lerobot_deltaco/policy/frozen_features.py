@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +19,6 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from gym_deltaco.atomic_files import atomic_write
 from lerobot_deltaco.policy.demo_encoders import crop_demonstrations, frame_array
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.vision import BATCH_SIZE, VisionEncoder
@@ -115,8 +115,11 @@ class FrozenFeatures:
         with torch.autocast(device.type, enabled=False):
             features = self._encoded(demonstrations, n_drawn)
         if path is not None:
-            with atomic_write(path) as temporary:
-                save_file({"features": features.cpu()}, temporary)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Several trainings may compute the same features at the same time.
+            temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+            save_file({"features": features.cpu()}, temporary)
+            os.replace(temporary, path)
         return features
 
     def _encoded(self, demonstrations: DemonstrationSet, n_drawn: int) -> Tensor:
