@@ -6,12 +6,12 @@ import re
 import shutil
 import subprocess
 import sys
-from contextlib import ExitStack
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from fake_hub import TOKEN, USER, WITHOUT_CARD_CHECK, FakeHub, Repo
+from fresh_python import run_python
 from huggingface_hub import DatasetCard, constants
 from PIL import Image
 
@@ -62,16 +62,10 @@ def hub():
         yield hub
 
 
-def start(program, *arguments, environment, with_card_check=False):
-    """Starts a Python program, with the card's check at the real Hub left out unless it is wanted."""
+def outcome(program, *arguments, environment, with_card_check=False):
+    """How a Python program ends, with the card's check at the real Hub left out unless it is wanted."""
     before = "" if with_card_check else WITHOUT_CARD_CHECK
-    return subprocess.Popen(
-        [sys.executable, "-c", before + program, *map(str, arguments)],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    return run_python(before + program, *arguments, env=environment)
 
 
 def command(name):
@@ -83,10 +77,9 @@ ONE_EPISODE = ("--tasks", "4", "--episodes-per-task", 1, "--workers", 1)
 
 
 def run(program, *arguments, environment):
-    process = start(program, *arguments, environment=environment)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    return output
+    result = outcome(program, *arguments, environment=environment)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 # The card
@@ -347,13 +340,10 @@ def test_missing_credentials_are_found_before_collecting(hub, tmp_path):
     ]
     new = tmp_path / "new"
     options = ("--root", new, *ONE_EPISODE, "--repo-id", REPO_ID, "--push-to-hub")
-    processes = [
-        (start(COLLECT, *options, environment=environment), message) for environment, message in cases
-    ]
-    for process, message in processes:
-        _, errors = process.communicate(timeout=300)
-        assert process.returncode == 1
-        (error,) = [line for line in errors.splitlines() if not line.startswith("pybullet build time")]
+    for environment, message in cases:
+        result = outcome(COLLECT, *options, environment=environment)
+        assert result.returncode == 1
+        (error,) = [line for line in result.stderr.splitlines() if not line.startswith("pybullet build time")]
         assert message in error
     assert not new.exists()
     assert KEY not in hub.repos
@@ -427,26 +417,21 @@ def test_a_push_that_stops_says_what_has_arrived(copy, tmp_path):
         ("POST /api/datasets/.*/commit/", f"{REPO_ID} has either all of the new files or none", False),
         ("POST /api/datasets/.*/tag/", "All files have arrived, but the tag 'v3.0'", True),
     ]
-    with ExitStack() as stack:
-        running = []
-        for number, (refused, message, has_arrived) in enumerate(cases):
-            hub = stack.enter_context(FakeHub())
+    for number, (refused, message, has_arrived) in enumerate(cases):
+        with FakeHub() as hub:
             hub.refused = refused
             # The card's check at a fixed address is not needed: this Hub is another one.
-            process = start(
+            result = outcome(
                 *(PUSH, "--root", copy, "--repo-id", REPO_ID),
                 environment=hub.environment(tmp_path / str(number)),
                 with_card_check=True,
             )
-            running.append((process, hub, message, has_arrived))
-        for process, hub, message, has_arrived in running:
-            _, errors = process.communicate(timeout=300)
-            assert process.returncode == 1, errors
-            assert message in errors.splitlines()[-1]
-            assert "cannot be reached" not in errors
-            assert "Traceback" not in errors
             stored = set(hub.repos[KEY].files()) if KEY in hub.repos else set()
-            assert (str(DIGESTS_FILE) in stored) == (str(CARD_FILE) in stored) == has_arrived
+        assert result.returncode == 1, result.stderr
+        assert message in result.stderr.splitlines()[-1]
+        assert "cannot be reached" not in result.stderr
+        assert "Traceback" not in result.stderr
+        assert (str(DIGESTS_FILE) in stored) == (str(CARD_FILE) in stored) == has_arrived
 
 
 def test_collecting_starts_without_heavy_imports():
@@ -496,14 +481,13 @@ def test_private_repositories_and_branches(hub, dataset, tmp_path):
 def test_a_token_that_may_only_read_is_named(hub, dataset, tmp_path):
     hub.read_only = True
     try:
-        process = start(
+        result = outcome(
             PUSH,
             *("--root", dataset, "--repo-id", f"{USER}/forbidden"),
             environment=hub.environment(tmp_path, TOKEN),
         )
-        _, errors = process.communicate(timeout=300)
     finally:
         hub.read_only = False
-    assert process.returncode == 1
-    assert "Set HF_TOKEN to a token that may write" in errors.splitlines()[-1]
-    assert "Traceback" not in errors
+    assert result.returncode == 1
+    assert "Set HF_TOKEN to a token that may write" in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr

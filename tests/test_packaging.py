@@ -8,6 +8,7 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
+from fresh_python import run_python
 
 ROOT = Path(__file__).parents[1]
 GYM_FILES = sorted((ROOT / "envs" / "gym_deltaco").rglob("*.py"))
@@ -18,6 +19,8 @@ DISTRIBUTION = "lerobot_policy_deltaco"
 # One process imports LeRobot, which takes 10 s, and nothing of this project. Each command runs in a fork.
 PROGRAM = """
 import os, sys
+
+os.dup2(1, 2)  # errors stand among the output
 from lerobot.scripts import lerobot_eval, lerobot_train
 
 MISSING = "lerobot_deltaco.training.optimization"
@@ -42,8 +45,7 @@ for name, main, words, missing in (
 @pytest.fixture(scope="module")
 def lerobot_outputs():
     """What LeRobot's commands print, by command."""
-    command = [sys.executable, "-c", PROGRAM]
-    result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=900)
+    result = run_python(PROGRAM)
     _, *parts = re.split("^OUTPUT OF (.+)$", result.stdout, flags=re.MULTILINE)
     return dict(zip(parts[::2], parts[1::2], strict=True))
 

@@ -3,13 +3,12 @@
 import json
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from fake_hub import USER, WITHOUT_CARD_CHECK, FakeHub
+from fresh_python import run_python
 from huggingface_hub import ModelCard
 from lerobot.cameras.opencv import OpenCVCameraConfig  # noqa: F401  (`type: opencv` on the command line)
 from lerobot.configs import FeatureType, PolicyFeature, parser
@@ -318,12 +317,9 @@ assert action.shape == (1, 3)
 
 def test_a_pushed_policy_is_fetched_by_its_name(tmp_path):
     with FakeHub() as hub:
-        result = subprocess.run(
-            [sys.executable, "-c", WITHOUT_CARD_CHECK + PUSH_AND_FETCH, str(tmp_path), POLICY_ID],
+        result = run_python(
+            *(WITHOUT_CARD_CHECK + PUSH_AND_FETCH, tmp_path, POLICY_ID),
             env={**hub.environment(tmp_path / "home"), "PYTHONPATH": str(Path(__file__).parent)},
-            capture_output=True,
-            text=True,
-            timeout=300,
         )
         assert result.returncode == 0, result.stderr[-3000:]
         files = hub.repos["model", POLICY_ID].files()

@@ -4,11 +4,10 @@ import json
 import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from fresh_python import run_python
 from lerobot.configs import parser
 from lerobot.rollout.configs import RolloutConfig
 from lerobot.scripts.lerobot_record import RecordConfig
@@ -101,14 +100,10 @@ def session(tmp_path_factory):
             *("--policy.demo_episode=0", "--fps=20", "--duration=1", "--return_to_initial_position=false"),
         ],
     ]
-    result = subprocess.run(
-        [sys.executable, "-c", SESSION, json.dumps(commands), str(policy), SENTENCE],
+    result = run_python(
+        *(SESSION, json.dumps(commands), policy, SENTENCE),
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parent), "HF_HOME": str(folder / "cache")},
-        stdin=subprocess.DEVNULL,  # no keys to listen to
-        capture_output=True,
-        text=True,
-        timeout=300,
     )
     assert result.returncode == 0, result.stderr[-3000:]
     return folder

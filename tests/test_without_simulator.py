@@ -1,7 +1,9 @@
 """Without PyBullet, a policy trains and acts, and what needs the simulator says what to install."""
 
-import subprocess
-import sys
+import os
+from pathlib import Path
+
+from fresh_python import run_python
 
 PROGRAM = """
 import sys
@@ -39,17 +41,10 @@ collect.main(["--tasks", "4", "--episodes-per-task", "1", "--root", f"{folder}/n
 
 
 def test_a_policy_needs_no_simulator_and_what_does_says_so(tmp_path):
-    command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path.parent, env=_environment())
+    paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    result = run_python(PROGRAM, tmp_path, cwd=tmp_path.parent, env=environment)
     *_, last = result.stderr.strip().splitlines()
     assert result.returncode == 1, result.stderr
     assert last.startswith("deltaco-collect: The environment needs PyBullet")
     assert not (tmp_path / "new").exists()
-
-
-def _environment():
-    import os
-    from pathlib import Path
-
-    paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
