@@ -2,8 +2,8 @@
 
 LeRobot's commands take 10 s to start, most of which is the import of PyTorch and other large packages, which
 read none of the environment's variables that a test may set. Here, one process imports these when it is first
-needed, and is forked for each program. The program itself imports LeRobot, the Hugging Face libraries and this
-project, with its own environment.
+needed, and is forked for each program. The program itself imports LeRobot, the Hugging Face libraries and
+this project, with its own environment.
 """
 
 import importlib

@@ -646,12 +646,6 @@ def stored(root):
     return {path for path in (root / STAGING).rglob("*") if path.suffix in (".arrow", ".parquet")}
 
 
-def test_killed_at_random_moments_it_completes_the_same_dataset(finished, tmp_path):
-    n_killed = kill_until_finished(tmp_path, random.Random(0), 1, ARGUMENTS, EPISODES_PER_FILE)
-    assert n_killed > 0
-    assert contents(tmp_path) == contents(finished)
-
-
 @pytest.mark.slow
 def test_killed_many_times_it_completes_the_same_dataset(tmp_path, monkeypatch):
     monkeypatch.setattr(collection, "EPISODES_PER_FILE", 5)
@@ -663,18 +657,25 @@ def test_killed_many_times_it_completes_the_same_dataset(tmp_path, monkeypatch):
     assert contents(tmp_path / "root") == contents(tmp_path / "expected")
 
 
-def test_a_write_that_fails_ends_with_a_message_and_the_next_run_goes_on(finished, tmp_path, in_process):
+@pytest.mark.parametrize(
+    ("max_file_size", "n_kept"),
+    [
+        pytest.param(20_000, 0, id="an episode", marks=pytest.mark.slow),
+        pytest.param(100_000, EPISODES_PER_FILE, id="a data file"),
+    ],
+)
+def test_a_write_that_fails_ends_with_a_message_and_the_next_run_goes_on(
+    finished, tmp_path, in_process, max_file_size, n_kept
+):
     """A limit on the size of files stands for a full disk."""
-    # Enough for no episode, then for no data file.
-    for max_file_size, n_kept in ((20_000, 0), (100_000, EPISODES_PER_FILE)):
-        process = start(tmp_path, max_file_size=max_file_size)
-        _, error = process.communicate(timeout=300)
-        assert process.returncode == 1, error
-        assert "Traceback" not in error
-        assert os.strerror(errno.EFBIG) in error
-        assert not is_finished(tmp_path)
-        assert n_waiting(tmp_path) >= n_kept
-        assert not list(tmp_path.rglob("*.part"))
+    process = start(tmp_path, max_file_size=max_file_size)
+    _, error = process.communicate(timeout=300)
+    assert process.returncode == 1, error
+    assert "Traceback" not in error
+    assert os.strerror(errno.EFBIG) in error
+    assert not is_finished(tmp_path)
+    assert n_waiting(tmp_path) >= n_kept
+    assert not list(tmp_path.rglob("*.part"))
     collect(tmp_path, PLAN)
     assert contents(tmp_path) == contents(finished)
 

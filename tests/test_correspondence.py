@@ -407,9 +407,14 @@ def large_dataset(tmp_path_factory, episodes):
     return table_dataset(tmp_path_factory.mktemp("data") / "large", episodes, image=draw)
 
 
-def test_it_learns_to_find_goals_in_larger_images(large_dataset, episodes, tmp_path):
+@pytest.mark.slow
+def test_it_learns_to_find_goals_in_larger_images(large_dataset, episodes):
     policy = trained_to_find(large_dataset, 60, goal_image_size=2 * SIZE)
     assert share_found(policy, large_dataset, episodes)[0] > 0.85
+
+
+def test_a_policy_that_finds_goals_in_larger_images_survives_saving(large_dataset, episodes, tmp_path):
+    policy = trained_to_find(large_dataset, 2, goal_image_size=2 * SIZE)
     batch = batch_of(large_dataset, [0])
     assert policy.scenes(batch).shape == (1, 3, 2 * SIZE, 2 * SIZE)
     policy.save_pretrained(tmp_path)
@@ -485,6 +490,7 @@ def test_sizes_of_images_for_goals_are_checked(options, message):
         DeltacoConfig(**{**CORRESPONDENCE, **options})
 
 
+@pytest.mark.slow
 def test_it_learns_to_do_without_a_demonstration_or_an_instruction(dataset, episodes):
     policy = trained_to_find(dataset, 150, demo_dropout=0.3, instruction_dropout=0.3)
     for leave_out in (None, "demo", "instruction"):

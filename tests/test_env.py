@@ -595,6 +595,7 @@ def binomial_interval(n, p, miss):
     return int(np.searchsorted(cumulative, miss / 2)), int(np.searchsorted(cumulative, 1 - miss / 2))
 
 
+@pytest.mark.slow
 def test_a_policy_that_picks_at_random_succeeds_in_1_of_6():
     n = 240
     with multiprocessing.get_context("spawn").Pool(2) as pool:

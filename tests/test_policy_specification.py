@@ -62,13 +62,18 @@ def dataset(tmp_path_factory):
 def make(request, dataset):
     """Makes the policy that is tested, and its processors, always with the same weights."""
 
-    def make():
+    def make(**demos):
         torch.manual_seed(0)
-        demos = {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
         policy, before, after = small_policy(dataset, **demos, **request.param)
         return SimpleNamespace(policy=policy, before=before, after=after, config=policy.config)
 
     return make
+
+
+@pytest.fixture
+def demos(dataset):
+    """Demonstrations for acting and for checkpoints. Without them, a policy acts by those of its training."""
+    return {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
 
 
 def optimizer_of(policy):
@@ -116,8 +121,8 @@ def test_it_trains_and_logs_and_leaves_the_batch_alone(make, dataset):
     torch.testing.assert_close(each.mean(), loss.detach(), rtol=1e-5, atol=1e-5)
 
 
-def test_it_acts_in_batches_of_any_size_and_leaves_the_batch_alone(make, dataset):
-    made = make()
+def test_it_acts_in_batches_of_any_size_and_leaves_the_batch_alone(make, dataset, demos):
+    made = make(**demos)
     made.policy.eval()
     for tasks in (TASKS[:1], TASKS):
         made.policy.reset()
@@ -168,8 +173,8 @@ def test_the_same_seed_gives_the_same_result_to_the_bit(make, dataset):
     assert_same(*results)
 
 
-def test_it_survives_saving_to_the_bit(make, dataset, tmp_path):
-    made = make()
+def test_it_survives_saving_to_the_bit(make, dataset, demos, tmp_path):
+    made = make(**demos)
     trained(made, made.before(batch_of(dataset, SAMPLES)), n_steps=1)
     made.policy.eval()
     batch = made.before(observation(dataset, TASKS))
