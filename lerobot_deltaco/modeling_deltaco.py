@@ -65,7 +65,7 @@ from lerobot_deltaco.policy.precision import autocast
 from lerobot_deltaco.policy.processor_files import check_processor_files
 from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.step_generator import process_rank, step_generator
-from lerobot_deltaco.policy.task_conditioning import EpisodeTasks, TaskConditioning
+from lerobot_deltaco.policy.task_conditioning import DemonstrationTurn, EpisodeTasks, TaskConditioning
 from lerobot_deltaco.policy.task_file import (
     TASK_FILE,
     TaskFile,
@@ -412,8 +412,12 @@ class DeltacoPolicy(PreTrainedPolicy):
     ) -> tuple[DemonstrationSet, Tensor]:
         """The demonstration of each sample: a set, and the row of each in it, (batch,)."""
         candidates = (self.eval_demonstrations, self.train_demonstrations)
+        turns = self._episode_tasks.turns
+        names, replaced = (
+            (tasks, self._episode_tasks.replaced) if turns is None else ([turn.task for turn in turns], {})
+        )
         chosen, rows = choose_demonstrations(
-            self.config, candidates, tasks, trials, self._episode_tasks.replaced, self.paraphrases
+            self.config, candidates, names, trials, replaced, self.paraphrases
         )
         if not self.training:
             self._episode_tasks.note_demonstrations(chosen.describe(rows))
@@ -453,6 +457,16 @@ class DeltacoPolicy(PreTrainedPolicy):
                 episode starts; instructions that it lacks keep their own demonstrations.
         """
         return self._episode_tasks.demonstrated_as(tasks)
+
+    def with_turns(self, turns: Sequence[DemonstrationTurn]) -> AbstractContextManager[None]:
+        """Uses the given demonstration for each sample of a batch, while the context is open.
+
+        Unlike `demonstrated_as`, it depends neither on the instructions nor on earlier episodes.
+
+        Args:
+            turns: The demonstrations, one for each sample.
+        """
+        return self._episode_tasks.with_turns(turns)
 
     # Datasets and checkpoints
 

@@ -3,13 +3,16 @@
 LeRobot's commands take 10 s to start, most of which is the import of PyTorch and other large packages, which
 read none of the environment's variables that a test may set. Here, one process imports these when it is first
 needed, and is forked for each program. The program itself imports LeRobot, the Hugging Face libraries and
-this project, with its own environment.
+this project, with its own environment. What PyTorch or NumPy read when they are imported, such as
+OMP_NUM_THREADS, is that of the first process, and so are its hash seed and NumPy's global random state.
 """
 
+import contextlib
 import importlib
 import json
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -35,14 +38,17 @@ def start_server(folder):
     path = str(folder / "socket")
     # It ends with its input, however this process ends.
     server = subprocess.Popen([sys.executable, __file__, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    server.stdout.readline()  # it listens now
+    if not server.stdout.readline():
+        raise RuntimeError(f"The process of tests/fresh_python.py does not listen at {path}.")
     os.environ[ADDRESS] = path
     return server
 
 
 def stop_server(server):
     os.environ.pop(ADDRESS, None)
-    server.communicate()
+    server.stdin.close()
+    server.stdout.close()
+    server.wait()
 
 
 def run_python(program, *arguments, env=None, cwd=None, timeout=300):
@@ -73,7 +79,14 @@ def run_python(program, *arguments, env=None, cwd=None, timeout=300):
         connection.sendall(json.dumps(request).encode())
         connection.shutdown(socket.SHUT_WR)
         with connection.makefile() as answer:
-            returncode = int(answer.read())
+            child = int(answer.readline())
+            try:
+                returncode = int(answer.readline())
+            except TimeoutError:
+                os.kill(child, signal.SIGKILL)
+                raise RuntimeError(
+                    f"A program has not ended after {timeout} s. Its errors:\n{errors.read_text()}"
+                ) from None
         return subprocess.CompletedProcess(
             ["python", "-c", program], returncode, output.read_text(), errors.read_text()
         )
@@ -104,8 +117,10 @@ def _serve(path):
                 request = json.load(received)
                 child = os.fork()
                 if child:
+                    connection.sendall(f"{child}\n".encode())
                     _, status = os.waitpid(child, 0)
-                    connection.sendall(str(os.waitstatus_to_exitcode(status)).encode())
+                    with contextlib.suppress(BrokenPipeError):  # nobody waits any more
+                        connection.sendall(f"{os.waitstatus_to_exitcode(status)}\n".encode())
                     os._exit(0)
             return request
     sys.exit()

@@ -646,6 +646,16 @@ def stored(root):
     return {path for path in (root / STAGING).rglob("*") if path.suffix in (".arrow", ".parquet")}
 
 
+def test_killed_it_completes_the_same_dataset(finished, tmp_path, in_process):
+    process = start(tmp_path)
+    wait_until(lambda: n_waiting(tmp_path) > 0)
+    process.kill()
+    process.communicate(timeout=300)
+    assert not is_finished(tmp_path)
+    collect(tmp_path, PLAN)
+    assert contents(tmp_path) == contents(finished)
+
+
 @pytest.mark.slow
 def test_killed_many_times_it_completes_the_same_dataset(tmp_path, monkeypatch):
     monkeypatch.setattr(collection, "EPISODES_PER_FILE", 5)
@@ -674,6 +684,7 @@ def test_a_write_that_fails_ends_with_a_message_and_the_next_run_goes_on(
     assert "Traceback" not in error
     assert os.strerror(errno.EFBIG) in error
     assert not is_finished(tmp_path)
+    assert (n_waiting(tmp_path) > 0) == (n_kept > 0)
     assert n_waiting(tmp_path) >= n_kept
     assert not list(tmp_path.rglob("*.part"))
     collect(tmp_path, PLAN)

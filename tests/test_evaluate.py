@@ -28,7 +28,7 @@ from lerobot_deltaco.envs.policy_fit import check_policy_fits
 from lerobot_deltaco.evaluation import sets
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.evaluation.episodes import counterfactual_task, scene_info
-from lerobot_deltaco.evaluation.evaluate import evaluate
+from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import read_record, record_path
 from lerobot_deltaco.training.loop import InMemoryTraining
@@ -102,6 +102,25 @@ def test_the_demonstrations_of_a_task_take_turns_and_are_recorded(loaded):
     assert [episode.demonstrated_objects for episode in episodes] == [[4]] * 3 + [[14]] * 3
 
 
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"instruction": "Put it away."}, [[0], [1], [0], [2], [3], [2]]),
+        ({"counterfactual": "instruction"}, [[0], [1], [0], [2], [3], [2]]),
+        ({"counterfactual": "demo"}, [[2], [3], [2], [0], [1], [0]]),
+    ],
+    ids=["a sentence for all tasks", "instruction", "demo"],
+)
+def test_they_take_turns_whatever_the_instruction_and_the_order_of_the_batches(loaded, settings, expected):
+    plan = EvaluationPlan("4,14", trials=3, **settings)
+    with Evaluation(*loaded, plan, 0) as evaluation:
+        assert len(evaluation.batches) == 3
+        outcomes = [outcome for number in (2, 0, 1) for outcome in evaluation.run(number)]
+        found = [outcome.result for outcome in evaluation.in_task_order(outcomes)]
+    assert [episode.demonstration_episodes for episode in found] == expected
+    assert loaded.policy._episode_tasks.turns is None
+
+
 def test_distractors_are_drawn_as_the_plan_says(loaded):
     def distractors(**settings):
         episodes = evaluate(*loaded, EvaluationPlan("4", trials=12, **settings), set_number=0)
@@ -139,7 +158,9 @@ def test_the_outcome_is_that_of_the_scene_at_the_end(loaded, monkeypatch):
     monkeypatch.setattr(
         loaded.policy,
         "select_action",
-        lambda batch: torch.as_tensor(np.stack([expert.act() for expert in experts]), dtype=torch.float32),
+        lambda batch: torch.as_tensor(
+            np.stack([expert.act() for expert in experts[-len(batch["task"]) :]]), dtype=torch.float32
+        ),
     )
     episodes = evaluate(*loaded, EvaluationPlan("4,14,55", trials=1), set_number=0)
     assert sum(episode.success for episode in episodes) >= 2
@@ -158,7 +179,6 @@ def test_a_counterfactual_changes_one_of_both(loaded, changed):
         given = {"demo": episode.demonstration, "instruction": episode.instruction}
         assert given.pop(changed) != own
         assert list(given.values()) == [own]
-    assert loaded.policy._episode_tasks.replaced == {}
 
 
 def test_the_other_task_asks_for_another_object_of_the_scene_and_the_other_container():

@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import av
@@ -14,11 +13,9 @@ from PIL import Image
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.commands import evaluate as evaluate_command
 from lerobot_deltaco.common.run_folder import RunError, checkpoints
-from lerobot_deltaco.evaluation import evaluate as evaluate_module
 from lerobot_deltaco.evaluation import processes
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.evaluation.episode_videos import KINDS, check_explainable, kind_of, write_videos
-from lerobot_deltaco.evaluation.episodes import batched
 from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.processes import EvaluationError, default_processes, run_batches
@@ -27,14 +24,6 @@ from lerobot_deltaco.evaluation.record import EpisodeResult, read_record, record
 CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "pick_place"
 STEP = 8_000
 TASKS = "24,26,35"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_batches():
-    """Several batches, though there are few episodes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluate_module, "batched", partial(batched, size=2))
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +72,7 @@ def test_its_step_is_that_of_its_folder_or_of_its_weights(tmp_path):
     "settings",
     [
         {},
-        {"instruction": "Put the jar in the green bin."},  # demonstrations take turns over all tasks
+        {"instruction": "Put the jar in the green bin."},
         {"counterfactual": "instruction"},
         {"counterfactual": "demo", "trials": 1},
     ],
@@ -93,6 +82,7 @@ def test_episodes_are_the_same_with_any_number_of_processes(loaded, settings):
     plan = EvaluationPlan(TASKS, **{"trials": 2, **settings})
     expected = evaluate(*loaded, plan, STEP)
     with Evaluation(*loaded, plan, STEP) as evaluation:
+        assert len(evaluation.batches) >= 3
         assert [outcome.result for outcome in run_batches(evaluation, 2)] == expected
 
 
@@ -123,11 +113,10 @@ def test_batches_may_be_run_in_any_order(loaded):
 
 def test_an_error_in_a_process_is_the_commands(loaded):
     # Task 0 has no demonstration in the checkpoint.
-    with (
-        Evaluation(*loaded, EvaluationPlan("0,24", trials=1), STEP) as evaluation,
-        pytest.raises(ValueError, match="There is no demonstration of the task"),
-    ):
-        run_batches(evaluation, 2)
+    with Evaluation(*loaded, EvaluationPlan("0,24", trials=1), STEP) as evaluation:
+        assert len(evaluation.batches) == 2
+        with pytest.raises(ValueError, match="There is no demonstration of the task"):
+            run_batches(evaluation, 2)
 
 
 def test_a_process_that_dies_is_reported(loaded, monkeypatch):

@@ -181,8 +181,8 @@ def make_task_vector_envs(
     env_kwargs: dict[str, Any],
     task_ids: Sequence[int],
     n_envs: int,
-    use_async_envs: bool = False,
-    fps: int = 24,
+    use_async_envs: bool,
+    fps: int,
 ) -> list[TaskVectorEnv]:
     """Makes the vector environments of tasks, which share their simulators. No simulator is started yet.
 
@@ -204,10 +204,10 @@ def make_task_vector_envs(
 
 
 def make_single_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
-    """Makes an environment for LeRobot's rollout, which stays in the last step of an episode that has ended.
+    """Makes an environment that stays in its last step once the episode has ended, as LeRobot's metric needs it.
 
-    The mask of LeRobot's metric includes the step after an episode's end. With the next-step autoreset and
-    LeRobot's wrapper, which stays in the finished episode, no other episode is counted there.
+    The mask of that metric includes the step after an episode's end. With LeRobot's wrapper and the next-step
+    autoreset, no other episode is counted there.
 
     Args:
         env_id: Id of the environment, for `gymnasium.make`.

@@ -228,7 +228,7 @@ def _run_again(
     evaluation = Evaluation(*loaded, plan, record.step, render_size=RENDER_SIZE)
     with evaluation, without_rollout_progress():
         for number, batch in enumerate(evaluation.batches):
-            rendered = [each for each in batch.episodes if (each.task_id, each.trial) in wanted]
+            rendered = [each for each in batch if (each.task_id, each.trial) in wanted]
             for outcome in evaluation.run(number, rendered) if rendered else ():
                 if outcome.images is None:
                     continue

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import random
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -16,9 +16,11 @@ from gym_deltaco.tasks import CONTAINER_COLORS, Task, get_task, select_tasks
 from gym_deltaco.workspace import Quadrant, container_matches
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 
-# Episodes that are run at the same time. A policy's step costs little more for 8 than for 2, and each episode
-# needs a simulator of 50 MB, in each process.
-BATCH_SIZE = 8
+# Most episodes that are run at the same time. A policy's step costs little more for 8 than for 2, and each
+# episode needs a simulator of 50 MB, in each process.
+MOST_AT_ONCE = 8
+# Batches are what processes share, so that small sets have some, too.
+FEWEST_BATCHES = 4
 
 
 class Episode(NamedTuple):
@@ -29,7 +31,8 @@ class Episode(NamedTuple):
         trial: Number of the episode among those of its task, from 0.
         seed: Seed of the environment's reset.
         instruction: Instruction that the policy receives.
-        demonstrated: Task string of the demonstration that the policy receives, if it takes one.
+        demonstrated: Task string of the demonstration that the policy receives, if it takes one. The trials
+            use the demonstrations of that task in turn.
     """
 
     task_id: int
@@ -37,23 +40,6 @@ class Episode(NamedTuple):
     seed: int
     instruction: str
     demonstrated: str
-
-
-class EpisodeBatch(NamedTuple):
-    """Episodes that are run at the same time.
-
-    Attributes:
-        episodes: The episodes. Those of one instruction have one `demonstrated`.
-        earlier: Their instructions, each as often as episodes of earlier batches have it.
-    """
-
-    episodes: tuple[Episode, ...]
-    earlier: tuple[str, ...]
-
-    @property
-    def demonstrated_as(self) -> dict[str, str]:
-        """Task strings of the demonstrations, by instruction."""
-        return {episode.instruction: episode.demonstrated for episode in self.episodes}
 
 
 def draw_episodes(
@@ -94,29 +80,10 @@ def draw_episodes(
     return episodes
 
 
-def batched(episodes: Sequence[Episode], size: int = BATCH_SIZE) -> list[EpisodeBatch]:
-    """Splits episodes into batches, in their order.
-
-    Args:
-        episodes: The episodes.
-        size: Largest number of episodes of a batch. One ends earlier before an episode that has the same
-            instruction as one of the batch with another task's demonstration.
-    """
-    batches: list[list[Episode]] = []
-    for episode in episodes:
-        shown = {other.instruction: other.demonstrated for other in batches[-1]} if batches else {}
-        fits = shown.get(episode.instruction, episode.demonstrated) == episode.demonstrated
-        if not batches or len(batches[-1]) == size or not fits:
-            batches.append([])
-        batches[-1].append(episode)
-    seen: Counter[str] = Counter()
-    finished = []
-    for batch in batches:
-        own = [episode.instruction for episode in batch]
-        earlier = [text for text in dict.fromkeys(own) for _ in range(seen[text])]
-        finished.append(EpisodeBatch(tuple(batch), tuple(earlier)))
-        seen.update(own)
-    return finished
+def split_into_batches(episodes: Sequence[Episode]) -> list[list[Episode]]:
+    """Splits episodes into batches that are run at the same time, in their order."""
+    size = min(MOST_AT_ONCE, math.ceil(len(episodes) / FEWEST_BATCHES))
+    return [list(episodes[start : start + size]) for start in range(0, len(episodes), size)]
 
 
 def counterfactual_task(others: Sequence[Task], info: Mapping[str, Any], rng: random.Random) -> Task:

@@ -22,7 +22,7 @@ from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.envs.policy_fit import NO_RENAMING, check_policy_fits
 from lerobot_deltaco.evaluation.demonstration_checks import check_enough_demonstrations, policy_kind
-from lerobot_deltaco.evaluation.episodes import Episode, EpisodeBatch, batched, draw_episodes
+from lerobot_deltaco.evaluation.episodes import Episode, draw_episodes, split_into_batches
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import BENCHMARK, EpisodeResult
 from lerobot_deltaco.evaluation.recording_env import RecordingVectorEnv
@@ -30,6 +30,7 @@ from lerobot_deltaco.evaluation.simulators import Simulators
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import Demonstrated
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals
+from lerobot_deltaco.policy.task_conditioning import DemonstrationTurn
 
 PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
 
@@ -143,7 +144,7 @@ class Evaluation:
             check_enough_demonstrations(self._deltaco, select_tasks(plan.tasks))
             if self._deltaco.eval_demonstrations is not None:
                 demonstrated = self._deltaco.eval_demonstrations.rows
-        self.batches = batched(draw_episodes(plan, set_number, demonstrated))
+        self.batches = split_into_batches(draw_episodes(plan, set_number, demonstrated))
         env_kwargs = {**env_config.gym_kwargs, "render_mode": None if render_size is None else "rgb_array"}
         if render_size is not None:
             env_kwargs["render_size"] = render_size
@@ -164,7 +165,7 @@ class Evaluation:
 
         Args:
             number: Number of the batch.
-            rendered: Episodes of the batch of which images are rendered.
+            rendered: Episodes of the batch of which images are rendered; needs `render_size`.
 
         Raises:
             ValueError: A task has no demonstration.
@@ -173,15 +174,13 @@ class Evaluation:
         with _one_thread(self.policy.config.device), torch.no_grad(), ExitStack() as stack:
             noted: list[FoundGoals | None] = []
             if self._deltaco is not None:
-                self._deltaco.begin_evaluation()
-                # Demonstrations of an instruction take turns over the whole set.
-                self._deltaco._episode_tasks.count_trials(batch.earlier)
-                stack.enter_context(self._deltaco.demonstrated_as(batch.demonstrated_as))
+                turns = [DemonstrationTurn(episode.demonstrated, episode.trial) for episode in batch]
+                stack.enter_context(self._deltaco.with_turns(turns))
                 if rendered:
                     noted = stack.enter_context(_noted_goals(self._deltaco))
             else:
-                # Policies that draw, such as diffusion policies, do so by the batch's first seed.
-                stack.enter_context(seeded_context(batch.episodes[0].seed % 2**32))
+                # Policies that draw, such as diffusion policies, draw for a whole batch, by its first seed.
+                stack.enter_context(seeded_context(batch[0].seed % 2**32))
                 stack.enter_context(_autocast(self.policy.config))
             return self._run_batch(batch, rendered, noted)
 
@@ -191,22 +190,22 @@ class Evaluation:
         return sorted(outcomes, key=lambda outcome: (places[outcome.result.task_id], outcome.result.trial))
 
     def _run_batch(
-        self, batch: EpisodeBatch, rendered: Collection[Episode], noted: Sequence[FoundGoals | None]
+        self, batch: Sequence[Episode], rendered: Collection[Episode], noted: Sequence[FoundGoals | None]
     ) -> list[EpisodeOutcome]:
-        env = self._simulators.vector_env([episode.task_id for episode in batch.episodes])
-        seeds = [episode.seed for episode in batch.episodes]
+        env = self._simulators.vector_env([episode.task_id for episode in batch])
+        seeds = [episode.seed for episode in batch]
         recorded = RecordingVectorEnv(
             env,
             seeds,
-            [episode.instruction for episode in batch.episodes],
-            [number for number, episode in enumerate(batch.episodes) if episode in rendered],
+            [episode.instruction for episode in batch],
+            [number for number, episode in enumerate(batch) if episode in rendered],
         )
         identity: PolicyProcessorPipeline = PolicyProcessorPipeline(steps=[])
         data = rollout(
             recorded, self.policy, identity, identity, self._preprocessor, self._postprocessor, seeds
         )
         outcomes = []
-        for index, episode in enumerate(batch.episodes):
+        for index, episode in enumerate(batch):
             demonstrated = [] if self._deltaco is None else self._deltaco.demonstrated(index)
             images = None
             if index in recorded.scenes:

@@ -67,7 +67,7 @@ def run_batches(evaluation: Evaluation, processes: int) -> list[EpisodeOutcome]:
     processes = min(processes, len(evaluation.batches))
     outcomes: list[EpisodeOutcome] = []
     progress = tqdm(
-        total=sum(len(batch.episodes) for batch in evaluation.batches),
+        total=sum(len(batch) for batch in evaluation.batches),
         desc=f"Evaluating step {evaluation.set_number}",
         unit="episode",
     )

@@ -18,7 +18,7 @@ class RecordingVectorEnv:
         env: The vector environment.
         seeds: Seeds of the environments' resets, used as they are.
         instructions: Instructions that the policy receives, one for each environment.
-        rendered: Numbers of the environments whose scenes are rendered before the first step and after each.
+        rendered: Indices of the environments whose scenes are rendered before the first step and after each.
 
     Attributes:
         infos: Info of each environment, after its last step.

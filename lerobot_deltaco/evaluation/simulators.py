@@ -38,8 +38,9 @@ class Simulators:
         while len(self._envs) < size:
             self._envs.append(make_single_env(ENV_ID, self._env_kwargs))
         if size not in self._vector_envs:
-            self._vector_envs[size] = make_sync_vector_env([partial(self._env, n) for n in range(size)])
+            self._vector_envs[size] = make_sync_vector_env([partial(_same, env) for env in self._envs[:size]])
         vector_env = self._vector_envs[size]
+        # The options of a reset would be the same for all environments.
         vector_env.set_attr("task", [get_task(task_id) for task_id in task_ids])
         return vector_env
 
@@ -47,7 +48,10 @@ class Simulators:
         """Closes all environments."""
         for vector_env in self._vector_envs.values():
             vector_env.close()
+        for env in self._envs:
+            env.close()
         self._envs, self._vector_envs = [], {}
 
-    def _env(self, number: int) -> gym.Env:
-        return self._envs[number]
+
+def _same(env: gym.Env) -> gym.Env:
+    return env

@@ -73,7 +73,12 @@ def choose_eval_demonstrations(
             ]
             return demonstrations, torch.tensor(rows, device=demonstrations.frames.device)
     known = sorted({name for demonstrations in sets for name in demonstrations.rows})
-    missing = next((name for name in names if name not in known), names[0])
+    missing = next((name for name in names if name not in known), None)
+    if missing is None:
+        raise ValueError(
+            f"The demonstrations of the {len(set(names))} tasks of this batch are in two sets: those of "
+            "--policy.demo_repo_id and those of the training. Name a dataset that has them all."
+        )
     example = f", such as {known[0]!r}" if known else ""
     raise ValueError(
         f"There is no demonstration of the task {missing!r}. There are demonstrations of {len(known)} tasks"

@@ -111,15 +111,18 @@ class FrozenFeatures:
         if path is not None and path.exists():
             logger.info("The features of the demonstrations are read from %s.", path)
             return load_file(path)["features"].to(device)
-        # Features do not depend on the precision of the training that first asks for them.
+        # Under the autocast of a training in bfloat16, features in float16 cannot be joined.
         with torch.autocast(device.type, enabled=False):
             features = self._encoded(demonstrations, n_drawn)
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             # Several trainings may compute the same features at the same time.
             temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-            save_file({"features": features.cpu()}, temporary)
-            os.replace(temporary, path)
+            try:
+                save_file({"features": features.cpu()}, temporary)
+                os.replace(temporary, path)
+            finally:
+                temporary.unlink(missing_ok=True)
         return features
 
     def _encoded(self, demonstrations: DemonstrationSet, n_drawn: int) -> Tensor:

@@ -13,6 +13,18 @@ from lerobot_deltaco.policy.demonstrations import Demonstrated
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals
 
 
+class DemonstrationTurn(NamedTuple):
+    """Which demonstration an episode uses.
+
+    Attributes:
+        task: Task string whose demonstrations are used.
+        turn: Number of the demonstration among those of the task, which begin again after the last one.
+    """
+
+    task: str
+    turn: int
+
+
 class TaskConditioning(NamedTuple):
     """Inputs of the policy's network that specify the tasks of a batch, computed once per episode."""
 
@@ -31,6 +43,8 @@ class EpisodeTasks:
 
     Attributes:
         replaced: For instructions that get another task's demonstrations, its task string.
+        turns: Demonstration of each sample of the episodes; None to choose it by the sample's instruction, in
+            turn.
     """
 
     def __init__(self) -> None:
@@ -38,6 +52,7 @@ class EpisodeTasks:
         self._demonstrated: dict[int, list[tuple[Demonstrated, ...]]] = {}  # by thread
         self._n_episodes: dict[str, int] = {}  # by task
         self.replaced: Mapping[str, str] = {}
+        self.turns: tuple[DemonstrationTurn, ...] | None = None
 
     def begin_episode(self) -> None:
         """Forgets the conditioning and the demonstrations of this thread's last episode."""
@@ -83,8 +98,23 @@ class EpisodeTasks:
         finally:
             self.replaced = previous
 
+    @contextmanager
+    def with_turns(self, turns: Sequence[DemonstrationTurn]) -> Iterator[None]:
+        """Uses the given demonstration for each sample, while the context is open.
+
+        Args:
+            turns: The demonstrations, one for each sample.
+        """
+        previous, self.turns = self.turns, tuple(turns)
+        try:
+            yield
+        finally:
+            self.turns = previous
+
     def count_trials(self, tasks: Sequence[str]) -> list[int]:
         """Number of each sample's episode among those of its task, from 0, whichever thread runs them."""
+        if self.turns is not None:
+            return [each.turn for each in self.turns]
         trials = []
         for task in tasks:
             trials.append(self._n_episodes.get(task, 0))
