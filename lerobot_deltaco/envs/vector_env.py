@@ -204,7 +204,7 @@ def make_task_vector_envs(
 
 
 def make_single_env(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env:
-    """Makes an environment that stays in its last step once the episode has ended, as LeRobot's metric needs it.
+    """Makes an environment that stays in its last step once the episode has ended, for LeRobot's metric.
 
     The mask of that metric includes the step after an episode's end. With LeRobot's wrapper and the next-step
     autoreset, no other episode is counted there.
