@@ -295,7 +295,7 @@ def test_one_draw_decides_for_each_distractor_or_for_both_of_a_scene(
 ):
     # Objects are drawn before their places. To take the first places that are drawn saves most of the time.
     monkeypatch.setattr(layout_module, "_is_clear", lambda *_: True)
-    n = 2000
+    n = 1000
     shares = shares_alike(task_id, alike, n, adversarial_probability=probability, adversarial_draw=draw)
     expected = shares_by_the_rule(len(alike), 31, probability, draw)
     assert expected.sum() == pytest.approx(1)

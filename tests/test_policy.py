@@ -115,7 +115,7 @@ def test_the_loss_is_the_papers_sum(make, dataset):
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize("options", [{}, OURS], ids=str)
+@pytest.mark.parametrize("options", [pytest.param({}, marks=pytest.mark.slow), OURS], ids=str)
 def test_one_batch_can_be_overfitted(make, dataset, options):
     policy, before, _ = make(crop_padding=0, **options)
     batch = before(batch_of(dataset, [1, 6, 11, 16, 21, 26]))

@@ -64,6 +64,7 @@ def test_the_joined_dataset_is_that_of_one_machine(whole, in_process, tmp_path, 
     assert verify_dataset(root).has_digests
 
 
+@pytest.mark.slow
 def test_commands_collect_shards_by_workers_and_join_them(tmp_path, capsys):
     plan = ["--tasks", "90,4", "--episodes-per-task", "2", "--workers", "1"]
     for step in (["--shard", "1/2"], ["--shard", "2/2"], ["--join"]):

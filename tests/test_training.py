@@ -169,7 +169,7 @@ def without_later_checkpoints(checkpoints, folder, step):
     return folder / "checkpoints" / f"{step:06d}" / "pretrained_model" / "train_config.json"
 
 
-@pytest.mark.parametrize("tasks_per_batch", [0, 2])
+@pytest.mark.parametrize("tasks_per_batch", [pytest.param(0, marks=pytest.mark.slow), 2])
 def test_a_resumed_run_equals_an_uninterrupted_one(train, tmp_path, tasks_per_batch):
     # An epoch has 60 frames, which are 6 batches.
     options = [f"--policy.tasks_per_batch={tasks_per_batch}", "--batch_size=10", "--steps=14"]
