@@ -605,6 +605,7 @@ def test_an_interrupt_ends_with_a_message_and_the_next_run_goes_on(finished, tmp
     assert contents(tmp_path) == contents(finished)
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_the_workers_start_is_no_worse(tmp_path):
     process = start(tmp_path)
     wait_until(lambda: psutil.Process(process.pid).children() or process.poll() is not None)

@@ -329,22 +329,25 @@ def test_the_hub_is_needed(monkeypatch):
         check_credentials()
 
 
-def test_missing_credentials_are_found_before_collecting(hub, tmp_path):
-    cases = [
-        (hub.environment(tmp_path, token=None), "Set HF_TOKEN to a token that may write"),
-        (hub.environment(tmp_path, token="hf_wrong"), "does not accept the credentials"),
-        (
-            {**hub.environment(tmp_path), "HF_ENDPOINT": "http://127.0.0.1:9"},
-            "http://127.0.0.1:9 cannot be reached",
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        pytest.param({"HF_TOKEN": ""}, "Set HF_TOKEN to a token that may write", id="no token"),
+        pytest.param({"HF_TOKEN": "hf_wrong"}, "does not accept the credentials", id="wrong token"),
+        pytest.param(
+            *({"HF_ENDPOINT": "http://127.0.0.1:9"}, "http://127.0.0.1:9 cannot be reached"),
+            id="no Hub",
+            marks=pytest.mark.slow,
         ),
-    ]
+    ],
+)
+def test_missing_credentials_are_found_before_collecting(hub, tmp_path, changes, message):
     new = tmp_path / "new"
     options = ("--root", new, *ONE_EPISODE, "--repo-id", REPO_ID, "--push-to-hub")
-    for environment, message in cases:
-        result = outcome(COLLECT, *options, environment=environment)
-        assert result.returncode == 1
-        (error,) = [line for line in result.stderr.splitlines() if not line.startswith("pybullet build time")]
-        assert message in error
+    result = outcome(COLLECT, *options, environment={**hub.environment(tmp_path), **changes})
+    assert result.returncode == 1
+    (error,) = [line for line in result.stderr.splitlines() if not line.startswith("pybullet build time")]
+    assert message in error
     assert not new.exists()
     assert KEY not in hub.repos
 
@@ -411,27 +414,36 @@ for fetched, kept in zip(dataset, local, strict=True):
     assert TASKS[4].instruction in output
 
 
-def test_a_push_that_stops_says_what_has_arrived(copy, tmp_path):
-    cases = [
-        ("repos/create", "Nothing has arrived.", False),
-        ("POST /api/datasets/.*/commit/", f"{REPO_ID} has either all of the new files or none", False),
-        ("POST /api/datasets/.*/tag/", "All files have arrived, but the tag 'v3.0'", True),
-    ]
-    for number, (refused, message, has_arrived) in enumerate(cases):
-        with FakeHub() as hub:
-            hub.refused = refused
-            # The card's check at a fixed address is not needed: this Hub is another one.
-            result = outcome(
-                *(PUSH, "--root", copy, "--repo-id", REPO_ID),
-                environment=hub.environment(tmp_path / str(number)),
-                with_card_check=True,
-            )
-            stored = set(hub.repos[KEY].files()) if KEY in hub.repos else set()
-        assert result.returncode == 1, result.stderr
-        assert message in result.stderr.splitlines()[-1]
-        assert "cannot be reached" not in result.stderr
-        assert "Traceback" not in result.stderr
-        assert (str(DIGESTS_FILE) in stored) == (str(CARD_FILE) in stored) == has_arrived
+@pytest.mark.parametrize(
+    ("refused", "message", "has_arrived"),
+    [
+        pytest.param("repos/create", "Nothing has arrived.", False, id="at first"),
+        pytest.param(
+            *("POST /api/datasets/.*/commit/", f"{REPO_ID} has either all of the new files or none", False),
+            id="at the commit",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            *("POST /api/datasets/.*/tag/", "All files have arrived, but the tag 'v3.0'", True),
+            id="at the tag",
+        ),
+    ],
+)
+def test_a_push_that_stops_says_what_has_arrived(copy, tmp_path, refused, message, has_arrived):
+    with FakeHub() as hub:
+        hub.refused = refused
+        # The card's check at a fixed address is not needed: this Hub is another one.
+        result = outcome(
+            *(PUSH, "--root", copy, "--repo-id", REPO_ID),
+            environment=hub.environment(tmp_path),
+            with_card_check=True,
+        )
+        stored = set(hub.repos[KEY].files()) if KEY in hub.repos else set()
+    assert result.returncode == 1, result.stderr
+    assert message in result.stderr.splitlines()[-1]
+    assert "cannot be reached" not in result.stderr
+    assert "Traceback" not in result.stderr
+    assert (str(DIGESTS_FILE) in stored) == (str(CARD_FILE) in stored) == has_arrived
 
 
 def test_collecting_starts_without_heavy_imports():
