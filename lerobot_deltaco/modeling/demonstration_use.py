@@ -26,7 +26,7 @@ def choose_demonstrations(
         config: Configuration of the policy.
         candidates: Sets of demonstrations, in the order in which they are searched; that of the dataset
             `demo_repo_id` first.
-        tasks: Instruction of each sample.
+        tasks: Instruction of each sample, or the task string that demonstrates it.
         trials: Number of each sample's episode among those of its task, from 0.
         replaced: For instructions that get another task's demonstrations, its task string.
         paraphrases: Sentences that stand for task strings; None for none.

@@ -112,7 +112,10 @@ class EpisodeTasks:
             self.turns = previous
 
     def count_trials(self, tasks: Sequence[str]) -> list[int]:
-        """Number of each sample's episode among those of its task, from 0, whichever thread runs them."""
+        """Number of each sample's episode among those of its task, from 0, whichever thread runs them.
+
+        If `turns` are given, their numbers, and nothing is counted.
+        """
         if self.turns is not None:
             return [each.turn for each in self.turns]
         trials = []
