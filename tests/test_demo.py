@@ -1,8 +1,10 @@
 """The demo: its recipe makes sense, each step is done once, and it leaves a page and a summary."""
 
 import json
-import sys
+import signal
 from html.parser import HTMLParser
+from importlib import import_module
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from small_policies import REPO_ID, TASKS, use_fake_encoder, write_dataset
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.demo import machine, recipe
 from lerobot_deltaco.demo import steps as demo_steps
+from lerobot_deltaco.demo.commands import Command, deltaco, lerobot, run
 from lerobot_deltaco.demo.machine import seconds_per_step
 from lerobot_deltaco.demo.page import write_page
 from lerobot_deltaco.demo.steps import Demo, DemoError
@@ -34,43 +37,77 @@ def demo(tmp_path, monkeypatch):
     return Demo(tmp_path / "demo")
 
 
-def test_a_step_is_done_once(demo, tmp_path, capsys):
-    log = tmp_path / "log"
-    command = [sys.executable, "-c", f"open({str(log)!r}, 'a').write('x')"]
+@pytest.fixture
+def greet(tmp_path, monkeypatch):
+    """Makes commands that greet, each time they run, on their output and in a file, and end with a status."""
+    (tmp_path / "greeting.py").write_text(
+        "import os, sys, torch\n"
+        "def main():\n"
+        "    print('hello', torch.get_num_threads(), os.environ['HF_HUB_OFFLINE'])\n"
+        "    with open(sys.argv[1], 'a') as file:\n"
+        "        file.write('x')\n"
+        "    sys.exit(int(sys.argv[2]))\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    return lambda file, status=0: Command("greeting", (str(file), str(status)))
+
+
+def test_a_command_has_an_output_a_status_and_a_number_of_threads_of_its_own(greet, tmp_path):
+    log = tmp_path / "log.txt"
+    for threads in (1, 2):
+        assert run(greet(tmp_path / "file", 3), log, threads) == 3
+        assert log.read_text() == f"hello {threads} 1\n"
+    assert str(greet("a file")) == "python -m greeting 'a file' 0"
+
+
+def test_a_command_that_a_signal_ends_or_that_does_not_exist_has_failed(tmp_path, monkeypatch):
+    (tmp_path / "killed.py").write_text(
+        "import os, signal\ndef main(): os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    log = tmp_path / "log.txt"
+    assert run(Command("killed", ()), log) == -signal.SIGKILL
+    assert run(Command("no_such_command", ()), log) == 1
+    assert "No module named 'no_such_command'" in log.read_text()
+
+
+def test_a_command_is_what_a_shell_would_run():
+    for command in (deltaco("train", "--steps=3"), lerobot("eval", "--env.type=deltaco")):
+        assert find_spec(command.module) is not None
+        assert callable(import_module(command.module).main)
+
+
+def test_a_step_is_done_once(demo, greet, tmp_path, capsys):
+    file = tmp_path / "greetings"
     for again in (demo, Demo(demo.folder)):
-        again._do("greet", "Greeting", command)
-    assert log.read_text() == "x"
+        again._do("greet", "Greeting", greet(file))
+    assert file.read_text() == "x"
     assert "Greeting: done before" in capsys.readouterr().out
     assert demo.seconds()["greet"] > 0
 
 
-def test_a_failed_step_is_named_and_done_again(demo, tmp_path):
-    flag = tmp_path / "flag"
-    command = [sys.executable, "-c", f"import os, sys; sys.exit(0 if os.path.exists({str(flag)!r}) else 3)"]
+def test_a_failed_step_is_named_and_done_again(demo, greet, tmp_path):
     with pytest.raises(DemoError, match="(?s)Greeting failed .exit status 3.*it continues from here"):
-        demo._do("greet", "Greeting", command)
+        demo._do("greet", "Greeting", greet(tmp_path / "greetings", 3))
     first = demo.seconds()
     assert "greet" not in first
-    flag.touch()
-    demo._do("greet", "Greeting", command)
+    demo._do("greet", "Greeting", greet(tmp_path / "greetings"))
     # The time of the attempt that failed is counted too.
     assert demo.seconds()["greet"] > first["greet_so_far"]
 
 
-def test_steps_that_run_together_are_done_once_and_each_has_a_log(demo, tmp_path):
-    flag, log = tmp_path / "flag", tmp_path / "log"
-    greet = [sys.executable, "-c", f"print('hello'); open({str(log)!r}, 'a').write('x')"]
-    fail = [sys.executable, "-c", f"import os, sys; sys.exit(0 if os.path.exists({str(flag)!r}) else 3)"]
-    commands = {"greet": greet, "fail": fail}
+def test_steps_that_run_together_are_done_once_and_each_has_a_log(demo, greet, tmp_path):
+    file = tmp_path / "greetings"
+    commands = {"greet": greet(file), "fail": greet(tmp_path / "others", 3)}
     with pytest.raises(DemoError, match="(?s)fail failed .exit status 3.*logs/fail.txt.*continues from here"):
         demo._do_together("both", "Both", commands)
     assert "both" not in demo.seconds()
-    flag.touch()
+    commands["fail"] = greet(tmp_path / "others")
     for again in (demo, Demo(demo.folder)):
         again._do_together("both", "Both", commands)
     assert demo.seconds()["both"] > demo.seconds()["greet"]
-    assert log.read_text() == "x"
-    assert (demo.folder / "logs" / "greet.txt").read_text() == "hello\n"
+    assert file.read_text() == "x"
+    assert (demo.folder / "logs" / "greet.txt").read_text().startswith("hello")
 
 
 def test_a_demo_with_other_settings_is_not_mixed_with_this_one(demo):
@@ -108,7 +145,7 @@ def test_the_number_of_training_steps_fits_the_machine_and_is_chosen_once(demo, 
     again.train()
     assert again.settings["steps"] == steps
     assert done[0] == done[1]
-    assert f"--steps={steps}" in done[0]
+    assert f"--steps={steps}" in done[0].arguments
 
 
 class Page(HTMLParser):

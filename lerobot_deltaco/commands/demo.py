@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from lerobot_deltaco.commands.command_errors import exit_on_error
+from lerobot_deltaco.demo.commands import start_imports
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -25,6 +26,7 @@ def main(arguments: list[str] | None = None) -> None:
         help="folder for all outputs (default: %(default)s)",
     )
     options = parser.parse_args(arguments)
+    start_imports()
     with exit_on_error(parser):
         # Only here, since they take seconds to import.
         from lerobot_deltaco.demo.page import write_page

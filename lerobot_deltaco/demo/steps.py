@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-import shlex
 import shutil
-import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,12 +18,11 @@ from gym_deltaco.atomic_files import write_json
 from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.common.run_folder import last_policy, last_train_config
 from lerobot_deltaco.demo import recipe
+from lerobot_deltaco.demo.commands import Command, deltaco, lerobot, run
 from lerobot_deltaco.demo.machine import fast_dtype, seconds_per_step
 
 TRAINING_SET = "deltaco/demo"
 DEMONSTRATIONS = "deltaco/demo_demonstrations"
-# Nothing is fetched from the Hub: the language encoder comes with the extra `offline`.
-_OFFLINE = {**os.environ, "HF_HUB_OFFLINE": "1"}
 # What a finished step leaves, with the seconds that it took.
 _DONE = "done.json"
 
@@ -105,14 +101,14 @@ class Demo:
         self._do(
             "collect",
             "Collecting the expert's episodes",
-            self._deltaco(
+            deltaco(
                 "collect", "--tasks", tasks, "--episodes-per-task", number, "--root", self.folder / "dataset"
             ),
         )
         self._do(
             "demonstrate",
             "Collecting one demonstration of each task",
-            self._deltaco(
+            deltaco(
                 "collect",
                 "--tasks",
                 everything,
@@ -152,7 +148,7 @@ class Demo:
                 "output_dir": self.run,
             }
             arguments = [f"--{name}={value}" for name, value in options.items()]
-        self._do("train", f"Training for {steps} steps", self._deltaco("train", *arguments))
+        self._do("train", f"Training for {steps} steps", deltaco("train", *arguments))
 
     def _affordable_steps(self) -> int:
         """Number of training steps that this machine manages in the time for them."""
@@ -169,7 +165,7 @@ class Demo:
     def evaluate(self) -> None:
         """Evaluates on new scenes of trained tasks, on new combinations, and with counterfactual inputs.
 
-        As many run at a time as there are cores, since most of their time is the start of LeRobot.
+        As many run at a time as there are cores.
         """
         evaluations = {}
         for name, tasks in (("trained", "tasks"), ("new", "new_combinations")):
@@ -185,7 +181,7 @@ class Demo:
                 "output_dir": self.folder / "evaluation" / name,
             }
             arguments = [f"--{key}={value}" for key, value in options.items()]
-            evaluations[f"evaluate_{name}"] = self._lerobot("eval", arguments)
+            evaluations[f"evaluate_{name}"] = lerobot("eval", *arguments)
         everything = recipe.selection((*self.settings["tasks"], *self.settings["new_combinations"]))
         trials = str(self.settings["counterfactual_trials"])
         for what in ("demo", "instruction"):
@@ -199,24 +195,23 @@ class Demo:
                 "--trials",
                 trials,
             ]
-            evaluations[f"other_{what}"] = self._deltaco("evaluate", self.run, *arguments)
+            evaluations[f"other_{what}"] = deltaco("evaluate", self.run, *arguments)
         self._do_together("evaluate", "Evaluating", evaluations)
 
-    def _do(self, name: str, what: str, command: Sequence[Any]) -> None:
+    def _do(self, name: str, what: str, command: Command) -> None:
         """Runs a command, unless it was run to its end before."""
         seconds = self.seconds()
         if name in seconds:
             sys.stdout.write(f"[demo] {what}: done before.\n")
             return
-        words = [str(word) for word in command]
-        sys.stdout.write(f"\n[demo] {what}:\n{shlex.join(['python', *words[1:]])}\n")
+        sys.stdout.write(f"\n[demo] {what}:\n{command}\n")
         sys.stdout.flush()
         with self._timed(name):
-            code = subprocess.run(words, check=False, env=_OFFLINE).returncode
+            code = run(command)
             if code != 0:
-                raise DemoError(_failure(what, code, words, "above"))
+                raise DemoError(_failure(what, code, command, "above"))
 
-    def _do_together(self, name: str, what: str, commands: Mapping[str, Sequence[Any]]) -> None:
+    def _do_together(self, name: str, what: str, commands: Mapping[str, Command]) -> None:
         """Runs commands, as many at a time as there are cores, unless they were run to their ends before.
 
         The output of each goes to a file of its own.
@@ -225,23 +220,20 @@ class Demo:
         if name in seconds:
             sys.stdout.write(f"[demo] {what}: done before.\n")
             return
-        left = {part: list(map(str, command)) for part, command in commands.items() if part not in seconds}
+        left = {part: command for part, command in commands.items() if part not in seconds}
         n_workers = max(1, min(available_cores(), len(left)))
         logs = self.folder / "logs"
         logs.mkdir(exist_ok=True)
         sys.stdout.write(f"\n[demo] {what}, {n_workers} at a time; their output is in {logs}:\n")
-        sys.stdout.writelines(f"{shlex.join(['python', *words[1:]])}\n" for words in left.values())
+        sys.stdout.writelines(f"{command}\n" for command in left.values())
         sys.stdout.flush()
-        environment = {**_OFFLINE, "OMP_NUM_THREADS": str(max(1, available_cores() // n_workers))}
+        n_threads = max(1, available_cores() // n_workers)
 
-        def run(part: str) -> tuple[str, int]:
-            with (logs / f"{part}.txt").open("w") as log:
-                words = left[part]
-                result = subprocess.run(words, check=False, env=environment, stdout=log, stderr=log)
-            return part, result.returncode
+        def run_part(part: str) -> tuple[str, int]:
+            return part, run(left[part], logs / f"{part}.txt", n_threads)
 
         with self._timed(name), ThreadPoolExecutor(n_workers) as threads:
-            runs = [threads.submit(run, part) for part in left]
+            runs = [threads.submit(run_part, part) for part in left]
             failure: DemoError | None = None
             try:
                 for finished in tqdm(as_completed(runs), what, total=len(runs), unit="evaluation"):
@@ -272,17 +264,9 @@ class Demo:
         everything[name] = everything.get(name, 0.0) + seconds
         write_json(self.folder / _DONE, everything)
 
-    @staticmethod
-    def _deltaco(command: str, *arguments: Any) -> list[Any]:
-        return [sys.executable, "-m", f"lerobot_deltaco.commands.{command}", *arguments]
 
-    @staticmethod
-    def _lerobot(command: str, arguments: Sequence[str]) -> list[str]:
-        return [sys.executable, "-m", f"lerobot.scripts.lerobot_{command}", *arguments]
-
-
-def _failure(what: str, code: int, words: Sequence[str], where: str) -> str:
+def _failure(what: str, code: int, command: Command, where: str) -> str:
     return (
-        f"{what} failed (exit status {code}); see {where} for why. The command was\n{shlex.join(words)}\n"
+        f"{what} failed (exit status {code}); see {where} for why. The command was\n{command}\n"
         "After fixing the cause, run the demo again: it continues from here."
     )
