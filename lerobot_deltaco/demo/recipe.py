@@ -22,7 +22,7 @@ DEMONSTRATIONS_PER_TASK = 1
 # looks as if it were about to grasp it. A policy that learned much of that hovers.
 DROPPED_FRAMES = 19
 # As many steps as the machine does in this time, within bounds. A short measurement may be 40 % too good.
-TRAINING_SECONDS = 210
+TRAINING_SECONDS = 180
 LEAST_STEPS, MOST_STEPS = 2000, 12000
 SAVE_EVERY = 400
 BATCH_SIZE = 48
