@@ -1,7 +1,11 @@
 """The demo: its recipe makes sense, each step is done once, and it leaves a page and a summary."""
 
 import json
+import os
 import signal
+import subprocess
+import sys
+import time
 from html.parser import HTMLParser
 from importlib import import_module
 from importlib.util import find_spec
@@ -69,6 +73,42 @@ def test_a_command_that_a_signal_ends_or_that_does_not_exist_has_failed(tmp_path
     assert run(Command("killed", ()), log) == -signal.SIGKILL
     assert run(Command("no_such_command", ()), log) == 1
     assert "No module named 'no_such_command'" in log.read_text()
+
+
+def test_an_interrupted_command_has_time_to_clean_up(tmp_path):
+    (tmp_path / "patient.py").write_text(
+        "import time\n"
+        "from pathlib import Path\n"
+        "def main():\n"
+        "    try:\n"
+        "        Path('state').write_text('waiting')\n"
+        "        time.sleep(60)\n"
+        "    except KeyboardInterrupt:\n"
+        "        time.sleep(0.5)\n"
+        "        Path('state').write_text('clean')\n"
+        "        raise SystemExit(130)\n"
+    )
+    program = (
+        "import signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "sys.path.insert(0, '.')\n"
+        "from lerobot_deltaco.demo import commands\n"
+        "commands._IMPORTED = ()\n"
+        "commands.start_imports()\n"
+        "commands.run(commands.Command('patient', ()))\n"
+    )
+    # As in a terminal, Ctrl-C goes to all processes of the session.
+    options = {"cwd": tmp_path, "start_new_session": True, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", program], **options) as demo:
+        state, end = tmp_path / "state", time.monotonic() + 60
+        while not (state.exists() and state.read_text() == "waiting"):
+            assert time.monotonic() < end
+            assert demo.poll() is None
+            time.sleep(0.05)
+        os.killpg(demo.pid, signal.SIGINT)
+        errors = demo.communicate(timeout=60)[1]
+    assert state.read_text() == "clean"
+    assert errors.count("Traceback") == 1  # this program's
 
 
 def test_a_command_is_what_a_shell_would_run():

@@ -11,6 +11,7 @@ import multiprocessing
 import multiprocessing.forkserver
 import os
 import shlex
+import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -57,7 +58,10 @@ def start_imports() -> None:
     os.environ.update(_ENVIRONMENT)
     if _FORKS:
         multiprocessing.set_forkserver_preload(list(_IMPORTED))
+        # It ends when this process ends; after Ctrl-C, it need not say where in its imports it was.
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         multiprocessing.forkserver.ensure_running()
+        signal.signal(signal.SIGINT, before)
 
 
 def run(command: Command, log: Path | None = None, threads: int | None = None) -> int:
@@ -89,6 +93,7 @@ def run(command: Command, log: Path | None = None, threads: int | None = None) -
 
 def _run(command: Command, log: Path | None, threads: int | None) -> None:
     """The command's process."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.update(_ENVIRONMENT)
     if log is not None:
         with log.open("wb") as file:
