@@ -1,7 +1,7 @@
 """Commands of the demo, in processes that are forked from one that has imported LeRobot already.
 
 A command is a module with a function `main`, which reads `sys.argv`. It does what `python -m` would do with
-it, but need not import LeRobot, which takes 10 to 20 s of a core. The demo runs seven commands.
+it, but need not import LeRobot, which takes 6 to 15 s of a core. The demo runs seven commands.
 """
 
 from __future__ import annotations
