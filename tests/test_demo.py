@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from html.parser import HTMLParser
 from importlib import import_module
 from importlib.util import find_spec
@@ -16,7 +17,7 @@ from PIL import Image
 from small_policies import REPO_ID, TASKS, use_fake_encoder, write_dataset
 
 from gym_deltaco.tasks import get_task
-from lerobot_deltaco.demo import machine, recipe
+from lerobot_deltaco.demo import commands, machine, preloaded, recipe
 from lerobot_deltaco.demo import steps as demo_steps
 from lerobot_deltaco.demo.commands import Command, deltaco, lerobot, run
 from lerobot_deltaco.demo.machine import seconds_per_step
@@ -45,9 +46,9 @@ def demo(tmp_path, monkeypatch):
 def greet(tmp_path, monkeypatch):
     """Makes commands that greet, each time they run, on their output and in a file, and end with a status."""
     (tmp_path / "greeting.py").write_text(
-        "import os, sys, torch\n"
+        "import sys\n"
         "def main():\n"
-        "    print('hello', torch.get_num_threads(), os.environ['HF_HUB_OFFLINE'])\n"
+        "    print('hello')\n"
         "    with open(sys.argv[1], 'a') as file:\n"
         "        file.write('x')\n"
         "    sys.exit(int(sys.argv[2]))\n"
@@ -56,12 +57,32 @@ def greet(tmp_path, monkeypatch):
     return lambda file, status=0: Command("greeting", (str(file), str(status)))
 
 
-def test_a_command_has_an_output_a_status_and_a_number_of_threads_of_its_own(greet, tmp_path):
+def test_a_command_has_an_output_and_a_status_of_its_own(greet, tmp_path):
     log = tmp_path / "log.txt"
-    for threads in (1, 2):
-        assert run(greet(tmp_path / "file", 3), log, threads) == 3
-        assert log.read_text() == f"hello {threads} 1\n"
+    assert run(greet(tmp_path / "file", 3), log) == 3
+    assert log.read_text() == "hello\n"
     assert str(greet("a file")) == "python -m greeting 'a file' 0"
+
+
+def test_a_command_has_a_number_of_threads(tmp_path, monkeypatch):
+    program = (
+        "import os, torch\ndef main():\n    print(torch.get_num_threads(), os.environ['OMP_NUM_THREADS'])\n"
+    )
+    (tmp_path / "count_threads.py").write_text(program)
+    monkeypatch.syspath_prepend(tmp_path)
+    log = tmp_path / "log.txt"
+    assert run(Command("count_threads", ()), log, threads=3) == 0
+    assert log.read_text() == "3 3\n"
+
+
+def test_commands_that_run_in_several_threads_each_have_their_own_status(greet, tmp_path):
+    statuses = [status % 3 for status in range(48)]
+    with ThreadPoolExecutor(4) as threads:
+        runs = [
+            threads.submit(run, greet(tmp_path / "file", status), tmp_path / f"{number}.txt")
+            for number, status in enumerate(statuses)
+        ]
+        assert [each.result() for each in runs] == statuses
 
 
 def test_a_command_that_a_signal_ends_or_that_does_not_exist_has_failed(tmp_path, monkeypatch):
@@ -75,45 +96,70 @@ def test_a_command_that_a_signal_ends_or_that_does_not_exist_has_failed(tmp_path
     assert "No module named 'no_such_command'" in log.read_text()
 
 
-def test_an_interrupted_command_has_time_to_clean_up(tmp_path):
-    (tmp_path / "patient.py").write_text(
+@pytest.fixture
+def interrupted(tmp_path):
+    """Interrupts a demo, as Ctrl-C does, that runs a command, once a file is there; returns its errors."""
+
+    def interrupt(preloaded, command, file):
+        (tmp_path / "preloaded.py").write_text(preloaded)
+        (tmp_path / "command.py").write_text(command)
+        program = (
+            "import signal, sys\n"
+            "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+            "sys.path.insert(0, '.')\n"
+            "from lerobot_deltaco.demo import commands\n"
+            "commands._PRELOADED = 'preloaded'\n"
+            "commands.start_imports()\n"
+            "commands.run(commands.Command('command', ()))\n"
+        )
+        options = {"cwd": tmp_path, "start_new_session": True, "stderr": subprocess.PIPE, "text": True}
+        with subprocess.Popen([sys.executable, "-c", program], **options) as demo:
+            end = time.monotonic() + 60
+            while not (tmp_path / file).exists():
+                assert time.monotonic() < end
+                assert demo.poll() is None
+                time.sleep(0.05)
+            os.killpg(demo.pid, signal.SIGINT)
+            # To the end of all processes that have it.
+            return demo.communicate(timeout=60)[1]
+
+    return interrupt
+
+
+def test_an_interrupted_command_has_time_to_clean_up(tmp_path, interrupted):
+    command = (
         "import time\n"
         "from pathlib import Path\n"
         "def main():\n"
         "    try:\n"
-        "        Path('state').write_text('waiting')\n"
+        "        Path('running').touch()\n"
         "        time.sleep(60)\n"
         "    except KeyboardInterrupt:\n"
         "        time.sleep(0.5)\n"
-        "        Path('state').write_text('clean')\n"
+        "        Path('clean').touch()\n"
         "        raise SystemExit(130)\n"
     )
-    program = (
-        "import signal, sys\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "sys.path.insert(0, '.')\n"
-        "from lerobot_deltaco.demo import commands\n"
-        "commands._IMPORTED = ()\n"
-        "commands.start_imports()\n"
-        "commands.run(commands.Command('patient', ()))\n"
-    )
-    # As in a terminal, Ctrl-C goes to all processes of the session.
-    options = {"cwd": tmp_path, "start_new_session": True, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", program], **options) as demo:
-        state, end = tmp_path / "state", time.monotonic() + 60
-        while not (state.exists() and state.read_text() == "waiting"):
-            assert time.monotonic() < end
-            assert demo.poll() is None
-            time.sleep(0.05)
-        os.killpg(demo.pid, signal.SIGINT)
-        errors = demo.communicate(timeout=60)[1]
-    assert state.read_text() == "clean"
-    assert errors.count("Traceback") == 1  # this program's
+    errors = interrupted("", command, "running")
+    assert (tmp_path / "clean").exists()
+    assert errors.count("Traceback") == 1  # the demo's own
 
 
-def test_a_command_is_what_a_shell_would_run():
-    for command in (deltaco("train", "--steps=3"), lerobot("eval", "--env.type=deltaco")):
-        assert find_spec(command.module) is not None
+def test_no_command_starts_after_an_interrupt_during_the_imports(tmp_path, interrupted):
+    preloaded = "import time\nfrom pathlib import Path\nPath('importing').touch()\ntime.sleep(2)\n"
+    command = "from pathlib import Path\ndef main():\n    Path('running').touch()\n"
+    errors = interrupted(preloaded, command, "importing")
+    assert not (tmp_path / "running").exists()
+    assert errors.count("Traceback") == 1
+
+
+def test_what_is_imported_beforehand_exists():
+    # Imports that fail there are left to the commands, so that a wrong name would go unnoticed.
+    assert all(find_spec(name) is not None for name in preloaded.NAMES)
+    assert find_spec(commands._PRELOADED) is not None
+
+
+def test_the_demos_commands_have_a_function_that_runs_them():
+    for command in (deltaco("collect"), deltaco("train"), deltaco("evaluate"), lerobot("eval")):
         assert callable(import_module(command.module).main)
 
 

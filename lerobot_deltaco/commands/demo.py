@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from lerobot_deltaco.commands.command_errors import exit_on_error
-from lerobot_deltaco.demo.commands import start_imports
+from lerobot_deltaco.demo.commands import start_imports, wait_for_imports
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -31,6 +31,8 @@ def main(arguments: list[str] | None = None) -> None:
         # Only here, since they take seconds to import.
         from lerobot_deltaco.demo.page import write_page
         from lerobot_deltaco.demo.steps import Demo, DemoError
+
+        wait_for_imports()  # or the demo's measurements of this machine would be disturbed
     with exit_on_error(parser, DemoError, OSError):
         demo = Demo(options.out)
         for step in (demo.collect, demo.train, demo.evaluate):

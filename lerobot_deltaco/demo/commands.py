@@ -1,7 +1,7 @@
 """Commands of the demo, in processes that are forked from one that has imported LeRobot already.
 
-A command is a module with a function `main`, which reads `sys.argv`. It does what `python -m` would do with
-it, but need not import LeRobot, which takes 6 to 15 s of a core. The demo runs seven commands.
+A command is a module whose `main` reads `sys.argv`. Forked, it need not import LeRobot, which takes 6 to 15 s
+of a core; the demo runs seven commands. Functions that a command registers with `atexit` are not called.
 """
 
 from __future__ import annotations
@@ -13,24 +13,21 @@ import os
 import shlex
 import signal
 import sys
+import threading
 from contextlib import suppress
+from multiprocessing.connection import wait
+from multiprocessing.context import ForkServerContext, SpawnContext
 from pathlib import Path
 from typing import Any, NamedTuple
 
 # Nothing is fetched from the Hub: the language encoder comes with the extra `offline`.
 _ENVIRONMENT = {"HF_HUB_OFFLINE": "1"}
-# What takes long to import; the modules of the commands import these where they need them.
-_IMPORTED = (
-    "lerobot.scripts.lerobot_eval",
-    "lerobot.scripts.lerobot_train",
-    "lerobot_deltaco.data.collection",
-    "lerobot_deltaco.evaluation.sets",
-    "lerobot_deltaco.training.loop",
-    "lerobot_policy_deltaco",
-)
+_PRELOADED = "lerobot_deltaco.demo.preloaded"
 # Elsewhere, processes that have imported PyTorch cannot be forked safely: each command imports what it needs.
 _FORKS = sys.platform == "linux"
 _SECONDS_TO_END = 10
+# Whoever starts a process also asks whether others have ended. Only one thread may read their status.
+_STATUS = threading.Lock()
 
 
 class Command(NamedTuple):
@@ -56,16 +53,27 @@ def lerobot(name: str, *arguments: Any) -> Command:
 def start_imports() -> None:
     """Starts the process that commands are forked from, which imports LeRobot while this one goes on."""
     os.environ.update(_ENVIRONMENT)
-    if _FORKS:
-        multiprocessing.set_forkserver_preload(list(_IMPORTED))
-        # It ends when this process ends; after Ctrl-C, it need not say where in its imports it was.
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if not _FORKS:
+        return
+    multiprocessing.set_forkserver_preload([_PRELOADED])
+    # It ignores Ctrl-C, or it would print a traceback; it ends after its imports once this process has ended.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
         multiprocessing.forkserver.ensure_running()
+    finally:
         signal.signal(signal.SIGINT, before)
 
 
+def wait_for_imports() -> None:
+    """Waits until that process has imported everything, after which it needs no processor time."""
+    if _FORKS:
+        process = _context().Process(target=_nothing)
+        process.start()
+        process.join()
+
+
 def run(command: Command, log: Path | None = None, threads: int | None = None) -> int:
-    """Runs a command to its end.
+    """Runs a command to its end. Several threads may do so at a time.
 
     Args:
         command: What is run.
@@ -75,24 +83,38 @@ def run(command: Command, log: Path | None = None, threads: int | None = None) -
     Returns:
         Its exit status; minus the number of the signal that ended it, if one did.
     """
-    context = multiprocessing.get_context("forkserver") if _FORKS else multiprocessing.get_context("spawn")
-    process = context.Process(target=_run, args=(command, log, threads))
-    process.start()
+    process = _context().Process(target=_run, args=(command, log, threads))
     try:
-        process.join()
+        with _STATUS:
+            process.start()
+        wait([process.sentinel])
     except BaseException:
         # After Ctrl-C, which the command gets too, it has time to end by itself, until Ctrl-C comes again.
-        with suppress(BaseException):
-            process.join(_SECONDS_TO_END)
-        process.kill()
-        process.join()
+        if process.pid is not None:
+            with suppress(BaseException):
+                process.join(_SECONDS_TO_END)
+            process.kill()
+            process.join()
         raise
+    with _STATUS:
+        process.join()
     assert process.exitcode is not None
     return process.exitcode
 
 
+def _context() -> ForkServerContext | SpawnContext:
+    return multiprocessing.get_context("forkserver") if _FORKS else multiprocessing.get_context("spawn")
+
+
+def _nothing() -> None:
+    """A process that has nothing to do."""
+
+
 def _run(command: Command, log: Path | None, threads: int | None) -> None:
     """The command's process."""
+    demo = multiprocessing.parent_process()
+    if demo is None or not demo.is_alive():
+        return  # It was interrupted while it waited for the imports.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.update(_ENVIRONMENT)
     if log is not None:
