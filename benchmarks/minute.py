@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -135,20 +136,13 @@ def _measure_recipe(out: Path, encoder: str) -> list[Line]:
         "output_dir": out / "run",
     }
     arguments = [f"--{name}={value}" for name, value in settings.items()]
-    times = out / "times.json"
-    script = str(Path(__file__).with_name("step_times.py"))
-    clock, processor, _ = _run(script, str(times), *arguments, OMP_NUM_THREADS="1")
-    ends = json.loads(times.read_text())[WARM_UP - 1 :]
-    step, step_cpu = (
-        statistics.median(later[which] - earlier[which] for earlier, later in itertools.pairwise(ends))
-        for which in (0, 1)
-    )
-    name = f"a step of {BATCH_SIZE} samples, {encoder}, one thread"
-    lines += [
-        Line(f"deltaco-train, {WARM_UP + STEPS} steps, start included", clock, processor, "s"),
-        Line(f"    {name}", step, step_cpu, "s"),
-        Line("    samples", BATCH_SIZE / step, BATCH_SIZE / step_cpu, "samples/s"),
-    ]
+    clock, processor, steps = _measure_training(out / "times.json", arguments, n_threads=1)
+    name = f"deltaco-train, {WARM_UP + STEPS} steps, {encoder}, start included"
+    lines += [Line(name, clock, processor, "s"), *steps]
+    if available_cores() > 1:
+        settings["output_dir"] = out / "run_of_all_cores"
+        arguments = [f"--{name}={value}" for name, value in settings.items()]
+        lines += _measure_training(out / "times.json", arguments, available_cores())[2]
     clock, processor, _ = _run(
         "-m", _command("evaluate"), str(out / "run"), f"--tasks={EVALUATED}", f"--trials={TRIALS}"
     )
@@ -160,6 +154,25 @@ def _measure_recipe(out: Path, encoder: str) -> list[Line]:
         Line(f"deltaco-evaluate, {n_evaluated} episodes, start included", clock, processor, "s"),
         Line("    of which the episodes", n_evaluated / contents["seconds"], None, "episodes/s"),
     ]
+
+
+def _measure_training(
+    times: Path, arguments: Sequence[str], n_threads: int
+) -> tuple[float, float, list[Line]]:
+    """A training: its seconds on the clock and of the processor, and lines on its steps."""
+    script = str(Path(__file__).with_name("step_times.py"))
+    clock, processor, _ = _run(script, str(times), *arguments, OMP_NUM_THREADS=str(n_threads))
+    ends = json.loads(times.read_text())[WARM_UP - 1 :]
+    step, step_cpu = (
+        statistics.median(later[which] - earlier[which] for earlier, later in itertools.pairwise(ends))
+        for which in (0, 1)
+    )
+    threads = f"{n_threads} thread{'s' if n_threads > 1 else ''}"
+    lines = [
+        Line(f"    a step of {BATCH_SIZE} samples, {threads}", step, step_cpu, "s"),
+        Line(f"    samples, {threads}", BATCH_SIZE / step, BATCH_SIZE / step_cpu, "samples/s"),
+    ]
+    return clock, processor, lines
 
 
 def _command(name: str) -> str:

@@ -32,5 +32,5 @@ def test_where_a_minute_goes_is_measured(tmp_path):
     result = run("minute.py", "--only", "training", "--encoder=attention", f"--json={found}")
     assert result.returncode == 0, result.stderr
     lines = {line["what"].strip(): line["clock"] for line in json.loads(found.read_text())["lines"]}
-    assert lines["samples"] > 0
+    assert lines["samples, 1 thread"] > 0
     assert all(figure > 0 for figure in lines.values())
