@@ -329,6 +329,11 @@ def test_experiments_stand_as_in_the_papers_tables():
     assert sorted([*mine, *reversed(published)], key=in_order) == expected
 
 
+def test_numbers_in_names_sort_by_their_value():
+    names = ["mine/objects_100", "mine/objects_24", "mine/objects_24_either", "mine/objects_4000"]
+    assert sorted(names, key=in_order) == [names[1], names[2], names[0], names[3]]
+
+
 def test_the_authors_numbers():
     assert PAPER_RESULTS["scenario_a/deltaco"][1:] == pytest.approx((0.258, 0.034))
     assert PAPER_RESULTS["scenario_b/oracle"][1:] == pytest.approx((0.617, 0.14))

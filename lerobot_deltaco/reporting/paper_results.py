@@ -6,6 +6,7 @@ they show which order and which distances to expect, not which values.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
@@ -157,8 +158,11 @@ def label_of(experiment: str) -> str:
     return _OWN_LABELS.get(name, name.replace("_", " ")) if published is None else published.label
 
 
-def in_order(experiment: str) -> tuple[int, str, int, str]:
-    """A key that sorts experiments as they stand above, and others after those with which they belong."""
+def in_order(experiment: str) -> tuple[int, str, int, tuple[tuple[int, str], ...]]:
+    """A key that sorts experiments as they stand above, and others after those with which they belong.
+
+    Numbers in names sort by their value, so that the fewest come first, which others are compared with.
+    """
     comparison = experiment.rpartition("/")[0]
     titles, names = list(TITLES), list(PAPER_RESULTS)
     row = _paper_row(experiment)
@@ -166,7 +170,7 @@ def in_order(experiment: str) -> tuple[int, str, int, str]:
         titles.index(comparison) if comparison in titles else len(titles),
         comparison,
         names.index(row) if row in names else len(names),
-        experiment,
+        tuple((int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", experiment)),
     )
 
 
