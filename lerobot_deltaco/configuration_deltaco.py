@@ -163,6 +163,10 @@ class DeltacoConfig(PreTrainedConfig):
             demonstrations are scaled for finding goals: `image_size`, or 2, 4 or 8 times as much. The
             dataset's images must be at least as large. By default, `image_size`. On the benchmark, 96
             instead of 48 did not help.
+        pretrained_matching: Whether what a demonstration moved is also looked for by the features of
+            EfficientNet-Lite0, which was trained on ImageNet, with `demo_encoder=correspondence`. Before the
+            training, this takes a few minutes and the extra `offline`; afterwards, nothing but the
+            checkpoint.
         goal_noise: Standard deviation of the noise on goals in training, in coordinates in which an image's
             edges are at -1 and 1; 0.04 is a pixel of 48.
         grasp_depth: Whether goals include the depth of the grasp (`policy/goal_states.py`), estimated from
@@ -252,6 +256,7 @@ class DeltacoConfig(PreTrainedConfig):
     demo_camera: str | None = None
     n_demonstrations: int = 1
     goal_image_size: int | None = None
+    pretrained_matching: bool = False
     goal_noise: float = 0.04
     grasp_depth: bool = True
     depth_noise: float = 0.1
@@ -437,6 +442,11 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 f"`goal_image_size` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that one."
             )
+        if self.pretrained_matching:
+            raise ValueError(
+                f"`pretrained_matching` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that "
+                "one."
+            )
         if film == concat == "none":
             raise ValueError("`film` and `concat` are both 'none': the policy would get no task.")
         if encoder_loss != "none" and not self.uses_demo:
@@ -456,6 +466,11 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 f"`demo_encoder` cannot be {CORRESPONDENCE!r} in the method {self.method!r}. It can in "
                 f"{', '.join(GOAL_SOURCES)}."
+            )
+        if self.pretrained_matching and GOAL_SOURCES[self.method][0] != "demo":
+            raise ValueError(
+                "`pretrained_matching` looks for what a demonstration moved. The method "
+                f"{self.method!r} gets none: leave it out."
             )
         if "demo" in film or "demo" in concat or encoder_loss != "none":
             raise ValueError(

@@ -17,8 +17,11 @@ from lerobot_deltaco.policy.demonstration_choice import goal_demonstrations
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, RobotData
 from lerobot_deltaco.policy.goal_conditioning import FoundGoals, GoalConditioning
 from lerobot_deltaco.policy.goal_training import GoalBatch, GoalInputs, GoalTrainer, draw_given
+from lerobot_deltaco.policy.matching_fit import fit_matching
 from lerobot_deltaco.policy.precision import autocast
+from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
 from lerobot_deltaco.policy.recoloring import random_recolorings
+from lerobot_deltaco.policy.vision import load_efficientnet_lite0
 
 _LOSSES = ("grasp_loss", "release_loss", "depth_loss", "attention_loss")
 
@@ -79,7 +82,9 @@ def fit_goals(
         stats: Statistics of the dataset, by which the preprocessor normalizes.
 
     Raises:
-        ValueError: There are too few episodes in which the gripper closes and opens.
+        ValueError: There are too few episodes in which the gripper closes and opens, or, for pretrained
+            matching, no task with two of them.
+        VisionEncoderError: The weights that pretrained matching needs are missing.
     """
 
     def normalize(states: Tensor) -> Tensor:
@@ -94,7 +99,29 @@ def fit_goals(
     trainer = GoalTrainer(goals, demonstrations, robot_data, config.gripper_index, normalize)
     states, found = trainer.goals.states[:, 0], trainer.goals.found
     demonstrations.grasp_states = torch.where(found[:, None], states, torch.nan)
+    if goals.matching is not None and not goals.matching.fitted:
+        places = torch.where(found[:, None], trainer.goals.places[:, 0], torch.nan)
+        fit_pretrained_matching(goals.matching, demonstrations, places, config.seed)
     return trainer
+
+
+def fit_pretrained_matching(
+    matching: PretrainedMatching, demonstrations: DemonstrationSet, places: Tensor, seed: int
+) -> None:
+    """Fits matching by the features of EfficientNet-Lite0 to episodes.
+
+    Args:
+        matching: What is fitted.
+        demonstrations: The episodes.
+        places: Places of their grasps, (episodes, 2); NaN where there is none.
+        seed: Seed of the draws.
+
+    Raises:
+        ValueError: No task has two episodes with a grasp.
+        VisionEncoderError: The weights of EfficientNet-Lite0 are missing.
+    """
+    matching.encoder.take_weights(load_efficientnet_lite0().state_dict())
+    fit_matching(matching, demonstrations.frames[:, 0], places, demonstrations.tasks, seed)
 
 
 def learn_goals(

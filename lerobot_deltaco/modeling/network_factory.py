@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import torch
 from torch import nn
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
@@ -15,6 +16,7 @@ from lerobot_deltaco.policy.goal_conditioning import GoalConditioning
 from lerobot_deltaco.policy.heads import UnitHead
 from lerobot_deltaco.policy.networks import ConditionedPolicy
 from lerobot_deltaco.policy.options import BACKBONES, GOAL_SOURCES
+from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
 from lerobot_deltaco.policy.vision import load_vision_encoder
 
 
@@ -72,8 +74,13 @@ def make_goal_conditioning(config: DeltacoConfig) -> GoalConditioning | None:
         takes_either=config.takes_either_modality,
         detail=config.goal_detail,
     )
+    matching = None
+    if config.pretrained_matching:
+        # All other weights are the same with and without it.
+        with torch.random.fork_rng(devices=[]):
+            matching = PretrainedMatching(detail=config.goal_detail)
     return GoalConditioning(
-        locator, _state_dim(config), condition_dim, config.grasp_depth, config.depth_margin
+        locator, _state_dim(config), condition_dim, config.grasp_depth, config.depth_margin, matching
     )
 
 

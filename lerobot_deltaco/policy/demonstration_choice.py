@@ -117,12 +117,18 @@ def goal_demonstrations(
         goals: Networks that find goals, which know the depths of states at grasps.
         device: Device of the result.
     """
-    ends, depths = [], []
+    ends, depths, grasps = [], [], []
     for demonstrations, rows in chosen:
         ends.append(demonstrations.frames[rows][:, [0, -1]].float() / 255)  # (batch, 2, 3, H, W)
         states = demonstrations.grasp_states
         if states is None or goals.depth is None:
             depths.append(torch.full((len(rows),), torch.nan, device=rows.device))
+            grasps.append(torch.full((len(rows), 2), torch.nan, device=rows.device))
         else:
             depths.append(goals.states.depths(states[rows]))
-    return Demonstrations(torch.stack(ends, dim=1).to(device), torch.stack(depths, dim=1).to(device))
+            grasps.append(goals.states.grasp_places(states[rows]))
+    return Demonstrations(
+        torch.stack(ends, dim=1).to(device),
+        torch.stack(depths, dim=1).to(device),
+        grasps=torch.stack(grasps, dim=1).to(device),
+    )

@@ -18,6 +18,7 @@ from lerobot_deltaco.policy.correspondence import (
 )
 from lerobot_deltaco.policy.goal_states import GoalStates
 from lerobot_deltaco.policy.grasp_depth import DepthEstimator
+from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching, log_probabilities
 
 # Standard deviation of the error of depths by looks on novel objects; depths have a standard deviation of 1.
 LOOKS_STD = 0.7
@@ -59,11 +60,14 @@ class Demonstrations(NamedTuple):
             (batch, demonstrations, 2, 3, H, W) in 0..1.
         depths: Depths of their grasps, (batch, demonstrations); NaN where they are not known.
         places: In training, places of their goals, (batch, demonstrations, 2, 2).
+        grasps: In evaluation, places of their grasps by the robot's states, (batch, demonstrations, 2); NaN
+            where they are not known.
     """
 
     ends: Tensor
     depths: Tensor
     places: Tensor | None = None
+    grasps: Tensor | None = None
 
 
 class GoalConditioning(nn.Module):
@@ -75,6 +79,7 @@ class GoalConditioning(nn.Module):
         condition_dim: Size of the locator's condition, 0 for none.
         has_depth: Whether depths of grasps are estimated.
         depth_margin: Depth that is added to the estimates when goals are found.
+        matching: Finds what a demonstration moved by pretrained features as well; None for the locator alone.
     """
 
     def __init__(
@@ -84,9 +89,11 @@ class GoalConditioning(nn.Module):
         condition_dim: int,
         has_depth: bool,
         depth_margin: float = 0.0,
+        matching: PretrainedMatching | None = None,
     ) -> None:
         super().__init__()
         self.locator, self.condition_dim, self.depth_margin = locator, condition_dim, depth_margin
+        self.matching = matching
         self.states = GoalStates(state_dim, len(GOALS), has_depth)
         self.depth = None
         if has_depth:
@@ -189,7 +196,12 @@ class GoalConditioning(nn.Module):
                 description = self.locator.no_description(len(scenes), scenes.device)
                 demonstrated = torch.full((len(scenes),), torch.nan, device=scenes.device)
         located = self.locator(scenes, scenes, description, condition, given=given)
-        places, depths = peak_places(located.logits), None
+        logits = located.logits
+        if self.matching is not None and demonstrations is not None:
+            matched = self._matched(self.matching, scenes, demonstrations, each.attention)
+            either = log_probabilities(logits[:, 0]) + log_probabilities(matched)
+            logits = torch.stack([either, logits[:, 1]], dim=1)
+        places, depths = peak_places(logits), None
         if self.depth is not None:
             descriptors = None if description is None else description.moved
             depths = self.depth(
@@ -201,4 +213,28 @@ class GoalConditioning(nn.Module):
         if self.locator.takes_either and condition_is_missing:
             sources = ("demo", "demo")
         grasp, release = (demonstrations is not None and source == "demo" for source in sources)
-        return FoundGoals(places, depths, located.logits, attention, (grasp, release))
+        return FoundGoals(places, depths, logits, attention, (grasp, release))
+
+    @staticmethod
+    def _matched(
+        matching: PretrainedMatching, scenes: Tensor, demonstrations: Demonstrations, attention: Tensor
+    ) -> Tensor:
+        """Where pretrained features find what was moved, as logits (batch, h, w).
+
+        Args:
+            matching: Finds it.
+            scenes: First images of episodes, (batch, 3, H, W) in 0..1.
+            demonstrations: Demonstrations of each task.
+            attention: The locator's attention on them, (batch * demonstrations, 2, h, w), which stands in for
+                the places of grasps that are not known.
+        """
+        n_each = demonstrations.ends.shape[1]
+        places = peak_places(attention.clamp_min(_LEAST_ATTENTION).log())[:, 0]
+        if demonstrations.grasps is not None:
+            known = demonstrations.grasps.flatten(0, 1)
+            places = torch.where(known.isnan(), places, known)
+        with torch.autocast(scenes.device.type, enabled=False):  # it was fitted in float32
+            shown = matching.features(matching.encode(demonstrations.ends[:, :, 0].flatten(0, 1)))
+            each = F.normalize(matching.describe(shown, places), dim=1)
+            descriptors = each.unflatten(0, (-1, n_each)).mean(dim=1)
+            return matching.similarity(matching.features(matching.encode(scenes)), descriptors)

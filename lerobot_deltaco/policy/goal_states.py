@@ -93,11 +93,14 @@ class GoalStates(nn.Module):
         Returns:
             (grasps,); NaN if it is not known.
         """
-        assert self.to_image is not None
-        places = self.to_image(states).clamp(-1, 1)
-        features = _place_features(places)
+        features = _place_features(self.grasp_places(states))
         rest = states * self.state_scale + self.state_shift - features @ self.place_to_state[0]
         return self._project(rest, features)
+
+    def grasp_places(self, states: Tensor) -> Tensor:
+        """Places of grasps in the image, (grasps, 2), by the robot's states there, as `depths` takes them."""
+        assert self.to_image is not None
+        return self.to_image(states).clamp(-1, 1)
 
     def _project(self, rest: Tensor, features: Tensor) -> Tensor:
         """Depths from what places do not tell of states, (grasps, state), and features of the places."""

@@ -143,7 +143,7 @@ def load_vision_encoder(
             input_format = InputFormat(None, *scaled)
         features: Callable[[Any, Tensor], Tensor] = _call
     elif spec.kind == "efficientnet_lite0":
-        network, features = _load_efficientnet_lite0(), _efficientnet_features
+        network, features = load_efficientnet_lite0(), _efficientnet_features
         # Its input is (x - 127) / 128 for x in 0..255.
         input_format = InputFormat(224, (127 / 255,) * 3, (128 / 255,) * 3)
     else:
@@ -221,7 +221,12 @@ def r3m_weights(content: dict[str, Any]) -> dict[str, Tensor]:
 # EfficientNet-Lite0: two Python packages
 
 
-def _load_efficientnet_lite0() -> nn.Module:
+def load_efficientnet_lite0() -> nn.Module:
+    """EfficientNet-Lite0 with its weights for ImageNet.
+
+    Raises:
+        VisionEncoderError: A package is missing, or its weights are not the published ones.
+    """
     missing = [package for package in _LITE_PACKAGES if importlib.util.find_spec(package) is None]
     if missing:
         raise VisionEncoderError(

@@ -1,0 +1,62 @@
+"""Adds matching by pretrained features to a trained policy."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from lerobot_deltaco.modeling.goal_learning import fit_pretrained_matching
+from lerobot_deltaco.modeling.task_sources import read_eval_demonstrations
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
+
+
+def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, seed: int) -> int:
+    """Saves a policy with matching that is fitted to the episodes of a dataset.
+
+    Args:
+        checkpoint: Folder of the policy.
+        repo_id: Repository id of the dataset.
+        root: Folder of the dataset; None for LeRobot's cache.
+        out: Folder of the new checkpoint, which must not exist. It gets all files of the old one, except for
+            its card, whose figures are of the old policy.
+        seed: Seed of the draws.
+
+    Returns:
+        Number of episodes.
+
+    Raises:
+        FileNotFoundError: There is no such checkpoint or dataset.
+        ValueError: The policy finds no goals by demonstrations and depths, has matching already, or does not
+            fit the dataset.
+        VisionEncoderError: The weights of EfficientNet-Lite0 are missing.
+    """
+    if not (checkpoint / "config.json").is_file():
+        raise FileNotFoundError(f"{checkpoint} is no checkpoint: it has no config.json.")
+    policy = DeltacoPolicy.from_pretrained(checkpoint)
+    goals, config = policy.goals, policy.config
+    if goals is None or not config.uses_demo or not config.grasp_depth:
+        raise ValueError(
+            "Matching by pretrained features is for policies with demo_encoder=correspondence and "
+            "grasp_depth that get demonstrations."
+        )
+    if goals.matching is not None:
+        raise ValueError(f"The policy of {checkpoint} has matching by pretrained features already.")
+    data = replace(config, demo_repo_id=repo_id, demo_root=None if root is None else str(root))
+    episodes = read_eval_demonstrations(data)
+    assert episodes is not None
+    if episodes.grasp_states is None:
+        raise ValueError(f"The policy of {checkpoint} knows no gripper, by which grasps are found.")
+    matching = PretrainedMatching(detail=config.goal_detail)
+    places = goals.states.grasp_places(episodes.grasp_states)
+    fit_pretrained_matching(matching, episodes, places, seed)
+    goals.matching, config.pretrained_matching = matching.to(config.device), True
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+        new = Path(folder) / out.name
+        shutil.copytree(checkpoint, new, ignore=shutil.ignore_patterns("README.md"))
+        policy.save_pretrained(new)
+        new.rename(out)
+    return len(episodes.tasks)

@@ -1,0 +1,126 @@
+"""Fits matching by pretrained features to episodes: pairs of episodes of a task show the same object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from lerobot_deltaco.policy.correspondence import goal_loss
+from lerobot_deltaco.policy.efficientnet_lite import ImageMaps
+from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
+
+# Tried on validation tasks (docs/experiment-log.md): more steps and other regularization change nothing.
+_STEPS = 600
+_PAIRS_PER_STEP = 32
+_LEARNING_RATE = 2e-3
+_WARMUP_SHARE = 0.1
+_WEIGHT_DECAY = 0.2
+_IMAGES_AT_A_TIME = 32
+_N_FOR_STATISTICS = 256  # images whose maps give the channels' means and spreads
+
+
+def fit_matching(
+    matching: PretrainedMatching,
+    images: Tensor,
+    places: Tensor,
+    tasks: Sequence[str],
+    seed: int,
+    steps: int = _STEPS,
+) -> None:
+    """Fits the linear layers: what one episode of a task grasps is to be found in the scene of another.
+
+    Args:
+        matching: What is fitted; its encoder has its weights already.
+        images: First images of episodes, (episodes, 3, H, W) uint8.
+        places: Places of their grasps, x and y in -1..1, (episodes, 2); NaN where there is none.
+        tasks: Task of each episode.
+        seed: Seed of the initial weights and of the draws.
+        steps: Number of training steps.
+
+    Raises:
+        ValueError: No task has two episodes with a grasp.
+    """
+    pairs = _Pairs(places, tasks)
+    generator = torch.Generator().manual_seed(seed)
+    device = images.device
+    with torch.enable_grad(), torch.autocast(device.type, enabled=False):
+        maps = _encoded(matching, images)
+        some = torch.arange(0, len(images), math.ceil(len(images) / _N_FOR_STATISTICS), device=device)
+        matching.normalize_by(maps.rows(some))
+        layers = (matching.fine, matching.coarse)
+        for layer in layers:
+            bound = layer.in_channels**-0.5
+            for weights in layer.parameters():
+                drawn = 2 * torch.rand(weights.shape, generator=generator) - 1
+                weights.data.copy_(bound * drawn)
+        learned = [*matching.fine.parameters(), *matching.coarse.parameters(), matching.log_scale]
+        for weights in learned:
+            weights.requires_grad_(True)
+        optimizer = torch.optim.AdamW(learned, lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, _LEARNING_RATE, steps, pct_start=_WARMUP_SHARE
+        )
+        for _ in tqdm(range(steps), desc="Fitting the matching", unit="step", leave=False):
+            scenes, demonstrations = (rows.to(device) for rows in pairs.draw(_PAIRS_PER_STEP, generator))
+            shown = matching.features(maps.rows(demonstrations))
+            descriptors = matching.describe(shown, places[demonstrations])
+            logits = matching.similarity(matching.features(maps.rows(scenes)), descriptors)
+            loss = goal_loss(logits[:, None], places[scenes][:, None]).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+        for weights in learned:
+            weights.requires_grad_(False)
+            weights.grad = None
+    matching.fitted.fill_(True)
+
+
+class _Pairs:
+    """Draws pairs of different episodes of a task.
+
+    Args:
+        places: Places of the grasps, (episodes, 2); NaN where there is none.
+        tasks: Task of each episode.
+
+    Raises:
+        ValueError: No task has two episodes with a grasp.
+    """
+
+    def __init__(self, places: Tensor, tasks: Sequence[str]) -> None:
+        rows: dict[str, list[int]] = {}
+        for row in (~places.isnan().any(dim=1)).nonzero().flatten().tolist():
+            rows.setdefault(tasks[row], []).append(row)
+        self._rows = [torch.tensor(found) for found in rows.values() if len(found) > 1]
+        if not self._rows:
+            raise ValueError(
+                "Matching by pretrained features needs tasks with at least two episodes in which the gripper "
+                f"closes on something. Of {len(tasks)} episodes of {len(set(tasks))} tasks, there is no such "
+                "pair. Add episodes, or leave out `pretrained_matching`."
+            )
+
+    def draw(self, n_pairs: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Rows of the scenes and of the demonstrations, (n_pairs,) each, of tasks that are equally likely."""
+        scenes, demonstrations = [], []
+        for task in torch.randint(len(self._rows), (n_pairs,), generator=generator).tolist():
+            rows = self._rows[task]
+            first = int(torch.randint(len(rows), (), generator=generator))
+            further = int(torch.randint(1, len(rows), (), generator=generator))
+            scenes.append(rows[first])
+            demonstrations.append(rows[(first + further) % len(rows)])
+        return torch.stack(scenes), torch.stack(demonstrations)
+
+
+def _encoded(matching: PretrainedMatching, images: Tensor) -> ImageMaps:
+    """Maps of images (n, 3, H, W) uint8, not normalized, in float16."""
+    parts = []
+    with tqdm(total=len(images), desc="Encoding scenes", unit="image", leave=False) as bar:
+        for some in images.split(_IMAGES_AT_A_TIME):
+            maps = matching.encode(some.float() / 255)
+            parts.append(ImageMaps(maps.fine.half(), maps.coarse.half()))
+            bar.update(len(some))
+    return ImageMaps(*(torch.cat(kind).contiguous() for kind in zip(*parts, strict=True)))

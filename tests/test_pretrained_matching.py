@@ -1,0 +1,305 @@
+"""Matching by pretrained features: the encoder, the fit, and policies with it."""
+
+import copy
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from small_policies import batch_of, observation, small_policy
+from test_correspondence import table_dataset
+
+from lerobot_deltaco.commands import match
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.correspondence import peak_places
+from lerobot_deltaco.policy.efficientnet_lite import COARSE_CHANNELS, FINE_CHANNELS, EfficientNetLite
+from lerobot_deltaco.policy.matching_fit import fit_matching
+from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
+from lerobot_deltaco.policy.vision import load_efficientnet_lite0
+
+pytestmark = pytest.mark.usefixtures("fake_language")
+
+SIZE = 48
+TASKS = ["move the ring left", "move the cross right"]
+WITHOUT = {"demo_encoder": "correspondence", "image_size": SIZE, "motion_modes": 2}
+MATCHING = {**WITHOUT, "pretrained_matching": True}
+
+
+def drawn(*things):
+    """A gray table with rings and crosses of 9 x 9 px and one color, at their middles (x, y) in -1..1."""
+    image = np.full((SIZE, SIZE, 3), 150, np.uint8)
+    y, x = np.mgrid[-4:5, -4:5]
+    masks = {
+        "ring": (np.hypot(x, y) < 4.6) & (np.hypot(x, y) > 2.2),
+        "cross": (abs(x) < 1.5) | (abs(y) < 1.5),
+    }
+    for kind, middle in things:
+        column, row = (round((c + 1) * SIZE / 2) for c in middle)
+        image[row - 4 : row + 5, column - 4 : column + 5][masks[kind]] = (60, 90, 160)
+    return image
+
+
+def kinds_of(task):
+    """What a task moves, and what else lies there."""
+    return ("ring", "cross") if "ring" in task else ("cross", "ring")
+
+
+def drawn_table(task, thing, other):
+    kinds = kinds_of(task)
+    return drawn((kinds[0], thing), (kinds[1], other))
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    """Of each episode: the task, where its thing was and went, and where the other thing stood."""
+    rng = np.random.default_rng(0)
+    found = []
+    while len(found) < 60:
+        start, other = rng.uniform(-0.7, 0.7, (2, 2))
+        if np.abs(start - other).max() > 0.5:
+            task = TASKS[len(found) % 2]
+            found.append((task, start, other, np.array([-0.8 if "left" in task else 0.8, start[1]])))
+    return found
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory, episodes):
+    return table_dataset(tmp_path_factory.mktemp("data") / "table", episodes, image=drawn_table)
+
+
+@pytest.fixture(scope="module")
+def examples(episodes):
+    images = torch.tensor(np.stack([drawn_table(*episode[:3]) for episode in episodes]))
+    places = torch.tensor(np.stack([episode[1] for episode in episodes]), dtype=torch.float32)
+    return images.permute(0, 3, 1, 2).contiguous(), places, [episode[0] for episode in episodes]
+
+
+@pytest.fixture(scope="module")
+def published():
+    return load_efficientnet_lite0().eval()
+
+
+def new_matching(published, detail=1):
+    matching = PretrainedMatching(detail=detail)
+    matching.encoder.take_weights(published.state_dict())
+    return matching
+
+
+# The encoder
+
+
+def test_the_maps_are_those_of_the_package(published):
+    encoder = EfficientNetLite()
+    encoder.take_weights(published.state_dict())
+    images = torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(0))
+    fine, coarse = encoder(images)
+    maps = published._swish(published._bn0(published._conv_stem((images - encoder.mean) / encoder.std)))
+    theirs = []
+    with torch.no_grad():
+        for block in published._blocks[:7]:
+            maps = block(maps)
+            theirs.append(maps)
+    assert fine.shape == (2, FINE_CHANNELS, 8, 12)
+    assert coarse.shape == (2, COARSE_CHANNELS, 4, 6)
+    torch.testing.assert_close(fine, theirs[4], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(coarse, theirs[6], atol=1e-5, rtol=1e-5)
+
+
+def test_weights_of_another_network_are_refused():
+    with pytest.raises(ValueError, match="not the weights of EfficientNet-Lite0: 0.weight has the shape"):
+        EfficientNetLite().take_weights(torch.nn.Sequential(torch.nn.Conv2d(3, 8, 3)).state_dict())
+
+
+def test_nothing_of_it_is_trained_with_a_policy():
+    matching = PretrainedMatching().train()
+    assert not any(weights.requires_grad for weights in matching.parameters())
+    assert not any(module.training for module in matching.encoder.modules())
+
+
+# The fit
+
+
+def share_found(matching, images, places, tasks):
+    """Share of the episodes in which the next one of the task finds what is to be grasped."""
+    following = [
+        next(row for row in [*range(n + 1, len(tasks)), *range(n)] if tasks[row] == tasks[n])
+        for n in range(len(tasks))
+    ]
+    with torch.no_grad():
+        features = matching.features(matching.encode(images.float() / 255))
+        descriptors = matching.describe(features[following], places[following])
+        found = peak_places(matching.similarity(features, descriptors)[:, None])[:, 0]
+    return ((found - places).abs().amax(dim=1) < 0.2).float().mean()
+
+
+def test_a_fit_finds_shapes_of_one_color(published, examples):
+    matching = new_matching(published)
+    images, places, tasks = examples
+    fit_matching(matching, images[:40], places[:40], tasks[:40], seed=0, steps=60)
+    assert matching.fitted
+    assert share_found(matching, images[40:], places[40:], tasks[40:]) >= 0.9
+
+
+def test_a_fit_is_a_function_of_its_seed(published, examples):
+    first, second, other = (new_matching(published) for _ in range(3))
+    for matching, seed in ((first, 0), (second, 0), (other, 1)):
+        fit_matching(matching, *(part[:8] for part in examples), seed=seed, steps=2)
+    assert torch.equal(first.fine.weight, second.fine.weight)
+    assert not torch.equal(first.fine.weight, other.fine.weight)
+
+
+def test_larger_images_give_maps_of_the_same_size(published, examples):
+    images = examples[0][:2].float() / 255
+    larger = torch.nn.functional.interpolate(images, scale_factor=2)
+    plain, detailed = new_matching(published).encode(images), new_matching(published, 2).encode(larger)
+    assert plain.fine.shape == detailed.fine.shape == (2, FINE_CHANNELS, SIZE // 2, SIZE // 2)
+
+
+def test_episodes_without_a_grasp_do_not_count(published, examples):
+    images, places, tasks = (part[:6] for part in examples)
+    places = torch.where(torch.arange(6)[:, None] < 2, places, torch.nan)
+    with pytest.raises(ValueError, match="at least two episodes .* Of 6 episodes of 2 tasks"):
+        fit_matching(new_matching(published), images, places, tasks, seed=0, steps=2)
+
+
+# Policies
+
+
+@pytest.fixture
+def short_fit(monkeypatch):
+    """A fit of two steps, where what it learns does not matter."""
+    monkeypatch.setattr("lerobot_deltaco.policy.matching_fit.fit_matching.__defaults__", (2,))
+
+
+@pytest.mark.usefixtures("short_fit")
+def test_a_policy_with_it_trains_and_is_the_same_when_it_is_loaded(dataset, tmp_path):
+    data = {"demo_repo_id": "test/table", "demo_root": str(dataset.root)}
+    policy, _, _ = small_policy(dataset, **MATCHING, **data)
+    batch = batch_of(dataset, [0, 30])
+    loss, _ = policy(batch)
+    assert policy.goals.matching.fitted
+    loss.backward()
+    assert all(weights.grad is None for weights in policy.goals.matching.parameters())
+    assert not any("matching" in name for name, weights in policy.named_parameters() if weights.requires_grad)
+    policy.eval().save_pretrained(tmp_path)
+    loaded = DeltacoPolicy.from_pretrained(tmp_path)
+    seen = observation(dataset, TASKS)
+    for each in (policy, loaded):
+        each.reset()
+    found, again = (each.encode_task(tuple(TASKS), each.scenes(seen)).goals for each in (policy, loaded))
+    assert torch.equal(found.places, again.places)
+    assert torch.equal(found.logits, again.logits)
+
+
+@pytest.mark.usefixtures("short_fit")
+def test_all_other_weights_are_the_same_without_it(dataset):
+    losses, weights = [], []
+    for options in (WITHOUT, MATCHING):
+        torch.manual_seed(0)
+        policy, _, _ = small_policy(dataset, **options)
+        losses.append(policy(batch_of(dataset, [0, 30]))[0])
+        weights.append({name: value for name, value in policy.state_dict().items() if "matching" not in name})
+    assert torch.equal(*losses)
+    assert weights[0].keys() == weights[1].keys()
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+@pytest.mark.usefixtures("short_fit")
+def test_a_fitted_one_is_not_fitted_again(dataset, tmp_path):
+    policy, _, _ = small_policy(dataset, **MATCHING)
+    policy(batch_of(dataset, [0]))
+    policy.save_pretrained(tmp_path)
+    before = copy.deepcopy(policy.goals.matching.state_dict())
+    resumed = DeltacoPolicy.from_pretrained(tmp_path, dataset_meta=dataset.meta).train()
+    resumed.config.seed = 5
+    resumed(batch_of(dataset, [0]))
+    assert all(
+        torch.equal(before[name], value) for name, value in resumed.goals.matching.state_dict().items()
+    )
+
+
+def test_it_decides_between_things_that_the_locator_confuses(dataset, episodes, published, examples):
+    policy, _, _ = small_policy(dataset, **MATCHING, demo_repo_id="test/table", demo_root=str(dataset.root))
+    matching = new_matching(published)
+    fit_matching(matching, *examples, seed=0, steps=60)
+    policy.goals.matching.load_state_dict(matching.state_dict())
+    with torch.no_grad():
+        policy(batch_of(dataset, [0]))  # fits the states at goals
+    policy.eval()
+    right = 0
+    for number in range(10):
+        policy.reset()
+        seen = {
+            key: value[None] for key, value in dataset[7 * number].items() if key.startswith("observation.")
+        }
+        task = episodes[number][0]
+        goals = policy.encode_task((task,), policy.scenes(seen)).goals
+        right += bool((goals.places[0, 0] - torch.tensor(episodes[number][1])).abs().max() < 0.2)
+    assert right >= 9  # the locator is untrained, so it alone would be right by chance
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"demo_encoder": "attention"}, "is for `demo_encoder=correspondence`"),
+        ({"method": "language_only"}, "The method 'language_only' gets none"),
+        ({"method": "one_hot"}, "The method 'one_hot' gets none"),
+    ],
+)
+def test_where_there_is_nothing_to_match_it_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        DeltacoConfig(device="cpu", backbone="strided", **{**MATCHING, **options})
+
+
+# The command
+
+
+@pytest.fixture
+def checkpoint(dataset, tmp_path):
+    policy, before, after = small_policy(
+        dataset, **WITHOUT, demo_repo_id="test/table", demo_root=str(dataset.root)
+    )
+    policy(batch_of(dataset, [0]))
+    folder = tmp_path / "checkpoint"
+    policy.save_pretrained(folder)
+    before.save_pretrained(folder)
+    after.save_pretrained(folder)
+    (folder / "README.md").write_text("Figures of the old policy.\n")
+    return folder
+
+
+@pytest.mark.usefixtures("short_fit")
+def test_the_command_adds_it_to_a_trained_policy(checkpoint, dataset, tmp_path, capsys):
+    out = tmp_path / "matched"
+    match.main([str(checkpoint), "--dataset.root", str(dataset.root), "--out", str(out)])
+    assert "fitted to 60 episodes" in capsys.readouterr().out
+    old, new = DeltacoPolicy.from_pretrained(checkpoint), DeltacoPolicy.from_pretrained(out)
+    assert new.config.pretrained_matching
+    assert new.goals.matching.fitted
+    assert all(torch.equal(value, new.state_dict()[name]) for name, value in old.state_dict().items())
+    files = {path.name for path in checkpoint.iterdir()} - {"README.md"}
+    assert {path.name for path in out.iterdir()} == files
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_the_command_says_what_it_cannot_do(checkpoint, dataset, tmp_path, capsys):
+    def said(*arguments):
+        with pytest.raises(SystemExit) as end:
+            match.main([str(argument) for argument in arguments])
+        return end.value.code, capsys.readouterr().err
+
+    root = ("--dataset.root", dataset.root)
+    code, text = said(checkpoint, *root, "--out", checkpoint)
+    assert code == 2
+    assert "exists. Name a new folder" in text
+    code, text = said(tmp_path / "nothing", *root, "--out", tmp_path / "new")
+    assert code == 1
+    assert "is no checkpoint" in text
+    shutil.rmtree(checkpoint)
+    policy, _, _ = small_policy(dataset, image_size=SIZE, demo_encoder="attention")
+    policy.save_pretrained(checkpoint)
+    code, text = said(checkpoint, *root, "--out", tmp_path / "new")
+    assert code == 1
+    assert "for policies with demo_encoder=correspondence" in text
+    assert not (tmp_path / "new").exists()
