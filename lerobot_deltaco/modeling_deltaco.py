@@ -61,7 +61,7 @@ from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.networks import random_crop
 from lerobot_deltaco.policy.observations import instructions_of, stacked_images
 from lerobot_deltaco.policy.paraphrases import Paraphrases
-from lerobot_deltaco.policy.precision import autocast
+from lerobot_deltaco.policy.precision import autocast, warn_if_emulated
 from lerobot_deltaco.policy.processor_files import check_processor_files
 from lerobot_deltaco.policy.scalars import LoggedScalars
 from lerobot_deltaco.policy.step_generator import process_rank, step_generator
@@ -168,6 +168,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         """
         if self.training:
             self._finite_loss.check()
+            warn_if_emulated(self.config.dtype, batch[ACTION].device.type)
             if batch[ACTION].device.type == "cpu":
                 keep_freed_memory()
         step = int(self.step) if self.training else 0
