@@ -163,10 +163,11 @@ class DeltacoConfig(PreTrainedConfig):
             demonstrations are scaled for finding goals: `image_size`, or 2, 4 or 8 times as much. The
             dataset's images must be at least as large. By default, `image_size`. On the benchmark, 96
             instead of 48 did not help.
-        pretrained_matching: Whether what a demonstration moved is also looked for by the features of
-            EfficientNet-Lite0, which was trained on ImageNet, with `demo_encoder=correspondence`. Before the
-            training, this takes a few minutes and the extra `offline`; afterwards, nothing but the
-            checkpoint.
+        pretrained_matching: Whether what a demonstration moved, and what the instruction names by words of
+            training tasks, is also looked for by the features of EfficientNet-Lite0, which was trained on
+            ImageNet, with `demo_encoder=correspondence`. Before the training, this takes a few minutes and
+            the extra `offline`; afterwards, nothing but the checkpoint.
+        known_words: Words of the training tasks, for `pretrained_matching`; filled in by training.
         goal_noise: Standard deviation of the noise on goals in training, in coordinates in which an image's
             edges are at -1 and 1; 0.04 is a pixel of 48.
         grasp_depth: Whether goals include the depth of the grasp (`policy/goal_states.py`), estimated from
@@ -257,6 +258,7 @@ class DeltacoConfig(PreTrainedConfig):
     n_demonstrations: int = 1
     goal_image_size: int | None = None
     pretrained_matching: bool = False
+    known_words: list[str] = field(default_factory=list)
     goal_noise: float = 0.04
     grasp_depth: bool = True
     depth_noise: float = 0.1

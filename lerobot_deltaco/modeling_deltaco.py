@@ -74,6 +74,7 @@ from lerobot_deltaco.policy.task_file import (
     read_task_file,
     write_task_file,
 )
+from lerobot_deltaco.policy.words import vocabulary_of
 
 
 class DeltacoPolicy(PreTrainedPolicy):
@@ -123,6 +124,9 @@ class DeltacoPolicy(PreTrainedPolicy):
         if config.method == "one_hot" and not config.one_hot_tasks:
             demonstrated = self.eval_demonstrations.rows if self.eval_demonstrations else ()
             config.one_hot_tasks = one_hot_vocabulary(dataset_meta, demonstrated)
+
+        if config.pretrained_matching and config.uses_language and dataset_meta is not None:
+            config.known_words = config.known_words or vocabulary_of(dataset_meta.tasks.index)
 
         self._frozen = make_frozen_encoder(config)
         self.model = make_policy_network(config)

@@ -17,6 +17,7 @@ from lerobot_deltaco.policy.efficientnet_lite import COARSE_CHANNELS, FINE_CHANN
 from lerobot_deltaco.policy.matching_fit import fit_matching
 from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
 from lerobot_deltaco.policy.vision import load_efficientnet_lite0
+from lerobot_deltaco.policy.words import known_words, vocabulary_of
 
 pytestmark = pytest.mark.usefixtures("fake_language")
 
@@ -80,8 +81,8 @@ def published():
     return load_efficientnet_lite0().eval()
 
 
-def new_matching(published, detail=1):
-    matching = PretrainedMatching(detail=detail)
+def new_matching(published, detail=1, n_words=0):
+    matching = PretrainedMatching(n_words, detail=detail)
     matching.encoder.take_weights(published.state_dict())
     return matching
 
@@ -126,17 +127,20 @@ def share_found(matching, images, places, tasks):
         next(row for row in [*range(n + 1, len(tasks)), *range(n)] if tasks[row] == tasks[n])
         for n in range(len(tasks))
     ]
-    with torch.no_grad():
-        features = matching.features(matching.encode(images.float() / 255))
-        descriptors = matching.describe(features[following], places[following])
-        found = peak_places(matching.similarity(features, descriptors)[:, None])[:, 0]
-    return ((found - places).abs().amax(dim=1) < 0.2).float().mean()
+    maps = matching.normalized(matching.encode(images.float() / 255))
+    found = matching.find(maps, matching.describe(maps.rows(torch.tensor(following)), places[following]))
+    return share_at(found, places)
+
+
+def share_at(logits, places):
+    """Share of the maps (batch, h, w) whose peak is near a place."""
+    return ((peak_places(logits[:, None])[:, 0] - places).abs().amax(dim=1) < 0.2).float().mean()
 
 
 def test_a_fit_finds_shapes_of_one_color(published, examples):
     matching = new_matching(published)
     images, places, tasks = examples
-    fit_matching(matching, images[:40], places[:40], tasks[:40], seed=0, steps=60)
+    fit_matching(matching, images[:40], places[:40], tasks[:40], None, seed=0, steps=60)
     assert matching.fitted
     assert share_found(matching, images[40:], places[40:], tasks[40:]) >= 0.9
 
@@ -144,9 +148,41 @@ def test_a_fit_finds_shapes_of_one_color(published, examples):
 def test_a_fit_is_a_function_of_its_seed(published, examples):
     first, second, other = (new_matching(published) for _ in range(3))
     for matching, seed in ((first, 0), (second, 0), (other, 1)):
-        fit_matching(matching, *(part[:8] for part in examples), seed=seed, steps=2)
-    assert torch.equal(first.fine.weight, second.fine.weight)
-    assert not torch.equal(first.fine.weight, other.fine.weight)
+        fit_matching(matching, *(part[:8] for part in examples), None, seed=seed, steps=2)
+    assert torch.equal(first.demo.fine.weight, second.demo.fine.weight)
+    assert not torch.equal(first.demo.fine.weight, other.demo.fine.weight)
+
+
+def test_words_that_are_fitted_find_what_they_name(published, examples):
+    images, places, tasks = examples
+    vocabulary = vocabulary_of(tasks)
+    matching = new_matching(published, n_words=len(vocabulary))
+    words = known_words(vocabulary, tasks).present
+    fit_matching(matching, images[:40], places[:40], tasks[:40], words[:40], seed=0, steps=60)
+    maps = matching.normalized(matching.encode(images[40:].float() / 255))
+    assert share_at(matching.find_named(maps, words[40:]), places[40:]) >= 0.9
+    # In words that were never put like this.
+    other = known_words(vocabulary, ["ring" if "ring" in task else "CROSS!" for task in tasks[40:]])
+    assert share_at(matching.find_named(maps, other.present), places[40:]) >= 0.9
+
+
+def test_words_are_known_or_not():
+    vocabulary = vocabulary_of(["Put the red cup in.", "Put 2 bowls in."])
+    assert vocabulary == ["bowls", "cup", "in", "put", "red", "the"]
+    known = known_words(vocabulary, ["put RED bowls, in!", "put the jar in", ""])
+    assert known.present.sum(dim=1).tolist() == [4, 3, 0]
+    assert known.are_all.tolist() == [True, False, True]
+    assert known_words(vocabulary, []).present.shape == (0, 6)
+
+
+def test_only_so_many_episodes_are_fitted_to(published, examples, monkeypatch):
+    monkeypatch.setattr("lerobot_deltaco.policy.matching_fit._MAX_EPISODES", 6)
+    matching, seen = new_matching(published), []
+    monkeypatch.setattr(
+        matching, "encode", lambda images: seen.append(len(images)) or matching.encoder(images)
+    )
+    fit_matching(matching, *examples, None, seed=0, steps=1)
+    assert sum(seen) == 6
 
 
 def test_larger_images_give_maps_of_the_same_size(published, examples):
@@ -160,7 +196,7 @@ def test_episodes_without_a_grasp_do_not_count(published, examples):
     images, places, tasks = (part[:6] for part in examples)
     places = torch.where(torch.arange(6)[:, None] < 2, places, torch.nan)
     with pytest.raises(ValueError, match="at least two episodes .* Of 6 episodes of 2 tasks"):
-        fit_matching(new_matching(published), images, places, tasks, seed=0, steps=2)
+        fit_matching(new_matching(published), images, places, tasks, None, seed=0, steps=2)
 
 
 # Policies
@@ -221,8 +257,8 @@ def test_a_fitted_one_is_not_fitted_again(dataset, tmp_path):
 
 def test_it_decides_between_things_that_the_locator_confuses(dataset, episodes, published, examples):
     policy, _, _ = small_policy(dataset, **MATCHING, demo_repo_id="test/table", demo_root=str(dataset.root))
-    matching = new_matching(published)
-    fit_matching(matching, *examples, seed=0, steps=60)
+    matching = new_matching(published, n_words=len(policy.config.known_words))
+    fit_matching(matching, *examples, None, seed=0, steps=60)
     policy.goals.matching.load_state_dict(matching.state_dict())
     with torch.no_grad():
         policy(batch_of(dataset, [0]))  # fits the states at goals

@@ -94,7 +94,7 @@ def _plain(config: PreTrainedConfig) -> dict[str, Any]:
     if not isinstance(config, DeltacoConfig):
         # Encoded as its base class, so that the type is there.
         return _without(draccus.encode(config, PreTrainedConfig), left_out)
-    left_out |= {"one_hot_tasks", "demo_episodes"}
+    left_out |= {"one_hot_tasks", "known_words", "demo_episodes"}
     left_out |= {"demo_repo_id", "demo_root", "instruction_embeddings", "instructions"}
     left_out |= {"vision_encoder_weights", "demo_features_dir", "demo_feature_dim"}
     return _without(draccus.encode(config), left_out)

@@ -11,6 +11,7 @@ from lerobot_deltaco.modeling.goal_learning import fit_pretrained_matching
 from lerobot_deltaco.modeling.task_sources import read_eval_demonstrations
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
+from lerobot_deltaco.policy.words import vocabulary_of
 
 
 def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, seed: int) -> int:
@@ -49,10 +50,12 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
     assert episodes is not None
     if episodes.grasp_states is None:
         raise ValueError(f"The policy of {checkpoint} knows no gripper, by which grasps are found.")
-    matching = PretrainedMatching(detail=config.goal_detail)
+    known_words = vocabulary_of(episodes.tasks) if config.uses_language else []
+    matching = PretrainedMatching(len(known_words), detail=config.goal_detail)
     places = goals.states.grasp_places(episodes.grasp_states)
-    fit_pretrained_matching(matching, episodes, places, seed)
-    goals.matching, config.pretrained_matching = matching.to(config.device), True
+    fit_pretrained_matching(matching, episodes, places, known_words, seed)
+    goals.matching = matching.to(config.device)
+    config.pretrained_matching, config.known_words = True, known_words
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         new = Path(folder) / out.name

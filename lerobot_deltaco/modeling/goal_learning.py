@@ -22,6 +22,7 @@ from lerobot_deltaco.policy.precision import autocast
 from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
 from lerobot_deltaco.policy.recoloring import random_recolorings
 from lerobot_deltaco.policy.vision import load_efficientnet_lite0
+from lerobot_deltaco.policy.words import KnownWords, known_words
 
 _LOSSES = ("grasp_loss", "release_loss", "depth_loss", "attention_loss")
 
@@ -101,12 +102,16 @@ def fit_goals(
     demonstrations.grasp_states = torch.where(found[:, None], states, torch.nan)
     if goals.matching is not None and not goals.matching.fitted:
         places = torch.where(found[:, None], trainer.goals.places[:, 0], torch.nan)
-        fit_pretrained_matching(goals.matching, demonstrations, places, config.seed)
+        fit_pretrained_matching(goals.matching, demonstrations, places, config.known_words, config.seed)
     return trainer
 
 
 def fit_pretrained_matching(
-    matching: PretrainedMatching, demonstrations: DemonstrationSet, places: Tensor, seed: int
+    matching: PretrainedMatching,
+    demonstrations: DemonstrationSet,
+    places: Tensor,
+    vocabulary: Sequence[str],
+    seed: int,
 ) -> None:
     """Fits matching by the features of EfficientNet-Lite0 to episodes.
 
@@ -114,6 +119,7 @@ def fit_pretrained_matching(
         matching: What is fitted.
         demonstrations: The episodes.
         places: Places of their grasps, (episodes, 2); NaN where there is none.
+        vocabulary: Words that it knows, none for a policy without instructions.
         seed: Seed of the draws.
 
     Raises:
@@ -121,7 +127,8 @@ def fit_pretrained_matching(
         VisionEncoderError: The weights of EfficientNet-Lite0 are missing.
     """
     matching.encoder.take_weights(load_efficientnet_lite0().state_dict())
-    fit_matching(matching, demonstrations.frames[:, 0], places, demonstrations.tasks, seed)
+    present = known_words(vocabulary, demonstrations.tasks).present.to(places) if vocabulary else None
+    fit_matching(matching, demonstrations.frames[:, 0], places, demonstrations.tasks, present, seed)
 
 
 def learn_goals(
@@ -237,10 +244,13 @@ def find_goals(
     Raises:
         ValueError: A task has no demonstration, or a one-hot policy does not know it.
     """
-    demonstrations = condition = None
+    demonstrations = condition = words = None
     if config.uses_demo and config.leave_out != "demo":
         chosen = [choose(number) for number in range(config.n_demonstrations)]
         demonstrations = goal_demonstrations(chosen, goals, scenes.device)
     if config.leave_out != "instruction":
         condition = embedder.goal_condition(tasks, scenes.device)
-    return goals.find(scenes, demonstrations, condition)
+        if config.known_words:
+            known = known_words(config.known_words, tasks)
+            words = KnownWords(*(part.to(scenes.device) for part in known))
+    return goals.find(scenes, demonstrations, condition, words)

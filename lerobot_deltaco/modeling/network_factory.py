@@ -78,7 +78,7 @@ def make_goal_conditioning(config: DeltacoConfig) -> GoalConditioning | None:
     if config.pretrained_matching:
         # All other weights are the same with and without it.
         with torch.random.fork_rng(devices=[]):
-            matching = PretrainedMatching(detail=config.goal_detail)
+            matching = PretrainedMatching(len(config.known_words), detail=config.goal_detail)
     return GoalConditioning(
         locator, _state_dim(config), condition_dim, config.grasp_depth, config.depth_margin, matching
     )

@@ -19,10 +19,12 @@ from lerobot_deltaco.policy.correspondence import (
 from lerobot_deltaco.policy.goal_states import GoalStates
 from lerobot_deltaco.policy.grasp_depth import DepthEstimator
 from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching, log_probabilities
+from lerobot_deltaco.policy.words import KnownWords
 
 # Standard deviation of the error of depths by looks on novel objects; depths have a standard deviation of 1.
 LOOKS_STD = 0.7
 _LEAST_ATTENTION = 1e-9
+_WEIGHT_OF_WORDS = 2.0  # of their map's log probabilities; chosen on validation tasks
 
 
 class FoundGoals(NamedTuple):
@@ -79,7 +81,7 @@ class GoalConditioning(nn.Module):
         condition_dim: Size of the locator's condition, 0 for none.
         has_depth: Whether depths of grasps are estimated.
         depth_margin: Depth that is added to the estimates when goals are found.
-        matching: Finds what a demonstration moved by pretrained features as well; None for the locator alone.
+        matching: Finds what is to be grasped by pretrained features as well; None for the locator alone.
     """
 
     def __init__(
@@ -166,7 +168,11 @@ class GoalConditioning(nn.Module):
 
     @torch.no_grad()
     def find(
-        self, scenes: Tensor, demonstrations: Demonstrations | None, condition: Tensor | None
+        self,
+        scenes: Tensor,
+        demonstrations: Demonstrations | None,
+        condition: Tensor | None,
+        words: KnownWords | None = None,
     ) -> FoundGoals:
         """Finds the goals of tasks in scenes.
 
@@ -175,6 +181,7 @@ class GoalConditioning(nn.Module):
             demonstrations: Demonstrations of each task; None if the locator takes none, or takes either.
             condition: Embeddings of the instructions, or one-hot tasks; None if the locator takes none, or
                 takes either.
+            words: Words of the instructions, for matching by pretrained features; None without instructions.
         """
         description = demonstrated = given = None
         condition_is_missing = condition is None
@@ -197,10 +204,10 @@ class GoalConditioning(nn.Module):
                 demonstrated = torch.full((len(scenes),), torch.nan, device=scenes.device)
         located = self.locator(scenes, scenes, description, condition, given=given)
         logits = located.logits
-        if self.matching is not None and demonstrations is not None:
-            matched = self._matched(self.matching, scenes, demonstrations, each.attention)
-            either = log_probabilities(logits[:, 0]) + log_probabilities(matched)
-            logits = torch.stack([either, logits[:, 1]], dim=1)
+        if self.matching is not None:
+            attention = None if demonstrations is None else each.attention
+            grasp = self._matched(self.matching, logits[:, 0], scenes, demonstrations, attention, words)
+            logits = torch.stack([grasp, logits[:, 1]], dim=1)
         places, depths = peak_places(logits), None
         if self.depth is not None:
             descriptors = None if description is None else description.moved
@@ -217,24 +224,46 @@ class GoalConditioning(nn.Module):
 
     @staticmethod
     def _matched(
-        matching: PretrainedMatching, scenes: Tensor, demonstrations: Demonstrations, attention: Tensor
+        matching: PretrainedMatching,
+        located: Tensor,
+        scenes: Tensor,
+        demonstrations: Demonstrations | None,
+        attention: Tensor | None,
+        words: KnownWords | None,
     ) -> Tensor:
-        """Where pretrained features find what was moved, as logits (batch, h, w).
+        """The map of the grasp, with what pretrained features find: the product of their probabilities.
+
+        Words that training does not know say nothing. Where a demonstration shows what is meant, an
+        instruction with such words does not count, since the words that remain may fit other things as well.
 
         Args:
             matching: Finds it.
+            located: What the locator finds, as logits (batch, h, w).
             scenes: First images of episodes, (batch, 3, H, W) in 0..1.
-            demonstrations: Demonstrations of each task.
+            demonstrations: Demonstrations of each task; None without them.
             attention: The locator's attention on them, (batch * demonstrations, 2, h, w), which stands in for
                 the places of grasps that are not known.
+            words: Words of the instructions; None without them.
+
+        Returns:
+            Logits, (batch, h, w).
         """
-        n_each = demonstrations.ends.shape[1]
-        places = peak_places(attention.clamp_min(_LEAST_ATTENTION).log())[:, 0]
-        if demonstrations.grasps is not None:
-            known = demonstrations.grasps.flatten(0, 1)
-            places = torch.where(known.isnan(), places, known)
+        logits = log_probabilities(located)
         with torch.autocast(scenes.device.type, enabled=False):  # it was fitted in float32
-            shown = matching.features(matching.encode(demonstrations.ends[:, :, 0].flatten(0, 1)))
-            each = F.normalize(matching.describe(shown, places), dim=1)
-            descriptors = each.unflatten(0, (-1, n_each)).mean(dim=1)
-            return matching.similarity(matching.features(matching.encode(scenes)), descriptors)
+            maps = matching.normalized(matching.encode(scenes))
+            if demonstrations is not None:
+                assert attention is not None
+                n_each = demonstrations.ends.shape[1]
+                places = peak_places(attention.clamp_min(_LEAST_ATTENTION).log())[:, 0]
+                if demonstrations.grasps is not None:
+                    known = demonstrations.grasps.flatten(0, 1)
+                    places = torch.where(known.isnan(), places, known)
+                first = matching.normalized(matching.encode(demonstrations.ends[:, :, 0].flatten(0, 1)))
+                each = F.normalize(matching.describe(first, places), dim=1)
+                descriptors = each.unflatten(0, (-1, n_each)).mean(dim=1)
+                logits = logits + log_probabilities(matching.find(maps, descriptors))
+            if words is not None and matching.named is not None:
+                named = log_probabilities(matching.find_named(maps, words.present))
+                counts = words.are_all | (demonstrations is None)
+                logits = logits + torch.where(counts[:, None, None], _WEIGHT_OF_WORDS * named, 0.0)
+        return logits

@@ -15,10 +15,13 @@ from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
 
 # Tried on validation tasks (docs/experiment-log.md): more steps and other regularization change nothing.
 _STEPS = 600
+_MAX_EPISODES = 5000  # that are drawn to fit to; on validation tasks, twice as many are no better
 _PAIRS_PER_STEP = 32
 _LEARNING_RATE = 2e-3
 _WARMUP_SHARE = 0.1
 _WEIGHT_DECAY = 0.2
+_WORD_DROPOUT = 0.3
+_WORD_STD = 0.1  # of the words' descriptors before the fit
 _IMAGES_AT_A_TIME = 32
 _N_FOR_STATISTICS = 256  # images whose maps give the channels' means and spreads
 
@@ -28,36 +31,40 @@ def fit_matching(
     images: Tensor,
     places: Tensor,
     tasks: Sequence[str],
+    present: Tensor | None,
     seed: int,
     steps: int = _STEPS,
 ) -> None:
-    """Fits the linear layers: what one episode of a task grasps is to be found in the scene of another.
+    """Fits the linear layers and the words.
+
+    What one episode of a task grasps is to be found in the scene of another, and by some of the words of its
+    task: a share of them is left out in each step, so that none is needed.
 
     Args:
         matching: What is fitted; its encoder has its weights already.
         images: First images of episodes, (episodes, 3, H, W) uint8.
         places: Places of their grasps, x and y in -1..1, (episodes, 2); NaN where there is none.
         tasks: Task of each episode.
+        present: Which of the known words each task has, (episodes, words); None without words.
         seed: Seed of the initial weights and of the draws.
         steps: Number of training steps.
 
     Raises:
         ValueError: No task has two episodes with a grasp.
     """
-    pairs = _Pairs(places, tasks)
     generator = torch.Generator().manual_seed(seed)
     device = images.device
+    drawn = torch.randperm(len(tasks), generator=generator)[:_MAX_EPISODES].sort().values
+    tasks = [tasks[row] for row in drawn.tolist()]
+    images, places = images[drawn.to(device)], places[drawn.to(device)]
+    present = None if present is None else present[drawn.to(device)]
+    pairs = _Pairs(places, tasks)
     with torch.enable_grad(), torch.autocast(device.type, enabled=False):
         maps = _encoded(matching, images)
         some = torch.arange(0, len(images), math.ceil(len(images) / _N_FOR_STATISTICS), device=device)
         matching.normalize_by(maps.rows(some))
-        layers = (matching.fine, matching.coarse)
-        for layer in layers:
-            bound = layer.in_channels**-0.5
-            for weights in layer.parameters():
-                drawn = 2 * torch.rand(weights.shape, generator=generator) - 1
-                weights.data.copy_(bound * drawn)
-        learned = [*matching.fine.parameters(), *matching.coarse.parameters(), matching.log_scale]
+        _initialize(matching, generator)
+        learned = matching.learned
         for weights in learned:
             weights.requires_grad_(True)
         optimizer = torch.optim.AdamW(learned, lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
@@ -66,10 +73,15 @@ def fit_matching(
         )
         for _ in tqdm(range(steps), desc="Fitting the matching", unit="step", leave=False):
             scenes, demonstrations = (rows.to(device) for rows in pairs.draw(_PAIRS_PER_STEP, generator))
-            shown = matching.features(maps.rows(demonstrations))
-            descriptors = matching.describe(shown, places[demonstrations])
-            logits = matching.similarity(matching.features(maps.rows(scenes)), descriptors)
-            loss = goal_loss(logits[:, None], places[scenes][:, None]).mean()
+            here, there = places[scenes][:, None], matching.normalized(maps.rows(scenes))
+            descriptors = matching.describe(
+                matching.normalized(maps.rows(demonstrations)), places[demonstrations]
+            )
+            loss = goal_loss(matching.find(there, descriptors)[:, None], here).mean()
+            if present is not None:
+                kept = torch.rand(_PAIRS_PER_STEP, present.shape[1], generator=generator) >= _WORD_DROPOUT
+                words = present[scenes] * kept.to(present)
+                loss = loss + goal_loss(matching.find_named(there, words)[:, None], here).mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -124,3 +136,16 @@ def _encoded(matching: PretrainedMatching, images: Tensor) -> ImageMaps:
             parts.append(ImageMaps(maps.fine.half(), maps.coarse.half()))
             bar.update(len(some))
     return ImageMaps(*(torch.cat(kind).contiguous() for kind in zip(*parts, strict=True)))
+
+
+@torch.no_grad()
+def _initialize(matching: PretrainedMatching, generator: torch.Generator) -> None:
+    """Draws initial weights as PyTorch's layers do, but from a generator."""
+    weighed = [matching.demo] if matching.named is None else [matching.demo, matching.named]
+    for layer in (layer for maps in weighed for layer in (maps.fine, maps.coarse)):
+        for weights in layer.parameters():
+            drawn = 2 * torch.rand(weights.shape, generator=generator) - 1
+            weights.copy_(layer.in_channels**-0.5 * drawn)
+    if matching.named is not None:
+        matching.words.copy_(_WORD_STD * torch.randn(matching.words.shape, generator=generator))
+        matching.words[-1] = 0

@@ -1,9 +1,20 @@
-"""Matching by pretrained features (ours): finds what a demonstration moved by features learned on ImageNet.
+r"""Matching by pretrained features (ours): finds what a task asks for by features learned on ImageNet.
 
 A network that learns from a few hundred objects compares them by color: among objects of one color, it picks
 nearly at random. The features of a network that was trained on photographs tell shapes apart, too. They are
-frozen; learned is only how they are weighed: two linear layers, which are too few weights to learn the
+frozen; learned is only how they are weighed, by linear layers, which have too few weights to learn the
 training objects by heart. `policy/matching_fit.py` fits them before a training, or for a trained policy.
+
+    demonstration's first image     scene                     instruction
+            |                         |                            |
+        encoder (frozen) <-------> encoder (frozen)          words it has
+            |                         |        \                   |
+      weighed (linear) <-- same --> weighed   weighed (linear)   sum of the words' descriptors
+            |                         |           |                |
+    descriptor of what was grasped    |           |                |
+            |________ cosine _________|           |____ cosine ____|
+                        |                                 |
+                by the demonstration                 by the words
 """
 
 from __future__ import annotations
@@ -28,11 +39,12 @@ _LEAST_STD = 1e-3
 
 
 class PretrainedMatching(nn.Module):
-    """Describes what was moved by pretrained features, and finds it in scenes.
+    """Finds what a demonstration moved, or what words name, in scenes.
 
     No gradient reaches it in the training of a policy.
 
     Args:
+        n_words: Number of words that are known, 0 for a policy without instructions.
         descriptor_dim: Size of a descriptor.
         detail: Factor by which images are larger than those that the maps have half the side of.
 
@@ -42,18 +54,26 @@ class PretrainedMatching(nn.Module):
 
     fitted: Tensor
 
-    def __init__(self, descriptor_dim: int = 64, detail: int = 1) -> None:
+    def __init__(self, n_words: int = 0, descriptor_dim: int = 64, detail: int = 1) -> None:
         super().__init__()
         self.detail = detail
         self.encoder = EfficientNetLite()
-        self.fine = nn.Conv2d(FINE_CHANNELS, descriptor_dim, 1)
-        self.coarse = nn.Conv2d(COARSE_CHANNELS, descriptor_dim, 1)
-        self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
+        self.demo = WeighedMaps(descriptor_dim)
+        self.named = WeighedMaps(descriptor_dim) if n_words else None
+        if n_words:
+            # With a bias, which stands for no word.
+            self.words = nn.Parameter(torch.zeros(n_words + 1, descriptor_dim))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
         for name, channels in (("fine", FINE_CHANNELS), ("coarse", COARSE_CHANNELS)):
             self.register_buffer(f"{name}_mean", torch.zeros(channels, 1, 1))
             self.register_buffer(f"{name}_std", torch.ones(channels, 1, 1))
         self.requires_grad_(False)
+
+    @property
+    def learned(self) -> list[nn.Parameter]:
+        """What a fit changes."""
+        frozen = {id(weights) for weights in self.encoder.parameters()}
+        return [weights for weights in self.parameters() if id(weights) not in frozen]
 
     @torch.no_grad()
     def normalize_by(self, maps: ImageMaps) -> None:
@@ -69,39 +89,72 @@ class PretrainedMatching(nn.Module):
         enlarged = F.interpolate(images, size=size, mode="bicubic", align_corners=False)
         return self.encoder(enlarged.clamp(0, 1))
 
-    def features(self, maps: ImageMaps) -> Tensor:
-        """Features of places, (batch, descriptor_dim, h, w), from maps as `encode` makes them."""
-        fine = self.fine((maps.fine.float() - self.get_buffer("fine_mean")) / self.get_buffer("fine_std"))
-        coarse = self.coarse(
-            (maps.coarse.float() - self.get_buffer("coarse_mean")) / self.get_buffer("coarse_std")
+    def normalized(self, maps: ImageMaps) -> ImageMaps:
+        """Maps as `encode` makes them, with channels of mean 0 and spread 1, in float32."""
+        return ImageMaps(
+            (maps.fine.float() - self.get_buffer("fine_mean")) / self.get_buffer("fine_std"),
+            (maps.coarse.float() - self.get_buffer("coarse_mean")) / self.get_buffer("coarse_std"),
         )
-        # What is linear may be enlarged after it is projected, which is cheaper.
-        enlarged = F.interpolate(coarse.float(), size=fine.shape[-2:], mode="bilinear", align_corners=False)
-        return fine.float() + enlarged
 
-    def describe(self, features: Tensor, places: Tensor) -> Tensor:
-        """Descriptors of what is at places.
+    def describe(self, maps: ImageMaps, places: Tensor) -> Tensor:
+        """Descriptors of what demonstrations grasped, (batch, descriptor_dim).
 
         Args:
-            features: Features of places, (batch, descriptor_dim, h, w).
-            places: Places of grasps, x and y in -1..1, (batch, 2).
-
-        Returns:
-            (batch, descriptor_dim).
+            maps: Normalized maps of their first images.
+            places: Places of the grasps, x and y in -1..1, (batch, 2).
         """
+        features = self.demo(maps)
         height, width = features.shape[-2:]
         std = 2 * _POOLING_STD / torch.tensor([width, height], device=features.device)
         weights = gaussian_maps(places[:, None], height, width, std)  # (batch, 1, h, w)
         weights = weights / weights.sum(dim=(2, 3), keepdim=True).clamp_min(1e-6)
         return (features * weights).sum(dim=(2, 3))
 
-    def similarity(self, features: Tensor, descriptors: Tensor) -> Tensor:
-        """How similar the places of scenes are to descriptors, as logits (batch, h, w).
+    def find(self, maps: ImageMaps, descriptors: Tensor) -> Tensor:
+        """Where scenes are like descriptors (batch, descriptor_dim), as logits (batch, h, w).
 
         Args:
-            features: Features of the scenes' places, (batch, descriptor_dim, h, w).
-            descriptors: (batch, descriptor_dim).
+            maps: Normalized maps of the scenes.
+            descriptors: As `describe` makes them.
         """
+        return self.demo.similarity(self.demo(maps), descriptors)
+
+    def find_named(self, maps: ImageMaps, present: Tensor) -> Tensor:
+        """Where scenes are like what words name, as logits (batch, h, w).
+
+        Args:
+            maps: Normalized maps of the scenes.
+            present: Which words there are, (batch, words): 0 or 1.
+        """
+        assert self.named is not None
+        descriptors = present @ self.words[:-1] + self.words[-1]
+        return self.named.similarity(self.named(maps), descriptors)
+
+
+class WeighedMaps(nn.Module):
+    """Features of places: maps of two sizes, each weighed by a linear layer, and added up.
+
+    Args:
+        dim: Number of features.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.fine = nn.Conv2d(FINE_CHANNELS, dim, 1)
+        self.coarse = nn.Conv2d(COARSE_CHANNELS, dim, 1)
+        self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
+
+    def forward(self, maps: ImageMaps) -> Tensor:
+        """From normalized maps to (batch, dim, h, w)."""
+        fine = self.fine(maps.fine)
+        # What is linear may be enlarged after it is weighed, which is cheaper.
+        coarse = F.interpolate(
+            self.coarse(maps.coarse), size=fine.shape[-2:], mode="bilinear", align_corners=False
+        )
+        return fine + coarse
+
+    def similarity(self, features: Tensor, descriptors: Tensor) -> Tensor:
+        """Scaled cosine of features (batch, dim, h, w) and descriptors (batch, dim): (batch, h, w)."""
         cosine = torch.einsum("bchw,bc->bhw", F.normalize(features, dim=1), F.normalize(descriptors, dim=1))
         return self.log_scale.exp() * cosine
 
