@@ -14,10 +14,11 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.correspondence import peak_places
 from lerobot_deltaco.policy.efficientnet_lite import COARSE_CHANNELS, FINE_CHANNELS, EfficientNetLite
+from lerobot_deltaco.policy.goal_conditioning import Demonstrations, GoalConditioning
 from lerobot_deltaco.policy.matching_fit import fit_matching
 from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
 from lerobot_deltaco.policy.vision import load_efficientnet_lite0
-from lerobot_deltaco.policy.words import known_words, vocabulary_of
+from lerobot_deltaco.policy.words import KnownWords, known_words, vocabulary_of
 
 pytestmark = pytest.mark.usefixtures("fake_language")
 
@@ -197,6 +198,39 @@ def test_episodes_without_a_grasp_do_not_count(published, examples):
     places = torch.where(torch.arange(6)[:, None] < 2, places, torch.nan)
     with pytest.raises(ValueError, match="at least two episodes .* Of 6 episodes of 2 tasks"):
         fit_matching(new_matching(published), images, places, tasks, None, seed=0, steps=2)
+
+
+# Which maps count
+
+
+class FixedMatching:
+    """Finds what a demonstration moved at the first place of four, and what words name at the last."""
+
+    named = "something"
+    encode = normalized = staticmethod(lambda images: images)
+    describe = staticmethod(lambda maps, places: torch.zeros(len(maps), 1))
+    find = staticmethod(
+        lambda maps, descriptors: torch.tensor([[3.0, 0, 0, 0]]).expand(len(maps), 4)[:, None]
+    )
+    find_named = staticmethod(
+        lambda maps, present: torch.tensor([[0.0, 0, 0, 3]]).expand(len(maps), 4)[:, None]
+    )
+
+
+def matched(demonstrations, words):
+    scenes, located = torch.zeros(2, 3, 1, 4), torch.zeros(2, 1, 4)
+    attention = torch.ones(2, 2, 1, 4) / 4
+    maps = GoalConditioning._matched(FixedMatching, located, scenes, demonstrations, attention, words)
+    assert maps.shape == located.shape
+    return maps.flatten(1).argmax(dim=1).tolist()
+
+
+def test_an_instruction_with_unknown_words_counts_only_without_a_demonstration():
+    shown = Demonstrations(torch.zeros(2, 1, 2, 3, 1, 4), torch.zeros(2, 1))
+    words = KnownWords(torch.ones(2, 5), torch.tensor([True, False]))
+    assert matched(shown, words) == [3, 0]
+    assert matched(shown, None) == [0, 0]
+    assert matched(None, words) == [3, 3]
 
 
 # Policies
