@@ -95,7 +95,7 @@ def test_the_maps_are_those_of_the_package(published):
     encoder = EfficientNetLite()
     encoder.take_weights(published.state_dict())
     images = torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(0))
-    fine, coarse = encoder(images)
+    fine, coarse = encoder.fine_maps(images), encoder.coarse_maps(images)
     maps = published._swish(published._bn0(published._conv_stem((images - encoder.mean) / encoder.std)))
     theirs = []
     with torch.no_grad():
@@ -179,9 +179,8 @@ def test_words_are_known_or_not():
 def test_only_so_many_episodes_are_fitted_to(published, examples, monkeypatch):
     monkeypatch.setattr("lerobot_deltaco.policy.matching_fit._MAX_EPISODES", 6)
     matching, seen = new_matching(published), []
-    monkeypatch.setattr(
-        matching, "encode", lambda images: seen.append(len(images)) or matching.encoder(images)
-    )
+    encode = matching.encode
+    monkeypatch.setattr(matching, "encode", lambda images: seen.append(len(images)) or encode(images))
     fit_matching(matching, *examples, None, seed=0, steps=1)
     assert sum(seen) == 6
 
@@ -190,7 +189,9 @@ def test_larger_images_give_maps_of_the_same_size(published, examples):
     images = examples[0][:2].float() / 255
     larger = torch.nn.functional.interpolate(images, scale_factor=2)
     plain, detailed = new_matching(published).encode(images), new_matching(published, 2).encode(larger)
-    assert plain.fine.shape == detailed.fine.shape == (2, FINE_CHANNELS, SIZE // 2, SIZE // 2)
+    for maps in (plain, detailed):
+        assert maps.fine.shape == (2, FINE_CHANNELS, SIZE // 4, SIZE // 4)
+        assert maps.coarse.shape == (2, COARSE_CHANNELS, SIZE // 4, SIZE // 4)
 
 
 def test_episodes_without_a_grasp_do_not_count(published, examples):

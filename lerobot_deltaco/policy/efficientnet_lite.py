@@ -14,7 +14,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 FINE_CHANNELS, COARSE_CHANNELS = 40, 80
-FINE_STRIDE = 8
+FINE_STRIDE, COARSE_STRIDE = 8, 16
 # The mean and the standard deviation of ImageNet, by which the weights expect images to be normalized.
 _MEAN = (0.485, 0.456, 0.406)
 _STD = (0.229, 0.224, 0.225)
@@ -39,23 +39,6 @@ _FINE_BLOCKS = (
     _Block(40, 6, 5, 1),
 )
 _COARSE_BLOCKS = (_Block(80, 6, 3, 2), _Block(80, 6, 3, 1))
-
-
-class ImageMaps(NamedTuple):
-    """Feature maps of images.
-
-    Attributes:
-        fine: (batch, FINE_CHANNELS, h, w), where h and w are the height and width of the images divided by
-            `FINE_STRIDE`.
-        coarse: (batch, COARSE_CHANNELS, h / 2, w / 2), rounded up.
-    """
-
-    fine: Tensor
-    coarse: Tensor
-
-    def rows(self, rows: Tensor) -> ImageMaps:
-        """The maps of some of the images."""
-        return ImageMaps(self.fine[rows], self.coarse[rows])
 
 
 class EfficientNetLite(nn.Module):
@@ -107,13 +90,18 @@ class EfficientNetLite(nn.Module):
             tensor.copy_(value)
 
     @torch.no_grad()
-    def forward(self, images: Tensor) -> ImageMaps:
-        """Feature maps of images (batch, 3, H, W) in 0..1."""
+    def fine_maps(self, images: Tensor) -> Tensor:
+        """Maps of images (batch, 3, H, W) in 0..1: (batch, FINE_CHANNELS, H / 8, W / 8), rounded up."""
         with torch.autocast(images.device.type, enabled=False):
             images = (images.float() - self.mean) / self.std
             maps = self.stem(images.contiguous(memory_format=torch.channels_last))
-            fine = self.fine(F.relu6(maps))
-            return ImageMaps(fine, self.coarse(fine))
+            return self.fine(F.relu6(maps))
+
+    @torch.no_grad()
+    def coarse_maps(self, images: Tensor) -> Tensor:
+        """Maps of images (batch, 3, H, W) in 0..1: (batch, COARSE_CHANNELS, H / 16, W / 16), rounded up."""
+        with torch.autocast(images.device.type, enabled=False):
+            return self.coarse(self.fine_maps(images))
 
 
 class _ConvNorm(nn.Module):

@@ -10,12 +10,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_deltaco.policy.correspondence import goal_loss
-from lerobot_deltaco.policy.efficientnet_lite import ImageMaps
-from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
+from lerobot_deltaco.policy.pretrained_matching import ImageMaps, PretrainedMatching
 
 # Tried on validation tasks (docs/experiment-log.md): more steps and other regularization change nothing.
 _STEPS = 600
-_MAX_EPISODES = 5000  # that are drawn to fit to; on validation tasks, twice as many are no better
+_MAX_EPISODES = 10_000  # that are drawn to fit to
 _PAIRS_PER_STEP = 32
 _LEARNING_RATE = 2e-3
 _WARMUP_SHARE = 0.1

@@ -20,6 +20,7 @@ training objects by heart. `policy/matching_fit.py` fits them before a training,
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -27,15 +28,31 @@ from torch import Tensor, nn
 
 from lerobot_deltaco.policy.efficientnet_lite import (
     COARSE_CHANNELS,
+    COARSE_STRIDE,
     FINE_CHANNELS,
     FINE_STRIDE,
     EfficientNetLite,
-    ImageMaps,
 )
 from lerobot_deltaco.policy.networks import gaussian_maps
 
-_POOLING_STD = 1.2  # of the places around a grasp that describe what was grasped, in cells of the fine maps
+_POOLING_STD = 1.2  # of the places around a grasp that describe what was grasped, in cells of the features
 _LEAST_STD = 1e-3
+
+
+class ImageMaps(NamedTuple):
+    """Feature maps of images, of the size (h, w): a quarter of the images' height and width without detail.
+
+    Attributes:
+        fine: (batch, FINE_CHANNELS, h, w).
+        coarse: (batch, COARSE_CHANNELS, h, w), of images that were enlarged twice as much.
+    """
+
+    fine: Tensor
+    coarse: Tensor
+
+    def rows(self, rows: Tensor) -> ImageMaps:
+        """The maps of some of the images."""
+        return ImageMaps(self.fine[rows], self.coarse[rows])
 
 
 class PretrainedMatching(nn.Module):
@@ -85,9 +102,15 @@ class PretrainedMatching(nn.Module):
 
     def encode(self, images: Tensor) -> ImageMaps:
         """Maps of images (batch, 3, H, W) in 0..1, which the encoder sees enlarged."""
-        size = [FINE_STRIDE * (side // (2 * self.detail)) for side in images.shape[-2:]]
-        enlarged = F.interpolate(images, size=size, mode="bicubic", align_corners=False)
-        return self.encoder(enlarged.clamp(0, 1))
+        size = [max(1, side // (4 * self.detail)) for side in images.shape[-2:]]
+
+        def enlarged(stride: int) -> Tensor:
+            sides = [stride * cells for cells in size]
+            return F.interpolate(images, size=sides, mode="bicubic", align_corners=False).clamp(0, 1)
+
+        return ImageMaps(
+            self.encoder.fine_maps(enlarged(FINE_STRIDE)), self.encoder.coarse_maps(enlarged(COARSE_STRIDE))
+        )
 
     def normalized(self, maps: ImageMaps) -> ImageMaps:
         """Maps as `encode` makes them, with channels of mean 0 and spread 1, in float32."""
@@ -132,7 +155,7 @@ class PretrainedMatching(nn.Module):
 
 
 class WeighedMaps(nn.Module):
-    """Features of places: maps of two sizes, each weighed by a linear layer, and added up.
+    """Features of places: maps of two kinds, each weighed by a linear layer, and added up.
 
     Args:
         dim: Number of features.
@@ -145,13 +168,9 @@ class WeighedMaps(nn.Module):
         self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
 
     def forward(self, maps: ImageMaps) -> Tensor:
-        """From normalized maps to (batch, dim, h, w)."""
-        fine = self.fine(maps.fine)
-        # What is linear may be enlarged after it is weighed, which is cheaper.
-        coarse = F.interpolate(
-            self.coarse(maps.coarse), size=fine.shape[-2:], mode="bilinear", align_corners=False
-        )
-        return fine + coarse
+        """From normalized maps (batch, channels, h, w) to (batch, dim, 2 h, 2 w)."""
+        weighed = self.fine(maps.fine) + self.coarse(maps.coarse)
+        return F.interpolate(weighed, scale_factor=2, mode="bilinear", align_corners=False)
 
     def similarity(self, features: Tensor, descriptors: Tensor) -> Tensor:
         """Scaled cosine of features (batch, dim, h, w) and descriptors (batch, dim): (batch, h, w)."""
