@@ -120,6 +120,7 @@ _OWN_LABELS: Mapping[str, str] = MappingProxyType(
         "objects_100": "100 training objects",
         "objects_400": "400 training objects",
         "objects_400_either": "400 training objects, takes either input",
+        "objects_400_either_matching": "400 training objects, takes either input, pretrained matching",
     }
 )
 # What experiments whose names begin so have in common.
