@@ -13,7 +13,7 @@ from lerobot_deltaco.evaluation.record import read_record
 
 PROJECT = Path(__file__).parent.parent
 CHECKPOINT = PROJECT / "checkpoints" / "pick_place"
-RECORD = PROJECT / "results/small_objects/records/objects_400_either/seed_0/evaluations/0008000.json"
+RECORD = PROJECT / "results/small_objects/records/objects_400_either_matching/seed_0/evaluations/0008000.json"
 # Of name, color and shape tasks, with colors and positions of containers.
 TASKS = (26, 84, 128, 246)
 # Another processor rounds otherwise, which may change what happens in a few of the 16 episodes.
