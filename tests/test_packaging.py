@@ -111,6 +111,8 @@ FORBIDDEN = {
     "lerobot_deltaco/policy/losses.py": {"lerobot", "lerobot_deltaco"},
     "lerobot_deltaco/policy/demo_encoders.py": {"lerobot", "lerobot_deltaco.modeling_deltaco"},
     "lerobot_deltaco/policy/memory.py": {"lerobot", "lerobot_deltaco"},
+    "lerobot_deltaco/policy/efficientnet_lite.py": {"lerobot", "lerobot_deltaco"},
+    "lerobot_deltaco/policy/words.py": {"lerobot", "lerobot_deltaco"},
     # Reports are quick, and need no machine that could train.
     **{
         part: {"torch", "lerobot", "pybullet", "lerobot_deltaco.evaluation.evaluate"}

@@ -16,9 +16,9 @@ def main(arguments: list[str] | None = None) -> None:
     if options.out.exists():
         parser.error(f"{options.out} exists. Name a new folder with --out.")
     # Only here, since they take seconds to import.
-    from lerobot_deltaco.modeling.added_matching import add_matching
     from lerobot_deltaco.policy.task_file import TaskFileError
     from lerobot_deltaco.policy.vision import VisionEncoderError
+    from lerobot_deltaco.training.added_matching import add_matching
 
     with exit_on_error(
         parser,

@@ -206,9 +206,7 @@ class GoalConditioning(nn.Module):
         logits = located.logits
         if self.matching is not None:
             attention = None if demonstrations is None else each.attention
-            grasp_map = self._matched(
-                self.matching, logits[:, 0], scenes, demonstrations, attention, words
-            )
+            grasp_map = self._matched(self.matching, logits[:, 0], scenes, demonstrations, attention, words)
             logits = torch.stack([grasp_map, logits[:, 1]], dim=1)
         places, depths = peak_places(logits), None
         if self.depth is not None:
