@@ -165,8 +165,8 @@ class DeltacoConfig(PreTrainedConfig):
             instead of 48 did not help.
         pretrained_matching: Whether what a demonstration moved, and what the instruction names by words of
             training tasks, is also looked for by the features of EfficientNet-Lite0, which was trained on
-            ImageNet, with `demo_encoder=correspondence`. Before the training, this takes a few minutes and
-            the extra `offline`; afterwards, nothing but the checkpoint.
+            ImageNet, with `demo_encoder=correspondence`. Before the training, this takes a few minutes
+            for images of 48 px, and needs the extra `offline`; afterwards, the checkpoint is enough.
         known_words: Words of the training tasks, for `pretrained_matching`; filled in by training.
         goal_noise: Standard deviation of the noise on goals in training, in coordinates in which an image's
             edges are at -1 and 1; 0.04 is a pixel of 48.
@@ -444,7 +444,7 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 f"`goal_image_size` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that one."
             )
-        if self.pretrained_matching:
+        if self.pretrained_matching or self.known_words:
             raise ValueError(
                 f"`pretrained_matching` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that "
                 "one."

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from lerobot.configs.policies import PreTrainedConfig
 from small_policies import batch_of, observation, small_policy
 from test_correspondence import table_dataset
 
@@ -109,8 +110,10 @@ def test_the_maps_are_those_of_the_package(published):
 
 
 def test_weights_of_another_network_are_refused():
-    with pytest.raises(ValueError, match="not the weights of EfficientNet-Lite0: 0.weight has the shape"):
+    with pytest.raises(ValueError, match="not the weights of EfficientNet-Lite0: there are 2 tensors"):
         EfficientNetLite().take_weights(torch.nn.Sequential(torch.nn.Conv2d(3, 8, 3)).state_dict())
+    with pytest.raises(ValueError, match="not the weights of EfficientNet-Lite0: 0 has the shape"):
+        EfficientNetLite().take_weights({str(number): torch.zeros(2) for number in range(500)})
 
 
 def test_nothing_of_it_is_trained_with_a_policy():
@@ -172,7 +175,7 @@ def test_words_are_known_or_not():
     assert vocabulary == ["bowls", "cup", "in", "put", "red", "the"]
     known = known_words(vocabulary, ["put RED bowls, in!", "put the jar in", ""])
     assert known.present.sum(dim=1).tolist() == [4, 3, 0]
-    assert known.are_all.tolist() == [True, False, True]
+    assert known.are_all.tolist() == [True, False, False]
     assert known_words(vocabulary, []).present.shape == (0, 6)
 
 
@@ -232,6 +235,9 @@ def test_an_instruction_with_unknown_words_counts_only_without_a_demonstration()
     assert matched(shown, words) == [3, 0]
     assert matched(shown, None) == [0, 0]
     assert matched(None, words) == [3, 3]
+    none = KnownWords(torch.zeros(2, 5), torch.tensor([False, False]))
+    assert matched(shown, none) == [0, 0]
+    assert matched(None, none) == [0, 0]  # the first of equal places
 
 
 # Policies
@@ -261,6 +267,30 @@ def test_a_policy_with_it_trains_and_is_the_same_when_it_is_loaded(dataset, tmp_
     found, again = (each.encode_task(tuple(TASKS), each.scenes(seen)).goals for each in (policy, loaded))
     assert torch.equal(found.places, again.places)
     assert torch.equal(found.logits, again.logits)
+
+
+@pytest.mark.usefixtures("short_fit")
+@pytest.mark.parametrize("size", [16, 17, 18, 19])
+def test_any_size_of_images_will_do(dataset, size):
+    data = {"demo_repo_id": "test/table", "demo_root": str(dataset.root), "image_size": size}
+    policy, _, _ = small_policy(dataset, **{**MATCHING, **data})
+    policy(batch_of(dataset, [0]))
+    policy.eval()
+    goals = policy.encode_task(tuple(TASKS), policy.scenes(observation(dataset, TASKS))).goals
+    assert goals.places.isfinite().all()
+    assert goals.places.abs().max() <= 1
+
+
+@pytest.mark.usefixtures("short_fit")
+def test_several_demonstrations_and_methods_will_do(dataset):
+    data = {"demo_repo_id": "test/table", "demo_root": str(dataset.root)}
+    for options in ({"n_demonstrations": 3}, {"method": "demo_only"}):
+        policy, _, _ = small_policy(dataset, **MATCHING, **data, **options)
+        policy(batch_of(dataset, [0]))
+        assert bool(policy.config.known_words) == ("method" not in options)
+        policy.eval()
+        goals = policy.encode_task(tuple(TASKS), policy.scenes(observation(dataset, TASKS))).goals
+        assert goals.places.isfinite().all()
 
 
 @pytest.mark.usefixtures("short_fit")
@@ -354,6 +384,12 @@ def test_the_command_adds_it_to_a_trained_policy(checkpoint, dataset, tmp_path, 
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
+def with_matching(checkpoint):
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_matching = True
+    return config
+
+
 def test_the_command_says_what_it_cannot_do(checkpoint, dataset, tmp_path, capsys):
     def said(*arguments):
         with pytest.raises(SystemExit) as end:
@@ -364,9 +400,14 @@ def test_the_command_says_what_it_cannot_do(checkpoint, dataset, tmp_path, capsy
     code, text = said(checkpoint, *root, "--out", checkpoint)
     assert code == 2
     assert "exists. Name a new folder" in text
+    code, text = said(checkpoint, *root, "--out", checkpoint / "new")
+    assert code == 1
+    assert "Name a folder outside of it" in text
     code, text = said(tmp_path / "nothing", *root, "--out", tmp_path / "new")
     assert code == 1
     assert "is no checkpoint" in text
+    with pytest.raises(ValueError, match="`deltaco-match` adds it"):
+        DeltacoPolicy.from_pretrained(checkpoint, config=with_matching(checkpoint))
     shutil.rmtree(checkpoint)
     policy, _, _ = small_policy(dataset, image_size=SIZE, demo_encoder="attention")
     policy.save_pretrained(checkpoint)

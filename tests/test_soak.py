@@ -236,6 +236,7 @@ VALUES = {
     "optimizer_l2": [0.0, 1e-4, -1.0],
     "demo_camera": [None, "observation.images.wrist", "observation.images.none", 3],
     "n_demonstrations": [1, 2, 0, None],
+    "pretrained_matching": [False, False, True, "yes"],
     "goal_image_size": [None, 16, 32, 48, 96, 15, 2**31, "48"],
     "goal_noise": [0.0, 0.04, -1.0, math.nan],
     "grasp_depth": [True, False, 1],

@@ -90,6 +90,10 @@ def check_loaded_weights(policy: nn.Module, path: str) -> None:
     expected = set(policy.state_dict())
     if stored != expected:
         missing, unknown = sorted(expected - stored), sorted(stored - expected)
+        if not unknown and all(name.startswith("goals.matching.") for name in missing):
+            raise ValueError(
+                f"The policy of {path} was trained without `pretrained_matching`. `deltaco-match` adds it."
+            )
         raise ValueError(
             f"{path} does not have the weights of this policy: it lacks {missing[:3] or 'none'}, "
             f"and has the unknown {unknown[:3] or 'none'}. The config.json beside it belongs to other "

@@ -81,6 +81,11 @@ class EfficientNetLite(nn.Module):
             ValueError: It is the state of another network.
         """
         own = self.state_dict()
+        if len(published) < len(own):
+            raise ValueError(
+                f"These are not the weights of EfficientNet-Lite0: there are {len(published)} tensors, and "
+                f"at least {len(own)} are needed."
+            )
         for (name, tensor), (other, value) in zip(own.items(), published.items(), strict=False):
             if tensor.shape != value.shape:
                 raise ValueError(

@@ -261,9 +261,16 @@ class GoalConditioning(nn.Module):
                 first = matching.normalized(matching.encode(demonstrations.ends[:, :, 0].flatten(0, 1)))
                 each = F.normalize(matching.describe(first, places), dim=1)
                 descriptors = each.unflatten(0, (-1, n_each)).mean(dim=1)
-                logits = logits + log_probabilities(matching.find(maps, descriptors))
+                logits = logits + log_probabilities(_resized(matching.find(maps, descriptors), located))
             if words is not None and matching.named is not None:
-                named = log_probabilities(matching.find_named(maps, words.present))
-                counts = words.are_all | (demonstrations is None)
+                named = log_probabilities(_resized(matching.find_named(maps, words.present), located))
+                counts = words.present.any(dim=1) & (words.are_all | (demonstrations is None))
                 logits = logits + torch.where(counts[:, None, None], _WEIGHT_OF_WORDS * named, 0.0)
         return logits
+
+
+def _resized(logits: Tensor, like: Tensor) -> Tensor:
+    """Maps (batch, h, w) at the size of others, which differs if an image's side is no multiple of 4."""
+    if logits.shape == like.shape:
+        return logits
+    return F.interpolate(logits[:, None], size=like.shape[-2:], mode="bilinear", align_corners=False)[:, 0]

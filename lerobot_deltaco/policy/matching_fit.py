@@ -14,7 +14,7 @@ from lerobot_deltaco.policy.pretrained_matching import ImageMaps, PretrainedMatc
 
 # Tried on validation tasks (docs/experiment-log.md): more steps and other regularization change nothing.
 _STEPS = 600
-_MAX_EPISODES = 10_000  # that are drawn to fit to
+_MAX_EPISODES = 10_000  # drawn for the fit
 _PAIRS_PER_STEP = 32
 _LEARNING_RATE = 2e-3
 _WARMUP_SHARE = 0.1
@@ -53,7 +53,9 @@ def fit_matching(
     """
     generator = torch.Generator().manual_seed(seed)
     device = images.device
-    drawn = torch.randperm(len(tasks), generator=generator)[:_MAX_EPISODES].sort().values
+    _Pairs(places, tasks)  # says what is missing
+    grasps = (~places.isnan().any(dim=1)).nonzero().flatten().cpu()
+    drawn = grasps[torch.randperm(len(grasps), generator=generator)[:_MAX_EPISODES]].sort().values
     tasks = [tasks[row] for row in drawn.tolist()]
     images, places = images[drawn.to(device)], places[drawn.to(device)]
     present = None if present is None else present[drawn.to(device)]
@@ -88,6 +90,8 @@ def fit_matching(
         for weights in learned:
             weights.requires_grad_(False)
             weights.grad = None
+        if present is not None:
+            matching.words[:-1][~present.any(dim=0)] = 0  # words of no episode say nothing
     matching.fitted.fill_(True)
 
 
@@ -111,7 +115,7 @@ class _Pairs:
             raise ValueError(
                 "Matching by pretrained features needs tasks with at least two episodes in which the gripper "
                 f"closes on something. Of {len(tasks)} episodes of {len(set(tasks))} tasks, there is no such "
-                "pair. Add episodes, or leave out `pretrained_matching`."
+                "pair. Add episodes, or train without `pretrained_matching`."
             )
 
     def draw(self, n_pairs: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,9 @@ def warn_if_emulated(dtype: str, device_type: str) -> None:
         dtype: Precision, "float32" or "bfloat16".
         device_type: Type of the networks' device, such as "cpu".
     """
-    if dtype == "bfloat16" and device_type == "cpu" and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
+    if dtype != "bfloat16" or device_type != "cpu" or not torch.backends.mkldnn.is_available():
+        return
+    if not torch.ops.mkldnn._is_mkldnn_bf16_supported():
         logger.warning(
             "This processor has no instructions for bfloat16, so that a training step takes several times as "
             "long as in float32. Stop, and train with --policy.dtype=float32 (deltaco-experiment: --set "

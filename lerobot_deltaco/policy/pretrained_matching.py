@@ -2,8 +2,8 @@ r"""Matching by pretrained features (ours): finds what a task asks for by featur
 
 A network that learns from a few hundred objects compares them by color: among objects of one color, it picks
 nearly at random. The features of a network that was trained on photographs tell shapes apart, too. They are
-frozen; learned is only how they are weighed, by linear layers, which have too few weights to learn the
-training objects by heart. `policy/matching_fit.py` fits them before a training, or for a trained policy.
+frozen; only their weighting is learned, by linear layers, which have too few weights to learn the training
+objects by heart. `policy/matching_fit.py` fits them before a training, or for a trained policy.
 
     demonstration's first image     scene                     instruction
             |                         |                            |

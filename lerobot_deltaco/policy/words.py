@@ -25,7 +25,7 @@ class KnownWords(NamedTuple):
 
     Attributes:
         present: Which words of a vocabulary each has, (instructions, words) float: 0 or 1.
-        are_all: Whether there are no others in it, (instructions,) bool.
+        are_all: Whether it has words and no others, (instructions,) bool.
     """
 
     present: Tensor
@@ -44,5 +44,7 @@ def known_words(vocabulary: Sequence[str], instructions: Sequence[str]) -> Known
     for row, instruction in enumerate(instructions):
         for word in words_of(instruction) & places.keys():
             present[row, places[word]] = 1
-    are_all = torch.tensor([words_of(instruction) <= places.keys() for instruction in instructions])
+    are_all = torch.tensor(
+        [frozenset() < words_of(instruction) <= places.keys() for instruction in instructions]
+    )
     return KnownWords(present, are_all.reshape(len(instructions)))

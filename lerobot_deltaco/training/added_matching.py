@@ -22,7 +22,7 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
         repo_id: Repository id of the dataset.
         root: Folder of the dataset; None for LeRobot's cache.
         out: Folder of the new checkpoint, which must not exist. It gets all files of the old one, except for
-            its card, whose figures are of the old policy.
+            its card and the configuration of its training, which describe the old policy.
         seed: Seed of the draws.
 
     Returns:
@@ -34,6 +34,8 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
             fit the dataset.
         VisionEncoderError: The weights of EfficientNet-Lite0 are missing.
     """
+    if out.resolve().is_relative_to(checkpoint.resolve()):
+        raise ValueError(f"{out} is in the folder of the checkpoint itself. Name a folder outside of it.")
     if not (checkpoint / "config.json").is_file():
         raise FileNotFoundError(f"{checkpoint} is no checkpoint: it has no config.json.")
     policy = DeltacoPolicy.from_pretrained(checkpoint)
@@ -48,18 +50,20 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
     data = replace(config, demo_repo_id=repo_id, demo_root=None if root is None else str(root))
     episodes = read_eval_demonstrations(data)
     assert episodes is not None
+    assert config.device is not None
+    episodes = episodes.to(config.device)
     if episodes.grasp_states is None:
         raise ValueError(f"The policy of {checkpoint} knows no gripper, by which grasps are found.")
     known_words = vocabulary_of(episodes.tasks) if config.uses_language else []
-    matching = PretrainedMatching(len(known_words), detail=config.goal_detail)
+    matching = PretrainedMatching(len(known_words), detail=config.goal_detail).to(config.device)
     places = goals.states.grasp_places(episodes.grasp_states)
     fit_pretrained_matching(matching, episodes, places, known_words, seed)
-    goals.matching = matching.to(config.device)
+    goals.matching = matching
     config.pretrained_matching, config.known_words = True, known_words
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
         new = Path(folder) / out.name
-        shutil.copytree(checkpoint, new, ignore=shutil.ignore_patterns("README.md"))
+        shutil.copytree(checkpoint, new, ignore=shutil.ignore_patterns("README.md", "train_config.json"))
         policy.save_pretrained(new)
         new.rename(out)
     return len(episodes.tasks)
