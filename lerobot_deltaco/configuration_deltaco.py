@@ -444,7 +444,7 @@ class DeltacoConfig(PreTrainedConfig):
             raise ValueError(
                 f"`goal_image_size` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that one."
             )
-        if self.pretrained_matching or self.known_words:
+        if self.pretrained_matching:
             raise ValueError(
                 f"`pretrained_matching` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that "
                 "one."

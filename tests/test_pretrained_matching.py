@@ -200,7 +200,7 @@ def test_larger_images_give_maps_of_the_same_size(published, examples):
 def test_episodes_without_a_grasp_do_not_count(published, examples):
     images, places, tasks = (part[:6] for part in examples)
     places = torch.where(torch.arange(6)[:, None] < 2, places, torch.nan)
-    with pytest.raises(ValueError, match="at least two episodes .* Of 6 episodes of 2 tasks"):
+    with pytest.raises(ValueError, match="at least two episodes .* 2 such episodes are of 2 different tasks"):
         fit_matching(new_matching(published), images, places, tasks, None, seed=0, steps=2)
 
 

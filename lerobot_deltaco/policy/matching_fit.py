@@ -53,13 +53,12 @@ def fit_matching(
     """
     generator = torch.Generator().manual_seed(seed)
     device = images.device
-    _Pairs(places, tasks)  # says what is missing
     grasps = (~places.isnan().any(dim=1)).nonzero().flatten().cpu()
     drawn = grasps[torch.randperm(len(grasps), generator=generator)[:_MAX_EPISODES]].sort().values
     tasks = [tasks[row] for row in drawn.tolist()]
     images, places = images[drawn.to(device)], places[drawn.to(device)]
     present = None if present is None else present[drawn.to(device)]
-    pairs = _Pairs(places, tasks)
+    pairs = _Pairs(tasks)
     with torch.enable_grad(), torch.autocast(device.type, enabled=False):
         maps = _encoded(matching, images)
         some = torch.arange(0, len(images), math.ceil(len(images) / _N_FOR_STATISTICS), device=device)
@@ -99,23 +98,22 @@ class _Pairs:
     """Draws pairs of different episodes of a task.
 
     Args:
-        places: Places of the grasps, (episodes, 2); NaN where there is none.
-        tasks: Task of each episode.
+        tasks: Task of each episode; all have a grasp.
 
     Raises:
         ValueError: No task has two episodes with a grasp.
     """
 
-    def __init__(self, places: Tensor, tasks: Sequence[str]) -> None:
+    def __init__(self, tasks: Sequence[str]) -> None:
         rows: dict[str, list[int]] = {}
-        for row in (~places.isnan().any(dim=1)).nonzero().flatten().tolist():
-            rows.setdefault(tasks[row], []).append(row)
+        for row, task in enumerate(tasks):
+            rows.setdefault(task, []).append(row)
         self._rows = [torch.tensor(found) for found in rows.values() if len(found) > 1]
         if not self._rows:
             raise ValueError(
                 "Matching by pretrained features needs tasks with at least two episodes in which the gripper "
-                f"closes on something. Of {len(tasks)} episodes of {len(set(tasks))} tasks, there is no such "
-                "pair. Add episodes, or train without `pretrained_matching`."
+                f"closes on something. The {len(tasks)} such episodes are of {len(rows)} different tasks, with "
+                "no pair. Add episodes, or train without `pretrained_matching`."
             )
 
     def draw(self, n_pairs: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
