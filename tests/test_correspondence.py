@@ -44,17 +44,21 @@ def state_of(place):
     return np.array([3 + 0.4 * x + 0.1 * y, -1 - 0.1 * x + 0.5 * y, 7.0], np.float32)
 
 
-@pytest.fixture(scope="module")
-def episodes():
+def random_moves(tasks):
     """Of each episode: the task, where its thing was and went, and where the other thing stood."""
     rng = np.random.default_rng(0)
     found = []
     while len(found) < 60:
         start, other = rng.uniform(-0.7, 0.7, (2, 2))
         if np.abs(start - other).max() > 0.5:
-            task = list(COLORS)[len(found) % 2]
+            task = tasks[len(found) % 2]
             found.append((task, start, other, np.array([-0.8 if "left" in task else 0.8, start[1]])))
     return found
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return random_moves(list(COLORS))
 
 
 @pytest.fixture(scope="module")

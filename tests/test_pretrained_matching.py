@@ -8,7 +8,7 @@ import pytest
 import torch
 from lerobot.configs.policies import PreTrainedConfig
 from small_policies import batch_of, observation, small_policy
-from test_correspondence import table_dataset
+from test_correspondence import random_moves, table_dataset
 
 from lerobot_deltaco.commands import match
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
@@ -55,15 +55,7 @@ def drawn_table(task, thing, other):
 
 @pytest.fixture(scope="module")
 def episodes():
-    """Of each episode: the task, where its thing was and went, and where the other thing stood."""
-    rng = np.random.default_rng(0)
-    found = []
-    while len(found) < 60:
-        start, other = rng.uniform(-0.7, 0.7, (2, 2))
-        if np.abs(start - other).max() > 0.5:
-            task = TASKS[len(found) % 2]
-            found.append((task, start, other, np.array([-0.8 if "left" in task else 0.8, start[1]])))
-    return found
+    return random_moves(TASKS)
 
 
 @pytest.fixture(scope="module")

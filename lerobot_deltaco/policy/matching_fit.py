@@ -112,8 +112,8 @@ class _Pairs:
         if not self._rows:
             raise ValueError(
                 "Matching by pretrained features needs tasks with at least two episodes in which the gripper "
-                f"closes on something. The {len(tasks)} such episodes are of {len(rows)} different tasks, with "
-                "no pair. Add episodes, or train without `pretrained_matching`."
+                f"closes on something. The {len(tasks)} such episodes are of {len(rows)} different "
+                "tasks. Add episodes, or train without `pretrained_matching`."
             )
 
     def draw(self, n_pairs: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
