@@ -1,6 +1,7 @@
 """Matching by pretrained features: the encoder, the fit, and policies with it."""
 
 import copy
+import json
 import shutil
 
 import numpy as np
@@ -189,6 +190,23 @@ def test_larger_images_give_maps_of_the_same_size(published, examples):
         assert maps.coarse.shape == (2, COARSE_CHANNELS, SIZE // 4, SIZE // 4)
 
 
+def test_the_maps_of_large_images_stop_growing(published, examples):
+    large = torch.nn.functional.interpolate(examples[0][:1].float() / 255, size=(256, 192))
+    maps = new_matching(published).encode(large)
+    assert maps.fine.shape[-2:] == maps.coarse.shape[-2:] == (24, 24)
+    small = new_matching(published).encode(torch.nn.functional.interpolate(large, size=(96, 96)))
+    assert torch.nn.functional.cosine_similarity(maps.fine.flatten(), small.fine.flatten(), dim=0) > 0.9
+
+
+@pytest.mark.slow
+def test_a_fit_to_large_images_finds_shapes_of_one_color(published, examples):
+    images, places, tasks = (part[:24] for part in examples)
+    images = torch.nn.functional.interpolate(images, size=(256, 256))
+    matching = new_matching(published)
+    fit_matching(matching, images[:16], places[:16], tasks[:16], None, seed=0, steps=60)
+    assert share_found(matching, images[16:], places[16:], tasks[16:]) >= 0.9
+
+
 def test_episodes_without_a_grasp_do_not_count(published, examples):
     images, places, tasks = (part[:6] for part in examples)
     places = torch.where(torch.arange(6)[:, None] < 2, places, torch.nan)
@@ -374,6 +392,18 @@ def test_the_command_adds_it_to_a_trained_policy(checkpoint, dataset, tmp_path, 
     files = {path.name for path in checkpoint.iterdir()} - {"README.md"}
     assert {path.name for path in out.iterdir()} == files
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.usefixtures("short_fit")
+@pytest.mark.parametrize(("name", "n_episodes"), [("test/table", 30), ("test/other", 60)])
+def test_the_command_leaves_out_what_the_training_held_back(
+    checkpoint, dataset, tmp_path, capsys, name, n_episodes
+):
+    trained_on = {"repo_id": "test/table", "episodes": list(range(40)), "eval_split": 0.25}
+    (checkpoint / "train_config.json").write_text(json.dumps({"dataset": trained_on}))
+    data = ["--dataset.root", str(dataset.root), "--dataset.repo_id", name]
+    match.main([str(checkpoint), *data, "--out", str(tmp_path / "matched")])
+    assert f"fitted to {n_episodes} episodes" in capsys.readouterr().out
 
 
 def with_matching(checkpoint):

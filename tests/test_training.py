@@ -21,6 +21,7 @@ from torch.nn.parallel import DistributedDataParallel
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import load_demonstrations
 from lerobot_deltaco.policy.finite_loss import TrainingDivergedError
+from lerobot_deltaco.policy.vision import VisionEncoderError
 from lerobot_deltaco.training.frames import FramesInMemory, decoded, needed_bytes
 from lerobot_deltaco.training.loop import InMemoryTraining
 
@@ -346,6 +347,15 @@ def test_a_mistyped_folder_is_named_and_not_made(train, tmp_path, option):
     ):
         train("--policy.demo_repo_id=test/foreign", f"--{option}={missing}")
     assert not missing.parent.exists()
+
+
+def test_missing_weights_for_matching_are_noticed_before_the_frames_are_read(train, monkeypatch):
+    monkeypatch.setattr("lerobot_deltaco.policy.vision._LITE_PACKAGES", ("no_such_package",))
+    monkeypatch.setattr(
+        "lerobot_deltaco.training.loop.FramesInMemory", lambda *_, **__: pytest.fail("read frames")
+    )
+    with pytest.raises(VisionEncoderError, match="no-such-package. Install this project's extra `offline`"):
+        train("--policy.demo_encoder=correspondence", "--policy.pretrained_matching=true")
 
 
 @pytest.mark.parametrize(

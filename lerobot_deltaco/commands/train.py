@@ -6,15 +6,27 @@ from draccus.utils import ParsingError
 
 from lerobot_deltaco.lerobot_internals import UnsupportedLeRobotError
 from lerobot_deltaco.policy.finite_loss import TrainingDivergedError
+from lerobot_deltaco.policy.language import LanguageEncoderError
+from lerobot_deltaco.policy.vision import VisionEncoderError
 from lerobot_deltaco.training.loop import reason_of, train
 from lerobot_deltaco.training.remote_job import RemoteJobError
+
+# Errors whose messages a user can act on. Others are bugs, and show a traceback.
+_ACTIONABLE = (
+    UnsupportedLeRobotError,
+    TrainingDivergedError,
+    ParsingError,
+    RemoteJobError,
+    LanguageEncoderError,
+    VisionEncoderError,
+)
 
 
 def main() -> None:
     """Trains. The arguments are those of `lerobot-train`."""
     try:
         train()
-    except (UnsupportedLeRobotError, TrainingDivergedError, ParsingError, RemoteJobError) as error:
+    except _ACTIONABLE as error:
         sys.exit(f"deltaco-train: {reason_of(error)}")
     except SystemExit as end:
         # LeRobot ends the command when its parser fails, without the reason.

@@ -78,14 +78,17 @@ def read_training_demonstrations(
     return demonstrations, data
 
 
-def read_eval_demonstrations(config: DeltacoConfig) -> DemonstrationSet | None:
+def read_eval_demonstrations(
+    config: DeltacoConfig, episodes: Sequence[int] | None = None
+) -> DemonstrationSet | None:
     """The demonstrations for evaluation, with the robot's states at grasps if depths are estimated.
 
     Args:
         config: Configuration of the policy.
+        episodes: Episodes of the dataset; None for all.
 
     Returns:
-        All episodes of the dataset `demo_repo_id`; None if none is named.
+        Those episodes of the dataset `demo_repo_id`; None if none is named.
 
     Raises:
         FileNotFoundError: There is no network, and no dataset in the folder.
@@ -94,7 +97,7 @@ def read_eval_demonstrations(config: DeltacoConfig) -> DemonstrationSet | None:
     repo_id, root = config.demo_repo_id, config.demo_root
     if repo_id is None:
         return None
-    demonstrations = read_demonstrations(config, repo_id, root, None)
+    demonstrations = read_demonstrations(config, repo_id, root, episodes)
     index = config.gripper_index
     if config.locates_goals and config.grasp_depth and index is not None:
         data = load_robot_data(repo_id, root, demonstrations.episodes.tolist())

@@ -270,7 +270,10 @@ class GoalConditioning(nn.Module):
 
 
 def _resized(logits: Tensor, like: Tensor) -> Tensor:
-    """Maps (batch, h, w) at the size of others, which differs if an image's side is no multiple of 4."""
+    """Maps (batch, h, w) at the size of others.
+
+    It differs if an image's side is no multiple of 4, or so large that the encoder sees it scaled down.
+    """
     if logits.shape == like.shape:
         return logits
     return F.interpolate(logits[:, None], size=like.shape[-2:], mode="bilinear", align_corners=False)[:, 0]

@@ -37,10 +37,13 @@ from lerobot_deltaco.policy.networks import gaussian_maps
 
 _POOLING_STD = 1.2  # of the places around a grasp that describe what was grasped, in cells of the features
 _LEAST_STD = 1e-3
+# Of a side of the maps. The encoder's work and the memory of a fit grow with its square: without a limit, the
+# encoder would see the images of a camera of 256 px with 1,024 px.
+_MAX_CELLS = 24
 
 
 class ImageMaps(NamedTuple):
-    """Feature maps of images, of the size (h, w): a quarter of the images' height and width without detail.
+    """Feature maps of images, of the size (h, w): a quarter of their sides (without detail), at most 24.
 
     Attributes:
         fine: (batch, FINE_CHANNELS, h, w).
@@ -101,15 +104,19 @@ class PretrainedMatching(nn.Module):
             self.get_buffer(f"{name}_std").copy_(values.std(dim=1).clamp_min(_LEAST_STD)[:, None, None])
 
     def encode(self, images: Tensor) -> ImageMaps:
-        """Maps of images (batch, 3, H, W) in 0..1, which the encoder sees enlarged."""
-        size = [max(1, side // (4 * self.detail)) for side in images.shape[-2:]]
+        """Maps of images (batch, 3, H, W) in 0..1, which the encoder sees scaled to its strides."""
+        size = [min(_MAX_CELLS, max(1, side // (4 * self.detail))) for side in images.shape[-2:]]
 
-        def enlarged(stride: int) -> Tensor:
+        def scaled(stride: int) -> Tensor:
             sides = [stride * cells for cells in size]
-            return F.interpolate(images, size=sides, mode="bicubic", align_corners=False).clamp(0, 1)
+            is_smaller = sides[0] < images.shape[-2]
+            larger_or_smaller = F.interpolate(
+                images, size=sides, mode="bicubic", align_corners=False, antialias=is_smaller
+            )
+            return larger_or_smaller.clamp(0, 1)
 
         return ImageMaps(
-            self.encoder.fine_maps(enlarged(FINE_STRIDE)), self.encoder.coarse_maps(enlarged(COARSE_STRIDE))
+            self.encoder.fine_maps(scaled(FINE_STRIDE)), self.encoder.coarse_maps(scaled(COARSE_STRIDE))
         )
 
     def normalized(self, maps: ImageMaps) -> ImageMaps:

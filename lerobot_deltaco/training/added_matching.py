@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_deltaco.common.run_folder import TRAIN_CONFIG
 from lerobot_deltaco.modeling.goal_learning import fit_pretrained_matching
 from lerobot_deltaco.modeling.task_sources import read_eval_demonstrations
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
+from lerobot_deltaco.policy.training_episodes import kept_episodes
 from lerobot_deltaco.policy.words import vocabulary_of
 
 
 def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, seed: int) -> int:
     """Saves a policy with matching that is fitted to the episodes of a dataset.
+
+    If the policy was trained on a dataset of this name, episodes that its training did not use are left out.
 
     Args:
         checkpoint: Folder of the policy.
@@ -48,7 +55,7 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
     if goals.matching is not None:
         raise ValueError(f"The policy of {checkpoint} has matching by pretrained features already.")
     data = replace(config, demo_repo_id=repo_id, demo_root=None if root is None else str(root))
-    episodes = read_eval_demonstrations(data)
+    episodes = read_eval_demonstrations(data, _episodes_of_training(checkpoint, repo_id, root))
     assert episodes is not None
     assert config.device is not None
     episodes = episodes.to(config.device)
@@ -67,3 +74,15 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
         policy.save_pretrained(new)
         new.rename(out)
     return len(episodes.tasks)
+
+
+def _episodes_of_training(checkpoint: Path, repo_id: str, root: Path | None) -> list[int] | None:
+    """The episodes that a policy was trained on, if its checkpoint says so; None for all of the dataset."""
+    path = checkpoint / TRAIN_CONFIG
+    if not path.is_file():
+        return None
+    dataset = json.loads(path.read_text(encoding="utf-8")).get("dataset") or {}
+    chosen, held_back = dataset.get("episodes"), dataset.get("eval_split") or 0.0
+    if dataset.get("repo_id") != repo_id or not (chosen or held_back):
+        return None
+    return kept_episodes(LeRobotDatasetMetadata(repo_id, root=root), chosen, held_back)

@@ -42,6 +42,7 @@ from lerobot_deltaco.lerobot_internals import (
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.dataset_folders import check_dataset_folder
 from lerobot_deltaco.policy.demonstrations import kept_frame_indices
+from lerobot_deltaco.policy.vision import load_efficientnet_lite0
 from lerobot_deltaco.training.frames import FramesInMemory
 from lerobot_deltaco.training.remote_job import check_remote_job
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
@@ -136,6 +137,7 @@ class InMemoryTraining:
             ValueError: No policy is trained, or the data cannot be held in memory.
             FileNotFoundError: There is no network, and no dataset in a folder.
             MemoryError: The frames do not fit.
+            VisionEncoderError: The weights that pretrained matching needs are missing.
         """
         policy = config.policy
         if policy is None:
@@ -146,6 +148,8 @@ class InMemoryTraining:
         check_dataset_folder("--dataset.root", config.dataset.root)
         if isinstance(policy, DeltacoConfig):
             check_dataset_folder("--policy.demo_root", policy.demo_root)
+            if policy.pretrained_matching and policy.pretrained_path is None:
+                load_efficientnet_lite0()  # for its errors: the weights are needed after the decoding
         self._config = config
         # The loader has nothing to do: it gives places, and the frames are gathered on the device.
         config.num_workers = 0
