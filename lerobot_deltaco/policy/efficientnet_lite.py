@@ -100,7 +100,7 @@ class EfficientNetLite(nn.Module):
         with torch.autocast(images.device.type, enabled=False):
             images = (images.float() - self.mean) / self.std
             maps = self.stem(images.contiguous(memory_format=torch.channels_last))
-            return self.fine(F.relu6(maps))
+            return self.fine(F.relu6(maps, inplace=True))
 
     @torch.no_grad()
     def coarse_maps(self, images: Tensor) -> Tensor:
@@ -117,12 +117,17 @@ class _ConvNorm(nn.Module):
     ) -> None:
         super().__init__()
         total = max(size - stride, 0)
-        self.padding = (total // 2, total - total // 2) * 2
-        self.conv = nn.Conv2d(in_channels, out_channels, size, stride, groups=groups, bias=False)
+        # The convolution itself pads all sides alike; one more row and column are added here, which takes a copy.
+        self.extra = total % 2
+        self.conv = nn.Conv2d(
+            in_channels, out_channels, size, stride, padding=total // 2, groups=groups, bias=False
+        )
         self.norm = nn.BatchNorm2d(out_channels, eps=_BATCH_NORM_EPS)
 
     def forward(self, maps: Tensor) -> Tensor:
-        return self.norm(self.conv(F.pad(maps, self.padding)))
+        if self.extra:
+            maps = F.pad(maps, (0, self.extra, 0, self.extra))
+        return self.norm(self.conv(maps))
 
 
 class _InvertedResidual(nn.Module):
@@ -137,6 +142,6 @@ class _InvertedResidual(nn.Module):
         self.has_skip = block.stride == 1 and channels == block.out_channels
 
     def forward(self, maps: Tensor) -> Tensor:
-        inner = maps if self.expand is None else F.relu6(self.expand(maps))
-        projected = self.project(F.relu6(self.depthwise(inner)))
+        inner = maps if self.expand is None else F.relu6(self.expand(maps), inplace=True)
+        projected = self.project(F.relu6(self.depthwise(inner), inplace=True))
         return maps + projected if self.has_skip else projected
