@@ -108,6 +108,8 @@ _OWN_LABELS: Mapping[str, str] = MappingProxyType(
         "demo_only": "demo only",
         "either": "DeL-TaCo, takes either input",
         "deltaco_paraphrases": "DeL-TaCo, trained on paraphrases",
+        "deltaco_paraphrases_templates": "DeL-TaCo, trained on paraphrases and templates",
+        "deltaco_matching": "DeL-TaCo, pretrained matching",
         "language_only_paraphrases": "language only, trained on paraphrases",
         "minilm_l3": "DeL-TaCo, MiniLM-L3",
         "minilm_l3_language_only": "language only, MiniLM-L3",
