@@ -117,7 +117,7 @@ class _ConvNorm(nn.Module):
     ) -> None:
         super().__init__()
         total = max(size - stride, 0)
-        # The convolution itself pads all sides alike; one more row and column are added here, which takes a copy.
+        # The convolution pads all sides alike; one more row and column are added here, which takes a copy.
         self.extra = total % 2
         self.conv = nn.Conv2d(
             in_channels, out_channels, size, stride, padding=total // 2, groups=groups, bias=False
