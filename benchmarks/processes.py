@@ -93,7 +93,7 @@ def _write_embeddings(folder: Path) -> Path:
     """Embeddings of the instructions, so that no language model is needed."""
     import torch
 
-    from lerobot_deltaco.policy.language import InstructionTable
+    from lerobot_deltaco.policy.language.instruction_table import InstructionTable
     from lerobot_deltaco.policy.task_file import write_task_file
 
     table = InstructionTable(LANGUAGE_ENCODER)

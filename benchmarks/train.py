@@ -28,7 +28,7 @@ from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
 
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy import language
+from lerobot_deltaco.policy.language import instruction_table
 from lerobot_deltaco.policy.options import BACKBONES
 from lerobot_deltaco.training.frames import FramesInMemory
 from lerobot_deltaco.training.loop import InMemoryTraining
@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None) -> None:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     with (
         tempfile.TemporaryDirectory() as folder,
-        patch.object(language, "load_language_encoder", lambda name: _random_encoder),
+        patch.object(instruction_table, "load_language_encoder", lambda name: _random_encoder),
     ):
         root = Path(folder) / "dataset"
         make_dataset(root)

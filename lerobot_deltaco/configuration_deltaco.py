@@ -14,7 +14,7 @@ from lerobot_deltaco.common.checks import check_choices
 from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.data.feature_names import ACTION_NAMES
 from lerobot_deltaco.lerobot_internals import log_refusals
-from lerobot_deltaco.policy.language_encoders import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.language.encoder_names import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
 from lerobot_deltaco.policy.options import (
     BACKBONES,
     CORRESPONDENCE,
@@ -170,7 +170,7 @@ class DeltacoConfig(PreTrainedConfig):
         known_words: Words of the training tasks, for `pretrained_matching`; filled in by training.
         goal_noise: Standard deviation of the noise on goals in training, in coordinates in which an image's
             edges are at -1 and 1; 0.04 is a pixel of 48.
-        grasp_depth: Whether goals include the depth of the grasp (`policy/goal_states.py`), estimated from
+        grasp_depth: Whether goals include the depth of the grasp (`policy/goals/states.py`), estimated from
             the demonstration and from what the object looks like.
         depth_margin: Depth that is added to the estimate in evaluation, in standard deviations of depths over
             the training episodes. A gripper that closes too high misses flat objects; on a robot, one that

@@ -51,16 +51,17 @@ from lerobot_deltaco.policy.actions import join_action, policy_loss
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder
 from lerobot_deltaco.policy.demonstrations import Demonstrated, DemonstrationSet, RobotData
 from lerobot_deltaco.policy.finite_loss import FiniteLoss, check_weights_to_save
-from lerobot_deltaco.policy.goal_conditioning import FoundGoals
-from lerobot_deltaco.policy.goal_training import GoalTrainer
+from lerobot_deltaco.policy.goals.conditioning import FoundGoals
+from lerobot_deltaco.policy.goals.training import GoalTrainer
+from lerobot_deltaco.policy.goals.words import vocabulary_of
 from lerobot_deltaco.policy.inference import FoldedPolicy
 from lerobot_deltaco.policy.initial_weights import initialize_demo_encoder, initialize_policy
-from lerobot_deltaco.policy.language import InstructionTable
+from lerobot_deltaco.policy.language.instruction_table import InstructionTable
+from lerobot_deltaco.policy.language.paraphrases import Paraphrases
 from lerobot_deltaco.policy.losses import contrastive_logits, contrastive_loss, cosine_loss
 from lerobot_deltaco.policy.memory import keep_freed_memory
 from lerobot_deltaco.policy.networks import random_crop
 from lerobot_deltaco.policy.observations import instructions_of, stacked_images
-from lerobot_deltaco.policy.paraphrases import Paraphrases
 from lerobot_deltaco.policy.precision import autocast, warn_if_emulated
 from lerobot_deltaco.policy.processor_files import check_processor_files
 from lerobot_deltaco.policy.scalars import LoggedScalars
@@ -74,7 +75,6 @@ from lerobot_deltaco.policy.task_file import (
     read_task_file,
     write_task_file,
 )
-from lerobot_deltaco.policy.words import vocabulary_of
 
 
 class DeltacoPolicy(PreTrainedPolicy):

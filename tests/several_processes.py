@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from small_policies import fake_encoder
 
 from lerobot_deltaco.lerobot_internals import run_training_loop
-from lerobot_deltaco.policy import language
+from lerobot_deltaco.policy.language import instruction_table
 from lerobot_deltaco.training.loop import InMemoryTraining
 
 
@@ -50,7 +50,7 @@ def train(name, options, out):
 def main():
     out = Path(sys.argv[1])
     jobs = json.loads((out / "jobs.json").read_text())
-    language.load_language_encoder = fake_encoder
+    instruction_table.load_language_encoder = fake_encoder
     fake_encoder.calls = []
     for number, (name, options, interrupted_at) in enumerate(jobs):
         os.environ["MASTER_PORT"] = str(int(os.environ["FIRST_PORT"]) + 2 * number)

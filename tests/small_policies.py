@@ -9,7 +9,7 @@ from lerobot.policies import make_policy, make_policy_config, make_pre_post_proc
 from torch.utils.data import default_collate
 
 from lerobot_deltaco.modeling import network_factory
-from lerobot_deltaco.policy import language
+from lerobot_deltaco.policy.language import instruction_table
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS
 
 REPO_ID = "test/foreign"
@@ -21,7 +21,7 @@ ACTION_NAMES = ["left.pos", "left_gripper.pos", "right.pos"]
 
 def fake_encoder(name):
     """Unit vectors that depend on nothing but the sentence."""
-    dim = language.LANGUAGE_ENCODERS[name].embedding_dim
+    dim = instruction_table.LANGUAGE_ENCODERS[name].embedding_dim
 
     def encode(sentences):
         fake_encoder.calls.append(list(sentences))
@@ -35,7 +35,7 @@ def fake_encoder(name):
 def use_fake_encoder(monkeypatch):
     """Puts it in the place of all language encoders."""
     fake_encoder.calls = []
-    monkeypatch.setattr(language, "load_language_encoder", fake_encoder)
+    monkeypatch.setattr(instruction_table, "load_language_encoder", fake_encoder)
     torch.manual_seed(0)
 
 

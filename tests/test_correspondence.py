@@ -10,15 +10,15 @@ from small_policies import batch_of, observation, small_policy
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy.calibration import MIN_EPISODES, StateToImage
-from lerobot_deltaco.policy.correspondence import GoalLocator, goal_loss, peak_places
 from lerobot_deltaco.policy.demonstrations import load_demonstrations
-from lerobot_deltaco.policy.goal_states import GoalStates
-from lerobot_deltaco.policy.grasp_depth import DepthEstimator
-from lerobot_deltaco.policy.keyframes import find_keyframes, follows_gripper, release_frames
+from lerobot_deltaco.policy.goals.calibration import MIN_EPISODES, StateToImage
+from lerobot_deltaco.policy.goals.correspondence import GoalLocator, goal_loss, peak_places
+from lerobot_deltaco.policy.goals.grasp_depth import DepthEstimator
+from lerobot_deltaco.policy.goals.keyframes import find_keyframes, follows_gripper, release_frames
+from lerobot_deltaco.policy.goals.recoloring import random_recolorings, recolor
+from lerobot_deltaco.policy.goals.states import GoalStates
+from lerobot_deltaco.policy.goals.training_goals import TrainingGoals
 from lerobot_deltaco.policy.networks import ConditionedPolicy, gaussian_maps
-from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
-from lerobot_deltaco.policy.training_goals import TrainingGoals
 from lerobot_deltaco.training.frames import FramesInMemory
 
 SIZE, LENGTH = 24, 7

@@ -8,10 +8,10 @@ import torch
 from transformers import AutoTokenizer
 
 from gym_deltaco.tasks import TASKS
-from lerobot_deltaco.policy import language, packaged_encoders
-from lerobot_deltaco.policy.language import InstructionTable, load_language_encoder
-from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6
-from lerobot_deltaco.policy.packaged_encoders import LanguageEncoderError
+from lerobot_deltaco.policy.language import instruction_table, packaged_encoders
+from lerobot_deltaco.policy.language.encoder_names import LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6
+from lerobot_deltaco.policy.language.instruction_table import InstructionTable, load_language_encoder
+from lerobot_deltaco.policy.language.packaged_encoders import LanguageEncoderError
 
 INSTRUCTIONS = [task.instruction for task in TASKS]
 
@@ -45,7 +45,7 @@ def test_a_very_long_sentence_is_cut():
 def test_the_encoder_is_loaded_for_new_instructions_alone(monkeypatch):
     table = InstructionTable(MINILM_L3)
     table.put(["wave"], torch.ones(1, 384))
-    monkeypatch.setattr(language, "load_language_encoder", lambda _: pytest.fail("loaded"))
+    monkeypatch.setattr(instruction_table, "load_language_encoder", lambda _: pytest.fail("loaded"))
     assert table(["wave", "wave"], "cpu").shape == (2, 384)
 
 

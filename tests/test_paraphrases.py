@@ -20,7 +20,7 @@ from gym_deltaco.tasks import get_task
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.data.paraphrases import read_paraphrases
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy.paraphrases import Paraphrases
+from lerobot_deltaco.policy.language.paraphrases import Paraphrases
 
 WORDS = {
     TASKS[0]: ["pile up the cups", "cups on cups"],
@@ -202,7 +202,9 @@ def longer_encoder(name):
 def test_instructions_have_unit_length_unless_they_are_wanted_as_they_are(
     make, dataset, monkeypatch, options, length
 ):
-    monkeypatch.setattr("lerobot_deltaco.policy.language.load_language_encoder", longer_encoder)
+    monkeypatch.setattr(
+        "lerobot_deltaco.policy.language.instruction_table.load_language_encoder", longer_encoder
+    )
     policy, before, _ = make(**options)
     embedded = policy._embedder.embed_instructions(TASKS, torch.device("cpu"))
     torch.testing.assert_close(embedded.norm(dim=1), torch.full((3,), float(length)))
@@ -217,7 +219,9 @@ def test_embeddings_of_the_first_version_stay_of_unit_length(make, monkeypatch, 
         tmp_path / "old.safetensors",
         metadata={"language_encoder": "paraphrase-MiniLM-L3-v2", "instructions": '["stack the cups"]'},
     )
-    monkeypatch.setattr("lerobot_deltaco.policy.language.load_language_encoder", longer_encoder)
+    monkeypatch.setattr(
+        "lerobot_deltaco.policy.language.instruction_table.load_language_encoder", longer_encoder
+    )
     policy, _, _ = make(
         method="language_only",
         normalize_language=False,

@@ -46,7 +46,7 @@ from lerobot_deltaco.play.session import Actions, Session
 from lerobot_deltaco.play.videos import LIFETIME, VideoFiles
 from lerobot_deltaco.play.worker import Worker
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
-from lerobot_deltaco.policy.goal_conditioning import FoundGoals
+from lerobot_deltaco.policy.goals.conditioning import FoundGoals
 
 # Two names and a color, each in a container's color and at a place.
 DEMONSTRATED = [TASKS[index].instruction for index in (4, 15, 36, 204)]

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import pytest
 from test_play import DATASET_TASKS, DEMONSTRATED, save_policy, write_dataset
 
-from lerobot_deltaco.policy.language_encoders import MINILM_L3
+from lerobot_deltaco.policy.language.encoder_names import MINILM_L3
 
 playwright = pytest.importorskip("playwright.sync_api", reason="Playwright's Python package is not installed")
 pytest.importorskip("gradio", reason="the extra `play` is not installed")

@@ -25,7 +25,7 @@ from lerobot_deltaco.cards.policy_card import MAX_TASKS_LISTED, METHOD_TEXTS, po
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
-from lerobot_deltaco.policy.language import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.language.instruction_table import LANGUAGE_ENCODERS
 from lerobot_deltaco.policy.options import METHODS
 
 POLICY_ID = f"{USER}/policy"

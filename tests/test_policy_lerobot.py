@@ -31,8 +31,8 @@ from small_policies import (
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy import language
-from lerobot_deltaco.policy.language import InstructionTable
+from lerobot_deltaco.policy.language import instruction_table
+from lerobot_deltaco.policy.language.instruction_table import InstructionTable
 
 pytestmark = pytest.mark.usefixtures("fake_language")
 
@@ -223,7 +223,7 @@ def test_threads_embed_instructions_without_mixing_them_up(monkeypatch):
         time.sleep(0.01)
         return encode(sentences)
 
-    monkeypatch.setattr(language, "load_language_encoder", lambda _: slowly)
+    monkeypatch.setattr(instruction_table, "load_language_encoder", lambda _: slowly)
     table = InstructionTable("all-MiniLM-L6-v2")
     asked = [[f"task {n // 2}"] for n in range(16)]
     with ThreadPoolExecutor(8) as pool:

@@ -14,13 +14,13 @@ from test_correspondence import random_moves, table_dataset
 from lerobot_deltaco.commands import match
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy.correspondence import peak_places
-from lerobot_deltaco.policy.efficientnet_lite import COARSE_CHANNELS, FINE_CHANNELS, EfficientNetLite
-from lerobot_deltaco.policy.goal_conditioning import Demonstrations, GoalConditioning
-from lerobot_deltaco.policy.matching_fit import fit_matching
-from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
+from lerobot_deltaco.policy.goals.conditioning import Demonstrations, GoalConditioning
+from lerobot_deltaco.policy.goals.correspondence import peak_places
+from lerobot_deltaco.policy.goals.efficientnet_lite import COARSE_CHANNELS, FINE_CHANNELS, EfficientNetLite
+from lerobot_deltaco.policy.goals.matching_fit import fit_matching
+from lerobot_deltaco.policy.goals.pretrained_matching import PretrainedMatching
+from lerobot_deltaco.policy.goals.words import KnownWords, known_words, vocabulary_of
 from lerobot_deltaco.policy.vision import load_efficientnet_lite0
-from lerobot_deltaco.policy.words import KnownWords, known_words, vocabulary_of
 
 pytestmark = pytest.mark.usefixtures("fake_language")
 
@@ -173,7 +173,7 @@ def test_words_are_known_or_not():
 
 
 def test_only_so_many_episodes_are_fitted_to(published, examples, monkeypatch):
-    monkeypatch.setattr("lerobot_deltaco.policy.matching_fit._MAX_EPISODES", 6)
+    monkeypatch.setattr("lerobot_deltaco.policy.goals.matching_fit._MAX_EPISODES", 6)
     matching, seen = new_matching(published), []
     encode = matching.encode
     monkeypatch.setattr(matching, "encode", lambda images: seen.append(len(images)) or encode(images))
@@ -256,7 +256,7 @@ def test_an_instruction_with_unknown_words_counts_only_without_a_demonstration()
 @pytest.fixture
 def short_fit(monkeypatch):
     """A fit of two steps, where what it learns does not matter."""
-    monkeypatch.setattr("lerobot_deltaco.policy.matching_fit.fit_matching.__defaults__", (2,))
+    monkeypatch.setattr("lerobot_deltaco.policy.goals.matching_fit.fit_matching.__defaults__", (2,))
 
 
 @pytest.mark.usefixtures("short_fit")

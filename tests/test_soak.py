@@ -32,7 +32,7 @@ from small_policies import (
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.common.typed_fields import type_hints
 from lerobot_deltaco.evaluation.record import read_record, record_path
-from lerobot_deltaco.policy.calibration import MIN_EPISODES
+from lerobot_deltaco.policy.goals.calibration import MIN_EPISODES
 from lerobot_deltaco.policy.options import METHODS
 from lerobot_deltaco.policy.task_file import TaskFile, write_task_file
 

@@ -31,11 +31,12 @@ from transformers import (
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy import language, vision
+from lerobot_deltaco.policy import vision
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures, Variants
 from lerobot_deltaco.policy.heads import UnitHead
-from lerobot_deltaco.policy.language_encoders import CLIP, LanguageEncoderSpec
+from lerobot_deltaco.policy.language import instruction_table
+from lerobot_deltaco.policy.language.encoder_names import CLIP, LanguageEncoderSpec
 from lerobot_deltaco.policy.precision import autocast
 from lerobot_deltaco.policy.vision import VisionEncoderError, load_vision_encoder, r3m_weights, square
 
@@ -218,9 +219,9 @@ def test_clips_language_transformer_is_a_language_encoder(folders, monkeypatch, 
     PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", unk_token="<unk>").save_pretrained(
         tmp_path
     )
-    table = {**language.LANGUAGE_ENCODERS, CLIP: LanguageEncoderSpec(str(tmp_path), 8)}
-    monkeypatch.setattr(language, "LANGUAGE_ENCODERS", table)
-    encode = language.load_language_encoder(CLIP)
+    table = {**instruction_table.LANGUAGE_ENCODERS, CLIP: LanguageEncoderSpec(str(tmp_path), 8)}
+    monkeypatch.setattr(instruction_table, "LANGUAGE_ENCODERS", table)
+    encode = instruction_table.load_language_encoder(CLIP)
     embeddings = encode(["put it there", "it there put", "put " * 200])
     assert embeddings.shape == (3, 8)
     assert embeddings.isfinite().all()

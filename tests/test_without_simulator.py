@@ -19,10 +19,10 @@ from lerobot_deltaco.commands import collect
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy import language
+from lerobot_deltaco.policy.language import instruction_table
 from lerobot_deltaco.training.frames import FramesInMemory
 
-language.load_language_encoder, fake_encoder.calls = fake_encoder, []
+instruction_table.load_language_encoder, fake_encoder.calls = fake_encoder, []
 folder = sys.argv[1]
 dataset = write_dataset(f"{folder}/foreign", [task for task in TASKS for _ in range(2)])
 policy, before, after = small_policy(dataset, demo_repo_id="test/foreign", demo_root=f"{folder}/foreign")

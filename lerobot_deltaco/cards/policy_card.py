@@ -16,7 +16,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_deltaco.cards.templates import env_options, render
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.language.encoder_names import LANGUAGE_ENCODERS
 from lerobot_deltaco.policy.options import Conditioning
 from lerobot_deltaco.policy.training_episodes import kept_episodes
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS

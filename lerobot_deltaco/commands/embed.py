@@ -9,7 +9,7 @@ from pathlib import Path
 from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.commands.command_errors import exit_on_error
-from lerobot_deltaco.policy.language_encoders import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.language.encoder_names import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -24,7 +24,7 @@ def main(arguments: list[str] | None = None) -> None:
     except (ValueError, OSError) as error:
         parser.error(str(error))
     # Only here, since they take seconds to import.
-    from lerobot_deltaco.policy.language import InstructionTable, LanguageEncoderError
+    from lerobot_deltaco.policy.language.instruction_table import InstructionTable, LanguageEncoderError
     from lerobot_deltaco.policy.task_file import write_task_file
 
     table = InstructionTable(options.language_encoder)

@@ -6,7 +6,7 @@ from draccus.utils import ParsingError
 
 from lerobot_deltaco.lerobot_internals import UnsupportedLeRobotError
 from lerobot_deltaco.policy.finite_loss import TrainingDivergedError
-from lerobot_deltaco.policy.language import LanguageEncoderError
+from lerobot_deltaco.policy.language.instruction_table import LanguageEncoderError
 from lerobot_deltaco.policy.vision import VisionEncoderError
 from lerobot_deltaco.training.loop import reason_of, train
 from lerobot_deltaco.training.remote_job import RemoteJobError

@@ -29,7 +29,7 @@ from lerobot_deltaco.evaluation.recording_env import RecordingVectorEnv
 from lerobot_deltaco.evaluation.simulators import Simulators
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import Demonstrated
-from lerobot_deltaco.policy.goal_conditioning import FoundGoals
+from lerobot_deltaco.policy.goals.conditioning import FoundGoals
 from lerobot_deltaco.policy.task_conditioning import DemonstrationTurn
 
 PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from gym_deltaco.sheets import GAP, across, caption, down, to_image
-from lerobot_deltaco.policy.goal_conditioning import FoundGoals
+from lerobot_deltaco.policy.goals.conditioning import FoundGoals
 
 # Colors that no object and no container of the benchmark has.
 GRASP_COLOR, RELEASE_COLOR = (255, 0, 200), (0, 220, 255)

@@ -14,8 +14,8 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, kept_frame_indices
 from lerobot_deltaco.policy.finite_loss import non_finite_weight
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures
-from lerobot_deltaco.policy.language import InstructionTable
-from lerobot_deltaco.policy.paraphrases import Paraphrases
+from lerobot_deltaco.policy.language.instruction_table import InstructionTable
+from lerobot_deltaco.policy.language.paraphrases import Paraphrases
 from lerobot_deltaco.policy.task_file import (
     StoredDemonstrations,
     TaskFile,

@@ -9,7 +9,7 @@ from torch import Tensor
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.policy.demonstration_choice import choose_episode, choose_eval_demonstrations
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
-from lerobot_deltaco.policy.paraphrases import Paraphrases
+from lerobot_deltaco.policy.language.paraphrases import Paraphrases
 
 
 def choose_demonstrations(

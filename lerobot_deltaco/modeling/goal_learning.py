@@ -12,17 +12,17 @@ from torch import Tensor
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling.task_embedding import TaskEmbedder
-from lerobot_deltaco.policy.correspondence import Given
 from lerobot_deltaco.policy.demonstration_choice import goal_demonstrations
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, RobotData
-from lerobot_deltaco.policy.goal_conditioning import FoundGoals, GoalConditioning
-from lerobot_deltaco.policy.goal_training import GoalBatch, GoalInputs, GoalTrainer, draw_given
-from lerobot_deltaco.policy.matching_fit import fit_matching
+from lerobot_deltaco.policy.goals.conditioning import FoundGoals, GoalConditioning
+from lerobot_deltaco.policy.goals.correspondence import Given
+from lerobot_deltaco.policy.goals.matching_fit import fit_matching
+from lerobot_deltaco.policy.goals.pretrained_matching import PretrainedMatching
+from lerobot_deltaco.policy.goals.recoloring import random_recolorings
+from lerobot_deltaco.policy.goals.training import GoalBatch, GoalInputs, GoalTrainer, draw_given
+from lerobot_deltaco.policy.goals.words import KnownWords, known_words
 from lerobot_deltaco.policy.precision import autocast
-from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
-from lerobot_deltaco.policy.recoloring import random_recolorings
 from lerobot_deltaco.policy.vision import load_efficientnet_lite0
-from lerobot_deltaco.policy.words import KnownWords, known_words
 
 _LOSSES = ("grasp_loss", "release_loss", "depth_loss", "attention_loss")
 

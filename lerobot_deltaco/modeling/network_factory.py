@@ -9,14 +9,14 @@ import torch
 from torch import nn
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.policy.correspondence import GoalLocator
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder, AttentionEncoder
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures, Variants
-from lerobot_deltaco.policy.goal_conditioning import GoalConditioning
+from lerobot_deltaco.policy.goals.conditioning import GoalConditioning
+from lerobot_deltaco.policy.goals.correspondence import GoalLocator
+from lerobot_deltaco.policy.goals.pretrained_matching import PretrainedMatching
 from lerobot_deltaco.policy.heads import UnitHead
 from lerobot_deltaco.policy.networks import ConditionedPolicy
 from lerobot_deltaco.policy.options import BACKBONES, GOAL_SOURCES
-from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
 from lerobot_deltaco.policy.vision import load_vision_encoder
 
 

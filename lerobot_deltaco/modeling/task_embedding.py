@@ -13,8 +13,8 @@ from lerobot_deltaco.policy.demo_encoders import crop_demonstrations
 from lerobot_deltaco.policy.demonstration_choice import choose_training_demonstrations
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures
-from lerobot_deltaco.policy.language import InstructionTable
-from lerobot_deltaco.policy.paraphrases import Paraphrases
+from lerobot_deltaco.policy.language.instruction_table import InstructionTable
+from lerobot_deltaco.policy.language.paraphrases import Paraphrases
 
 
 class TaskEmbedder:

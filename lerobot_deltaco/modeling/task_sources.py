@@ -16,8 +16,8 @@ from lerobot_deltaco.policy.demonstrations import (
     load_demonstrations,
     load_robot_data,
 )
-from lerobot_deltaco.policy.keyframes import find_keyframes
-from lerobot_deltaco.policy.paraphrases import Paraphrases
+from lerobot_deltaco.policy.goals.keyframes import find_keyframes
+from lerobot_deltaco.policy.language.paraphrases import Paraphrases
 from lerobot_deltaco.policy.training_episodes import training_episodes
 
 logger = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.videos import write_episode_video
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, kept_frame_indices, resize_images
-from lerobot_deltaco.policy.keyframes import find_keyframes
+from lerobot_deltaco.policy.goals.keyframes import find_keyframes
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,8 @@ from lerobot_deltaco.play.demonstrations import (
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.play.modalities import BOTH, DEMONSTRATION_ALONE, INSTRUCTION_ALONE, using
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
-from lerobot_deltaco.policy.goal_conditioning import FoundGoals
-from lerobot_deltaco.policy.language import LanguageEncoderError
+from lerobot_deltaco.policy.goals.conditioning import FoundGoals
+from lerobot_deltaco.policy.language.instruction_table import LanguageEncoderError
 
 MAX_SEED = 2**32 - 1
 MAX_SENTENCE = 200  # characters

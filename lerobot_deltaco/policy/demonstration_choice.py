@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
-from lerobot_deltaco.policy.goal_conditioning import Demonstrations, GoalConditioning
+from lerobot_deltaco.policy.goals.conditioning import Demonstrations, GoalConditioning
 
 
 def choose_training_demonstrations(

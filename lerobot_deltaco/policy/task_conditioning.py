@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torch import Tensor, nn
 
 from lerobot_deltaco.policy.demonstrations import Demonstrated
-from lerobot_deltaco.policy.goal_conditioning import FoundGoals
+from lerobot_deltaco.policy.goals.conditioning import FoundGoals
 
 
 class DemonstrationTurn(NamedTuple):

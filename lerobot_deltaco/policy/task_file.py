@@ -20,7 +20,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lerobot_deltaco.common.typed_fields import is_a
-from lerobot_deltaco.policy.language_encoders import LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.language.encoder_names import LANGUAGE_ENCODERS
 
 TASK_FILE = "tasks.safetensors"
 _DOWNLOAD_OPTIONS = ("revision", "cache_dir", "token", "local_files_only", "force_download")

@@ -14,9 +14,9 @@ from lerobot_deltaco.common.run_folder import TRAIN_CONFIG
 from lerobot_deltaco.modeling.goal_learning import fit_pretrained_matching
 from lerobot_deltaco.modeling.task_sources import read_eval_demonstrations
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching
+from lerobot_deltaco.policy.goals.pretrained_matching import PretrainedMatching
+from lerobot_deltaco.policy.goals.words import vocabulary_of
 from lerobot_deltaco.policy.training_episodes import kept_episodes
-from lerobot_deltaco.policy.words import vocabulary_of
 
 
 def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, seed: int) -> int:

@@ -30,7 +30,7 @@ from lerobot_deltaco.policy.demonstrations import (
     shorter_side,
     to_uint8,
 )
-from lerobot_deltaco.policy.keyframes import release_frames
+from lerobot_deltaco.policy.goals.keyframes import release_frames
 
 # Rows that are decoded at a time, and those of them that a thread takes at a time.
 CHUNK, PART = 1024, 32

@@ -3,7 +3,7 @@ r"""Matching by pretrained features (ours): finds what a task asks for by featur
 A network that learns from a few hundred objects compares them by color: among objects of one color, it picks
 nearly at random. The features of a network that was trained on photographs tell shapes apart, too. They are
 frozen; only their weighting is learned, by linear layers, which have too few weights to learn the training
-objects by heart. `policy/matching_fit.py` fits them before a training, or for a trained policy.
+objects by heart. `policy/goals/matching_fit.py` fits them before a training, or for a trained policy.
 
     demonstration's first image     scene                     instruction
             |                         |                            |
@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.policy.efficientnet_lite import (
+from lerobot_deltaco.policy.goals.efficientnet_lite import (
     COARSE_CHANNELS,
     COARSE_STRIDE,
     FINE_CHANNELS,

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lerobot_deltaco.policy.calibration import StateToImage
-from lerobot_deltaco.policy.keyframes import find_keyframes
+from lerobot_deltaco.policy.goals.calibration import StateToImage
+from lerobot_deltaco.policy.goals.keyframes import find_keyframes
 
 logger = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lerobot_deltaco.policy.calibration import StateToImage
-from lerobot_deltaco.policy.training_goals import TrainingGoals
+from lerobot_deltaco.policy.goals.calibration import StateToImage
+from lerobot_deltaco.policy.goals.training_goals import TrainingGoals
 
 _N_PLACE_FEATURES = 10
 _N_DEPTH_FEATURES = 3  # of the first of those: 1, x, y

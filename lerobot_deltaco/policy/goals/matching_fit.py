@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_deltaco.policy.correspondence import goal_loss
+from lerobot_deltaco.policy.goals.correspondence import goal_loss
+from lerobot_deltaco.policy.goals.pretrained_matching import ImageMaps, PretrainedMatching
 from lerobot_deltaco.policy.memory import keep_freed_memory
-from lerobot_deltaco.policy.pretrained_matching import ImageMaps, PretrainedMatching
 
 # Tried on validation tasks (docs/experiment-log.md): more steps and other regularization change nothing.
 _STEPS = 600

@@ -9,14 +9,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lerobot_deltaco.policy.calibration import StateToImage
-from lerobot_deltaco.policy.correspondence import Given
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, RobotData, resize_images
-from lerobot_deltaco.policy.goal_conditioning import Demonstrations, GoalConditioning
-from lerobot_deltaco.policy.keyframes import follows_gripper
+from lerobot_deltaco.policy.goals.calibration import StateToImage
+from lerobot_deltaco.policy.goals.conditioning import Demonstrations, GoalConditioning
+from lerobot_deltaco.policy.goals.correspondence import Given
+from lerobot_deltaco.policy.goals.keyframes import follows_gripper
+from lerobot_deltaco.policy.goals.recoloring import random_recolorings, recolor
+from lerobot_deltaco.policy.goals.training_goals import TrainingGoals, find_training_goals
 from lerobot_deltaco.policy.networks import random_shifts, shift_images
-from lerobot_deltaco.policy.recoloring import random_recolorings, recolor
-from lerobot_deltaco.policy.training_goals import TrainingGoals, find_training_goals
 
 _RESIZED_AT_A_TIME = 256
 

@@ -1,4 +1,4 @@
-"""The frozen sentence encoders that a policy can use. `policy/language.py` loads them."""
+"""The frozen sentence encoders that a policy can use. `policy/language/instruction_table.py` loads them."""
 
 from types import MappingProxyType
 from typing import NamedTuple

@@ -14,8 +14,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lerobot_deltaco.policy.language_encoders import CLIP, LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6
-from lerobot_deltaco.policy.packaged_encoders import LanguageEncoderError, packaged_l3, packaged_l6
+from lerobot_deltaco.policy.language.encoder_names import CLIP, LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6
+from lerobot_deltaco.policy.language.packaged_encoders import LanguageEncoderError, packaged_l3, packaged_l6
 from lerobot_deltaco.policy.task_file import TaskFile, read_task_file
 
 BATCH_SIZE = 64

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.policy.correspondence import (
+from lerobot_deltaco.policy.goals.correspondence import (
     GOALS,
     Description,
     Given,
@@ -16,10 +16,10 @@ from lerobot_deltaco.policy.correspondence import (
     goal_loss,
     peak_places,
 )
-from lerobot_deltaco.policy.goal_states import GoalStates
-from lerobot_deltaco.policy.grasp_depth import DepthEstimator
-from lerobot_deltaco.policy.pretrained_matching import PretrainedMatching, log_probabilities
-from lerobot_deltaco.policy.words import KnownWords
+from lerobot_deltaco.policy.goals.grasp_depth import DepthEstimator
+from lerobot_deltaco.policy.goals.pretrained_matching import PretrainedMatching, log_probabilities
+from lerobot_deltaco.policy.goals.states import GoalStates
+from lerobot_deltaco.policy.goals.words import KnownWords
 
 # Standard deviation of the error of depths by looks on novel objects; depths have a standard deviation of 1.
 LOOKS_STD = 0.7

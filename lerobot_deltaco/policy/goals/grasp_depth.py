@@ -1,6 +1,6 @@
 """Estimates how deep to grasp, from the depth in the demonstration and from the looks of the object.
 
-Depths are those of `policy/goal_states.py`. If the demonstration moved the same object, its depth is the
+Depths are those of `policy/goals/states.py`. If the demonstration moved the same object, its depth is the
 right one. If it moved another object of that color or shape, the looks of the object in the scene are a
 better guide. So two estimates are averaged, weighted by the inverse of their variances. The variance of the
 estimate from the demonstration is learned, from the kind of instruction and from how similar both objects

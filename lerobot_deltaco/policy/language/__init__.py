@@ -1,0 +1,1 @@
+"""Instructions as embeddings: frozen sentence encoders, and sentences that people wrote."""
