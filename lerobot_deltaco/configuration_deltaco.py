@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
@@ -24,6 +25,7 @@ from lerobot_deltaco.policy.options import (
     ENCODER_LOSSES,
     FRAMES_BETWEEN,
     GOAL_SOURCES,
+    GRIPPER_CLOSED,
     GRIPPER_LOSSES,
     INITIAL_WEIGHTS,
     INPUTS,
@@ -148,6 +150,8 @@ class DeltacoConfig(PreTrainedConfig):
             motions that are equally good; of several, the policy takes the likeliest.
         gripper: Gripper's dimension of the action: an index, "auto" (the last one whose name contains
             "gripper", if any) or "none".
+        gripper_closed: Which values of the gripper's dimension mean closed: low or high. Grasps and releases
+            are found by them.
         gripper_loss: Loss of the gripper: squared_error, or cross_entropy (ours).
         gripper_weight: Weight of the gripper loss in the policy loss; by default 30, or 3 for cross_entropy.
         encoder_loss_weight: Weight of the encoder loss, alpha_d in the paper's equation 3.
@@ -248,6 +252,7 @@ class DeltacoConfig(PreTrainedConfig):
     backbone: str = "paper"
     motion_modes: int = 1
     gripper: str = "auto"
+    gripper_closed: str = "low"
     gripper_loss: str = "squared_error"
     gripper_weight: float | None = None
     encoder_loss_weight: float = 10.0
@@ -324,6 +329,7 @@ class DeltacoConfig(PreTrainedConfig):
             demo_frames_between=FRAMES_BETWEEN,
             initial_weights=INITIAL_WEIGHTS,
             backbone=BACKBONES,
+            gripper_closed=GRIPPER_CLOSED,
             gripper_loss=GRIPPER_LOSSES,
             scheduler_name=SCHEDULERS,
             dtype=DTYPES,
@@ -570,6 +576,11 @@ class DeltacoConfig(PreTrainedConfig):
     def gripper_index(self) -> int | None:
         """Dimension of the action that is the gripper, once it is known; None is none."""
         return int(self.gripper) if self.gripper.isdecimal() else None
+
+    def gripper_opening(self, actions: Any) -> Any:
+        """The gripper's commands in actions (frames, action), so that greater is more open, (frames,)."""
+        command = actions[:, self.gripper_index]
+        return command if self.gripper_closed == "low" else -command
 
     def resolve(self, dataset_features: dict[str, dict] | None) -> None:
         """Decides what the training dataset tells: which dimension is the gripper, how actions are scaled.

@@ -1,5 +1,7 @@
 """Conditioning by correspondence: keyframes, calibration, recoloring, the locator, and the policy."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -351,8 +353,31 @@ def test_frames_in_memory_give_the_same_goals(policy, dataset):
     )
 
 
+def test_large_values_of_the_gripper_may_mean_closed(dataset, caplog):
+    frames = FramesInMemory(dataset)
+    demonstrations = frames.demonstrations("observation.image", SIZE, 2)
+    robot = frames.robot_data()
+    inverted = robot._replace(actions=robot.actions * torch.tensor([1, 1, -1]))
+
+    def goals_of(data, **options):
+        caplog.clear()
+        policy, _, _ = small_policy(dataset, **CORRESPONDENCE, **options)
+        policy.set_train_demonstrations(copy.deepcopy(demonstrations), data)
+        return policy.goal_trainer.goals
+
+    goals = goals_of(robot)
+    assert not caplog.records
+    assert torch.equal(goals_of(inverted, gripper_closed="high").states, goals.states)
+    assert not caplog.records
+    # In the wrong direction, the end of the approach looks like a release.
+    assert not torch.equal(goals_of(inverted).states, goals.states)
+    assert "closed at the beginning of 60 of 60 episodes" in caplog.text
+    assert "--policy.gripper_closed" in caplog.text
+
+
 def test_frames_until_the_release_are_those_that_are_trained_on(dataset):
-    use = FramesInMemory(dataset).until_release(2, 0).reshape(-1, LENGTH)
+    frames = FramesInMemory(dataset)
+    use = frames.until_release(frames.columns["action"][:, 2], 0).reshape(-1, LENGTH)
     assert (use == [True] * 6 + [False]).all()
 
 

@@ -272,7 +272,7 @@ from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 
 root, policy_id = Path(sys.argv[1]), sys.argv[2]
 fake_encoder.calls = []
-language.load_language_encoder = fake_encoder
+instruction_table.load_language_encoder = fake_encoder
 dataset = write_dataset(root / "train", [*TASKS, *TASKS])
 demos = write_dataset(root / "demos", [*TASKS, "juggle"])
 policy, before, after = small_policy(

@@ -31,13 +31,13 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.scripts import lerobot_record, lerobot_rollout, lerobot_train
-from small_policies import fake_encoder, language
+from small_policies import fake_encoder, instruction_table
 
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 
 commands, folder, task = json.loads(sys.argv[1]), sys.argv[2], sys.argv[3]
 fake_encoder.calls = []
-language.load_language_encoder = fake_encoder
+instruction_table.load_language_encoder = fake_encoder
 for name, *words in commands:
     module = {"record": lerobot_record, "rollout": lerobot_rollout, "train": lerobot_train}[name]
     FakeArm.sent.clear()

@@ -15,7 +15,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="deltaco-demo",
         description="Collects episodes, trains a policy on them with deltaco-train and evaluates it with "
-        "lerobot-eval, in 5 to 7 minutes on two idle cores. After an interruption, the same command "
+        "lerobot-eval, in about 5 minutes on two idle cores. After an interruption, the same command "
         "continues.",
     )
     parser.add_argument(

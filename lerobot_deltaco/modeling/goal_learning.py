@@ -96,8 +96,8 @@ def fit_goals(
         normalized = step(create_transition(observation={OBS_STATE: states.cpu()}))
         return normalized[TransitionKey.OBSERVATION][OBS_STATE]
 
-    assert config.gripper_index is not None
-    trainer = GoalTrainer(goals, demonstrations, robot_data, config.gripper_index, normalize)
+    gripper = config.gripper_opening(robot_data.actions)
+    trainer = GoalTrainer(goals, demonstrations, robot_data, gripper, normalize)
     states, found = trainer.goals.states[:, 0], trainer.goals.found
     demonstrations.grasp_states = torch.where(found[:, None], states, torch.nan)
     if goals.matching is not None and not goals.matching.fitted:

@@ -98,10 +98,9 @@ def read_eval_demonstrations(
     if repo_id is None:
         return None
     demonstrations = read_demonstrations(config, repo_id, root, episodes)
-    index = config.gripper_index
-    if config.locates_goals and config.grasp_depth and index is not None:
+    if config.locates_goals and config.grasp_depth and config.gripper_index is not None:
         data = load_robot_data(repo_id, root, demonstrations.episodes.tolist())
-        keyframes = find_keyframes(data.states, data.actions[:, index], data.spans)
+        keyframes = find_keyframes(data.states, config.gripper_opening(data.actions), data.spans)
         demonstrations.grasp_states = keyframes.grasp_states
     return demonstrations
 

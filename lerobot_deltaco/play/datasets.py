@@ -156,7 +156,7 @@ class EpisodeDataset:
         states, actions = (
             torch.stack([item[name] for item in items]).float() for name in (OBS_STATE, ACTION)
         )
-        return states, actions[:, config.gripper_index]
+        return states, config.gripper_opening(actions)
 
     def _unreadable(self, error: Exception) -> PlayError:
         # The details, which name files of this machine, are for the terminal.

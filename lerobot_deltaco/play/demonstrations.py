@@ -89,8 +89,8 @@ def demonstration_of(
     Args:
         title: Description for the page.
         images: Images of the camera, (frames, 3, H, W), uint8.
-        robot: States of the robot, (frames, state), and commands of its gripper, (frames,); None if the
-            policy does without.
+        robot: States of the robot, (frames, state), and commands of its gripper, greater for more open,
+            (frames,); None if the policy does without.
         config: The policy's.
         video_images: Images for people, (H, W, 3) each.
         fps: Frames per second.

@@ -56,6 +56,7 @@ BACKBONES = MappingProxyType(
 CORRESPONDENCE = "correspondence"
 DEMO_ENCODERS = ("cnn", "attention", CORRESPONDENCE, "pretrained")
 GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
+GRIPPER_CLOSED = ("low", "high")
 MODALITIES = ("demo", "instruction")
 DEMO_CROPS = ("array", "frame")
 FRAMES_BETWEEN = ("spread", "any")

@@ -164,30 +164,21 @@ class FramesInMemory:
 
     def robot_data(self) -> RobotData:
         """The robot's states and actions in all frames."""
-        spans = [self.spans[episode] for episode in self.spans]
-        return RobotData(self.columns[OBS_STATE], self.columns[ACTION], spans)
+        return RobotData(self.columns[OBS_STATE], self.columns[ACTION], list(self.spans.values()))
 
-    def until_release(self, gripper_index: int | None, n_after: int) -> NDArray[np.bool_]:
+    def until_release(self, gripper: Tensor, n_after: int) -> NDArray[np.bool_]:
         """Which frames come before the gripper's last opening in their episode, or soon after it.
 
         Args:
-            gripper_index: The gripper's dimension of the action.
+            gripper: Commands to the gripper in all frames, greater for more open, (frames,).
             n_after: Number of frames after the opening that count as well.
 
         Returns:
             (frames,) bool. All frames of an episode without an opening count.
-
-        Raises:
-            ValueError: There is no gripper.
         """
-        if gripper_index is None:
-            raise ValueError(
-                "`frames_after_release` needs a gripper among the action's dimensions, which `gripper` names."
-            )
-        data = self.robot_data()
-        releases = release_frames(data.actions[:, gripper_index], data.spans)
+        spans = list(self.spans.values())
         use = np.ones(len(self), dtype=bool)
-        for release, (_, last) in zip(releases, data.spans, strict=True):
+        for release, (_, last) in zip(release_frames(gripper, spans), spans, strict=True):
             if release is not None:
                 use[release + 1 + n_after : last + 1] = False
         return use

@@ -25,6 +25,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
@@ -225,7 +226,13 @@ class InMemoryTraining:
         use = np.zeros(len(tasks), dtype=bool)
         use[stock.indices] = True
         if config.frames_after_release is not None:
-            use &= self._frames.until_release(config.gripper_index, config.frames_after_release)
+            if config.gripper_index is None:
+                raise ValueError(
+                    "`frames_after_release` needs a gripper among the action's dimensions, which `gripper` "
+                    "names."
+                )
+            gripper = config.gripper_opening(self._frames.columns[ACTION])
+            use &= self._frames.until_release(gripper, config.frames_after_release)
         upsampled = []
         if config.upsampled_tasks is not None:
             names = self._frames.task_names

@@ -40,7 +40,7 @@ def find_keyframes(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, i
 
     Args:
         states: Robot states of all frames, (frames, state).
-        gripper: Commands of the gripper in all frames, (frames,).
+        gripper: Commands to the gripper in all frames, greater for more open, (frames,).
         spans: First and last frame of each episode.
 
     Returns:
@@ -69,6 +69,12 @@ def release_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[in
     """The frame of each episode in which the gripper opens for the last time; None without any."""
     closed = _is_closed(gripper)
     return [_last_opening(closed, span) for span in spans]
+
+
+def starts_closed(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> int:
+    """Number of episodes in whose first frame the gripper is to be closed."""
+    closed = _is_closed(gripper)
+    return sum(closed[first] for first, _ in spans)
 
 
 def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Tensor:

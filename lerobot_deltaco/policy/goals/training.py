@@ -77,7 +77,7 @@ class GoalTrainer:
         conditioning: Networks that are taught; their states at goals are fitted at once.
         demonstrations: The training episodes.
         robot_data: States and actions of the robot in them.
-        gripper_index: The gripper's dimension of the action.
+        gripper: Commands to the gripper in all frames, greater for more open, (frames,).
         normalize: Normalizes robot states (n, state) as the policy's input, by scaling and shifting each
             dimension.
 
@@ -90,13 +90,13 @@ class GoalTrainer:
         conditioning: GoalConditioning,
         demonstrations: DemonstrationSet,
         robot_data: RobotData,
-        gripper_index: int,
+        gripper: Tensor,
         normalize: Callable[[Tensor], Tensor],
     ) -> None:
         self._conditioning, self._demonstrations = conditioning, demonstrations
         frames, device = demonstrations.frames, demonstrations.frames.device
         states = robot_data.states.to(device)
-        gripper = robot_data.actions[:, gripper_index].to(device)
+        gripper = gripper.to(device)
         to_image = conditioning.states.to_image
         if to_image is None:
             to_image = StateToImage(states.shape[1]).to(device)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lerobot_deltaco.policy.goals.calibration import StateToImage
-from lerobot_deltaco.policy.goals.keyframes import find_keyframes
+from lerobot_deltaco.policy.goals.keyframes import find_keyframes, starts_closed
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ def find_training_goals(
         first: First images of the episodes, (episodes, 3, H, W) uint8.
         last: Last images of the episodes, (episodes, 3, H, W) uint8.
         states: Robot states of all frames, (frames, state).
-        gripper: Commands to the gripper in all frames, (frames,).
+        gripper: Commands to the gripper in all frames, greater for more open, (frames,).
         spans: First and last frame of each episode.
 
     Raises:
@@ -63,6 +63,15 @@ def find_training_goals(
             "The gripper does not close and open again in %d of %d episodes; their goals are not learned.",
             int((~found).sum()),
             len(found),
+        )
+    n_closed = starts_closed(gripper, spans)
+    if n_closed > len(spans) / 2:
+        logger.warning(
+            "The gripper is closed at the beginning of %d of %d episodes. If these values mean that it is "
+            "open, grasps and releases are mistaken for each other: set --policy.gripper_closed to the other "
+            "of low and high.",
+            n_closed,
+            len(spans),
         )
     to_image.fit(first[found], last[found], keyframes.states[found, 0])
     places = to_image(keyframes.states).clamp(-1, 1)
