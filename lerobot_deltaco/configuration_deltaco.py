@@ -363,6 +363,11 @@ class DeltacoConfig(PreTrainedConfig):
                 "A demonstration has its first and its last frame: `demo_rows` * `demo_columns` must be "
                 f"at least 2. Got {self.n_demo_frames}."
             )
+        if self.n_demonstrations > 1 and self.demo_episode is not None:
+            raise ValueError(
+                "`demo_episode` names a single demonstration, but `n_demonstrations` is "
+                f"{self.n_demonstrations}. Leave one of the two out."
+            )
         self._check_upsampling()
         self._check_conditioning()
         self._check_dropout()
@@ -449,6 +454,11 @@ class DeltacoConfig(PreTrainedConfig):
         if self.goal_image_size is not None:
             raise ValueError(
                 f"`goal_image_size` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that one."
+            )
+        if self.n_demonstrations > 1:
+            raise ValueError(
+                f"`n_demonstrations` is for `demo_encoder={CORRESPONDENCE}`, which combines demonstrations. "
+                f"Leave it out, or choose that one. Got {self.n_demonstrations}."
             )
         if self.pretrained_matching:
             raise ValueError(

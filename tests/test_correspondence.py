@@ -696,6 +696,8 @@ def test_several_demonstrations_are_combined(dataset):
         ({"recolor_share": 1.5}, "`recolor_share` must be at most 1"),
         ({"locator_share": 0.0}, "`locator_share` must be at least 1e-06"),
         ({"n_demonstrations": 0}, "`n_demonstrations` must be at least 1"),
+        ({"n_demonstrations": 5, "demo_episode": 0}, "names a single demonstration, .* is 5"),
+        ({"gripper_closed": "open"}, "`gripper_closed` must be one of low, high"),
         ({"color_blind_tasks": "("}, "`color_blind_tasks` must be a regular expression"),
         ({"depth_margin": float("nan")}, "`depth_margin` must be a finite number"),
         ({"frames_after_release": -1}, "`frames_after_release` must be at least 0"),
