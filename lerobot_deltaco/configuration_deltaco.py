@@ -366,7 +366,7 @@ class DeltacoConfig(PreTrainedConfig):
         if self.n_demonstrations > 1 and self.demo_episode is not None:
             raise ValueError(
                 "`demo_episode` names a single demonstration, but `n_demonstrations` is "
-                f"{self.n_demonstrations}. Leave one of the two out."
+                f"{self.n_demonstrations}. Set `demo_episode` to null, or `n_demonstrations` to 1."
             )
         self._check_upsampling()
         self._check_conditioning()
@@ -457,8 +457,8 @@ class DeltacoConfig(PreTrainedConfig):
             )
         if self.n_demonstrations > 1:
             raise ValueError(
-                f"`n_demonstrations` is for `demo_encoder={CORRESPONDENCE}`, which combines demonstrations. "
-                f"Leave it out, or choose that one. Got {self.n_demonstrations}."
+                f"`n_demonstrations` is for policies with `demo_encoder={CORRESPONDENCE}`, which combine "
+                f"demonstrations; set it to 1. Got {self.n_demonstrations}."
             )
         if self.pretrained_matching:
             raise ValueError(
@@ -589,6 +589,7 @@ class DeltacoConfig(PreTrainedConfig):
 
     def gripper_opening(self, actions: Any) -> Any:
         """The gripper's commands in actions (frames, action), so that greater is more open, (frames,)."""
+        assert self.gripper_index is not None
         command = actions[:, self.gripper_index]
         return command if self.gripper_closed == "low" else -command
 

@@ -24,6 +24,7 @@ from lerobot_deltaco.policy.networks import ConditionedPolicy, gaussian_maps
 from lerobot_deltaco.training.frames import FramesInMemory
 
 SIZE, LENGTH = 24, 7
+GRIPPER = (-1, -1, 1, 1, 1, -1, -1)  # in the frames of an episode; 1 is closed
 COLORS = {"move the red thing left": (230, 40, 30), "move the blue thing right": (30, 60, 220)}
 CORRESPONDENCE = {"demo_encoder": "correspondence", "image_size": SIZE, "motion_modes": 2}
 
@@ -76,8 +77,8 @@ def table_with(task, thing, other):
     return image_with((COLORS[task], thing), (other_color, other))
 
 
-def table_dataset(root, episodes, **cameras):
-    """Episodes of a thing that is moved on a table.
+def table_dataset(root, episodes, closed=-1, **cameras):
+    """Episodes of a thing that is moved on a table. The gripper's command is `closed`, or its opposite.
 
     Each camera is a function that draws an image of a task and the places of its thing and the other one.
     """
@@ -104,7 +105,9 @@ def table_dataset(root, episodes, **cameras):
                 {
                     **{name: draw(task, thing, other) for name, draw in images.items()},
                     "observation.state": state_of(place),
-                    "action": np.array([*(place - home), (1, 1, -1, -1, -1, 1, 1)[step]], np.float32),
+                    "action": np.array(
+                        [*(place - home), closed * (-1, -1, 1, 1, 1, -1, -1)[step]], np.float32
+                    ),
                     "task": task,
                 }
             )
@@ -366,13 +369,24 @@ def test_large_values_of_the_gripper_may_mean_closed(dataset, caplog):
         return policy.goal_trainer.goals
 
     goals = goals_of(robot)
-    assert not caplog.records
+    assert "gripper_closed" not in caplog.text
     assert torch.equal(goals_of(inverted, gripper_closed="high").states, goals.states)
-    assert not caplog.records
+    assert "gripper_closed" not in caplog.text
     # In the wrong direction, the end of the approach looks like a release.
     assert not torch.equal(goals_of(inverted).states, goals.states)
     assert "closed at the beginning of 60 of 60 episodes" in caplog.text
     assert "--policy.gripper_closed" in caplog.text
+
+
+def test_the_grasp_of_a_demonstration_follows_the_direction_of_the_gripper(dataset, episodes, tmp_path):
+    inverted = table_dataset(tmp_path / "inverted", episodes[:6], closed=1, image=table_with)
+    places = []
+    for data, closed in ((dataset, "low"), (inverted, "high")):
+        demos = {"demo_repo_id": "test/table", "demo_root": str(data.root), "gripper_closed": closed}
+        policy, _, _ = small_policy(data, **CORRESPONDENCE, **demos)
+        places.append(policy.eval_demonstrations.grasp_states[:6])
+    assert torch.equal(*places)
+    assert not places[0].isnan().any()
 
 
 def test_frames_until_the_release_are_those_that_are_trained_on(dataset):

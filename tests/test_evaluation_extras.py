@@ -165,6 +165,18 @@ def test_the_number_of_demonstrations_is_overridden_and_recorded(tmp_path, capsy
     assert "other demonstrations" in capsys.readouterr().err
 
 
+def test_several_demonstrations_need_a_policy_that_combines_them(tmp_path, capsys):
+    copy = shutil.copytree(CHECKPOINT, tmp_path / "copy")
+    config = json.loads((copy / "config.json").read_text())
+    other = {"demo_encoder": "attention", "pretrained_matching": False, "demo_dropout": 0.0}
+    (copy / "config.json").write_text(json.dumps({**config, **other, "instruction_dropout": 0.0}))
+    with pytest.raises(SystemExit):
+        evaluate_command.main(
+            [str(copy), "--tasks", "24", "--n-demonstrations", "3", "--out", str(tmp_path / "out")]
+        )
+    assert "`n_demonstrations` is for policies with `demo_encoder=correspondence`" in capsys.readouterr().err
+
+
 def test_the_demonstration_or_the_instruction_is_left_out(tmp_path, capsys):
     for modality, demonstration in (("demo", None), ("instruction", get_task(24).instruction)):
         out = tmp_path / modality

@@ -73,7 +73,7 @@ def test_the_defaults_are_the_papers():
         ({"motion_modes": 0}, "`motion_modes` must be at least 1"),
         ({"demos_per_task": 1}, "`demos_per_task` cannot be 1"),
         ({"temperature": 0.0}, "`temperature` must be at least 0.001"),
-        ({"n_demonstrations": 5}, "`n_demonstrations` is for `demo_encoder=correspondence`"),
+        ({"n_demonstrations": 5}, "`n_demonstrations` is for policies with `demo_encoder=correspondence`"),
         ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
         ({"film": "none", "concat": "none"}, "would get no task"),
         ({"method": "language_only", "encoder_loss": "contrastive"}, "no demonstration is used"),

@@ -15,6 +15,7 @@ from lerobot.scripts.lerobot_record import RecordConfig
 import lerobot_policy_deltaco  # noqa: F401  (registers the policy)
 
 TASK = "lift the arm"
+NEW_TASK = "drop it"
 SENTENCE = "please raise it a little"
 POLICY = "train/checkpoints/last/pretrained_model"
 
@@ -39,9 +40,9 @@ commands, folder, task = json.loads(sys.argv[1]), sys.argv[2], sys.argv[3]
 fake_encoder.calls = []
 instruction_table.load_language_encoder = fake_encoder
 for name, *words in commands:
-    module = {"record": lerobot_record, "rollout": lerobot_rollout, "train": lerobot_train}[name]
+    module = {"record": lerobot_record, "train": lerobot_train}.get(name, lerobot_rollout)
     FakeArm.sent.clear()
-    sys.argv = [f"lerobot-{name}", *words]
+    sys.argv = [f"lerobot-{name.partition('_')[0]}", *words]
     module.main()
     Path(f"{name}.json").write_text(json.dumps(FakeArm.sent))
 
@@ -81,9 +82,14 @@ def session(tmp_path_factory):
     """The folder of a session: a task and a demonstration are recorded, a policy is trained and used."""
     folder = tmp_path_factory.mktemp("session")
     policy = folder / POLICY
+    rollout = [
+        *(f"--policy.path={policy}", "--robot.type=fake_arm"),
+        *("--policy.demo_repo_id=me/demos", f"--policy.demo_root={folder / 'demos'}"),
+        *("--fps=20", "--duration=1", "--return_to_initial_position=false"),
+    ]
     commands = [
         record("me/tasks", folder / "tasks", TASK, 3),
-        record("me/demos", folder / "demos", "drop it", 1),
+        record("me/demos", folder / "demos", NEW_TASK, 1),
         [
             *("train", "--policy.type=deltaco", "--policy.device=cpu", "--policy.image_size=16"),
             *(
@@ -95,10 +101,10 @@ def session(tmp_path_factory):
             f"--output_dir={folder / 'train'}",
         ],
         [
-            *("rollout", f"--policy.path={policy}", "--robot.type=fake_arm", f"--task={SENTENCE}"),
-            *("--policy.demo_repo_id=me/demos", f"--policy.demo_root={folder / 'demos'}"),
-            *("--policy.demo_episode=0", "--fps=20", "--duration=1", "--return_to_initial_position=false"),
+            *("rollout_same_words", f"--task={NEW_TASK}"),
+            *rollout,
         ],
+        ["rollout", f"--task={SENTENCE}", "--policy.demo_episode=0", *rollout],
     ]
     result = run_python(
         *(SESSION, json.dumps(commands), policy, SENTENCE),
@@ -109,8 +115,9 @@ def session(tmp_path_factory):
     return folder
 
 
-def test_a_rollout_moves_the_robot_within_what_it_has_learned(session):
-    recorded, sent = (json.loads((session / f"{name}.json").read_text()) for name in ("record", "rollout"))
+@pytest.mark.parametrize("rollout", ["rollout_same_words", "rollout"])
+def test_a_rollout_moves_the_robot_within_what_it_has_learned(session, rollout):
+    recorded, sent = (json.loads((session / f"{name}.json").read_text()) for name in ("record", rollout))
     assert len(recorded) >= 5
     assert 5 <= len(sent) <= 20
     for action in sent:
@@ -154,7 +161,7 @@ def test_the_commands_of_the_robots_page_are_lerobots(session, monkeypatch):
     dataset, policy = recorded.dataset, rollout.policy
     assert (dataset.num_episodes, dataset.no_stamp) == (1, True)
     assert (policy.demo_repo_id, policy.demo_root) == (dataset.repo_id, str(dataset.root))
-    assert policy.demo_episode == 0
+    assert policy.demo_episode is None
     assert recorded.robot == rollout.robot
     assert rollout.fps == dataset.fps
     assert rollout.task == dataset.single_task

@@ -395,15 +395,29 @@ def test_the_command_adds_it_to_a_trained_policy(checkpoint, dataset, tmp_path, 
 
 
 @pytest.mark.usefixtures("short_fit")
-@pytest.mark.parametrize(("name", "n_episodes"), [("test/table", 30), ("test/other", 60)])
+@pytest.mark.parametrize(
+    ("name", "folder", "n_episodes"),
+    [("test/table", None, 30), ("test/other", "same", 30), ("test/other", None, 60)],
+)
 def test_the_command_leaves_out_what_the_training_held_back(
-    checkpoint, dataset, tmp_path, capsys, name, n_episodes
+    checkpoint, dataset, tmp_path, capsys, caplog, name, folder, n_episodes
 ):
-    trained_on = {"repo_id": "test/table", "episodes": list(range(40)), "eval_split": 0.25}
+    root = str(dataset.root) if folder else None
+    trained_on = {"repo_id": "test/table", "root": root, "episodes": list(range(40)), "eval_split": 0.25}
     (checkpoint / "train_config.json").write_text(json.dumps({"dataset": trained_on}))
     data = ["--dataset.root", str(dataset.root), "--dataset.repo_id", name]
     match.main([str(checkpoint), *data, "--out", str(tmp_path / "matched")])
     assert f"fitted to {n_episodes} episodes" in capsys.readouterr().out
+    assert ("was trained on some of the episodes of test/table" in caplog.text) == (n_episodes == 60)
+
+
+def test_the_command_wants_the_episodes_of_the_training(checkpoint, dataset, tmp_path, capsys):
+    trained_on = {"repo_id": "test/table", "episodes": [3, 60]}
+    (checkpoint / "train_config.json").write_text(json.dumps({"dataset": trained_on}))
+    data = ["--dataset.root", str(dataset.root), "--dataset.repo_id", "test/table"]
+    with pytest.raises(SystemExit):
+        match.main([str(checkpoint), *data, "--out", str(tmp_path / "matched")])
+    assert "episodes up to 60 of test/table, but the dataset has only 60" in capsys.readouterr().err
 
 
 def with_matching(checkpoint):

@@ -14,14 +14,16 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_train
 from PIL import Image
 from safetensors.torch import load_file
-from small_policies import REPO_ID, TASKS, batch_of, small_policy, write_dataset
+from small_policies import LENGTH, REPO_ID, TASKS, batch_of, small_policy, write_dataset
 from torch import distributed
 from torch.nn.parallel import DistributedDataParallel
 
+from lerobot_deltaco.commands import train as train_command
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import load_demonstrations
 from lerobot_deltaco.policy.finite_loss import TrainingDivergedError
-from lerobot_deltaco.policy.vision import VisionEncoderError
+from lerobot_deltaco.policy.vision import VisionEncoderError, load_efficientnet_lite0
+from lerobot_deltaco.training import loop
 from lerobot_deltaco.training.frames import FramesInMemory, decoded, needed_bytes
 from lerobot_deltaco.training.loop import InMemoryTraining
 
@@ -347,6 +349,36 @@ def test_a_mistyped_folder_is_named_and_not_made(train, tmp_path, option):
     ):
         train("--policy.demo_repo_id=test/foreign", f"--{option}={missing}")
     assert not missing.parent.exists()
+
+
+def test_frames_until_the_release_follow_the_direction_of_the_gripper(train, monkeypatch):
+    used, checked = [], []
+    sampler = loop.TaskBatchSampler
+    monkeypatch.setattr(
+        loop, "TaskBatchSampler", lambda *a, use, **k: used.append(use) or sampler(*a, use=use, **k)
+    )
+    monkeypatch.setattr(loop, "warn_if_inverted", lambda gripper, spans: checked.append(gripper[:2].tolist()))
+    options = ["--policy.tasks_per_batch=2", "--policy.frames_after_release=0", "--steps=1"]
+    for closed in ("low", "high"):
+        train(*options, f"--policy.gripper_closed={closed}", name=closed)
+    # The gripper's command is 0 in every other frame, the first included.
+    assert checked == [[0, 1], [0, -1]]
+    frames = np.arange(LENGTH)
+    for use, last_opening in zip(used, (frames[1::2][-1], frames[2::2][-1]), strict=True):
+        assert (use.reshape(-1, LENGTH) == (frames <= last_opening)).all()
+
+
+def test_without_a_gripper_there_is_no_release(train):
+    options = ["--policy.gripper=none", "--policy.tasks_per_batch=2", "--policy.frames_after_release=1"]
+    with pytest.raises(ValueError, match="`frames_after_release` needs a gripper"):
+        train(*options)
+
+
+def test_missing_weights_end_the_command_in_one_line(train, monkeypatch):
+    monkeypatch.setattr("lerobot_deltaco.policy.vision._LITE_PACKAGES", ("no_such_package",))
+    monkeypatch.setattr(train_command, "train", load_efficientnet_lite0)
+    with pytest.raises(SystemExit, match="deltaco-train: .*Install this project's extra `offline`"):
+        train_command.main()
 
 
 def test_missing_weights_for_matching_are_noticed_before_the_frames_are_read(train, monkeypatch):

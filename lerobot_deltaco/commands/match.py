@@ -63,7 +63,8 @@ def _parser() -> argparse.ArgumentParser:
         dest="dataset_repo_id",
         default="deltaco/training",
         metavar="USER/NAME",
-        help="name of the training dataset; any name will do for a folder (default: %(default)s)",
+        help="name of the training dataset (default: %(default)s). If it is the one that the policy was "
+        "trained on, by its name or its folder, episodes that the training held back are left out",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder of the checkpoint")
     parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default: %(default)s)")

@@ -150,7 +150,7 @@ class EpisodeDataset:
 
     @staticmethod
     def _robot(items: Sequence[dict[str, Any]], config: DeltacoConfig) -> tuple[Tensor, Tensor] | None:
-        """States of the robot and commands of its gripper, if the policy needs them."""
+        """States of the robot and its gripper's commands, greater for more open, if needed."""
         if not _needs_robot(config):
             return None
         states, actions = (

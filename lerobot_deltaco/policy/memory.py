@@ -26,6 +26,6 @@ def keep_freed_memory() -> bool:
     """
     if platform.libc_ver()[0] != "glibc":
         return False
-    logger.info("Freed memory stays with this process, which makes training steps up to 25 % faster.")
+    logger.info("Freed memory stays with this process, which makes it faster.")
     mallopt = ctypes.CDLL(None).mallopt
     return bool(mallopt(_MMAP_MAX, 0)) and bool(mallopt(_TRIM_THRESHOLD, _GREATEST))

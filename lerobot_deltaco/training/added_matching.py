@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import tempfile
 from dataclasses import replace
@@ -11,18 +12,24 @@ from pathlib import Path
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_deltaco.common.run_folder import TRAIN_CONFIG
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling.goal_learning import fit_pretrained_matching
 from lerobot_deltaco.modeling.task_sources import read_eval_demonstrations
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.policy.dataset_folders import check_dataset_folder
 from lerobot_deltaco.policy.goals.pretrained_matching import PretrainedMatching
 from lerobot_deltaco.policy.goals.words import vocabulary_of
 from lerobot_deltaco.policy.training_episodes import kept_episodes
+from lerobot_deltaco.policy.vision import load_efficientnet_lite0
+
+logger = logging.getLogger(__name__)
 
 
 def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, seed: int) -> int:
     """Saves a policy with matching that is fitted to the episodes of a dataset.
 
-    If the policy was trained on a dataset of this name, episodes that its training did not use are left out.
+    If it is the dataset that the policy was trained on, by its name or its folder, episodes that the training
+    did not use are left out.
 
     Args:
         checkpoint: Folder of the policy.
@@ -54,8 +61,10 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
         )
     if goals.matching is not None:
         raise ValueError(f"The policy of {checkpoint} has matching by pretrained features already.")
+    check_dataset_folder("--dataset.root", root)
+    load_efficientnet_lite0()  # for its errors, before minutes of decoding
     data = replace(config, demo_repo_id=repo_id, demo_root=None if root is None else str(root))
-    episodes = read_eval_demonstrations(data, _episodes_of_training(checkpoint, repo_id, root))
+    episodes = read_eval_demonstrations(data, _episodes_of_training(checkpoint, config, repo_id, root))
     assert episodes is not None
     assert config.device is not None
     episodes = episodes.to(config.device)
@@ -76,13 +85,38 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
     return len(episodes.tasks)
 
 
-def _episodes_of_training(checkpoint: Path, repo_id: str, root: Path | None) -> list[int] | None:
-    """The episodes that a policy was trained on, if its checkpoint says so; None for all of the dataset."""
+def _episodes_of_training(
+    checkpoint: Path, config: DeltacoConfig, repo_id: str, root: Path | None
+) -> list[int] | None:
+    """The episodes that a policy was trained on, if its checkpoint says so; None for all of the dataset.
+
+    Raises:
+        ValueError: The dataset does not have them.
+    """
     path = checkpoint / TRAIN_CONFIG
     if not path.is_file():
         return None
     dataset = json.loads(path.read_text(encoding="utf-8")).get("dataset") or {}
     chosen, held_back = dataset.get("episodes"), dataset.get("eval_split") or 0.0
-    if dataset.get("repo_id") != repo_id or not (chosen or held_back):
+    chosen = config.demo_episodes or chosen
+    if not (chosen or held_back):
         return None
-    return kept_episodes(LeRobotDatasetMetadata(repo_id, root=root), chosen, held_back)
+    name, folder = dataset.get("repo_id"), dataset.get("root")
+    is_folder = None not in (root, folder) and Path(str(root)).resolve() == Path(folder).resolve()
+    if name != repo_id and not is_folder:
+        logger.warning(
+            "The policy was trained on some of the episodes of %s (%s). The matching is fitted to all "
+            "episodes of the dataset given here; if it is the same, name it --dataset.repo_id=%s.",
+            name,
+            folder or "LeRobot's cache",
+            name,
+        )
+        return None
+    meta = LeRobotDatasetMetadata(repo_id, root=root)
+    if chosen and max(chosen) >= meta.total_episodes:
+        raise ValueError(
+            f"The policy was trained on episodes up to {max(chosen)} of {repo_id}, but the dataset has only "
+            f"{meta.total_episodes}. Name the dataset that it was trained on, or give this one another name "
+            "with --dataset.repo_id to fit the matching to all of its episodes."
+        )
+    return list(config.demo_episodes or kept_episodes(meta, chosen, held_back))

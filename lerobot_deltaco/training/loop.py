@@ -43,6 +43,7 @@ from lerobot_deltaco.lerobot_internals import (
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.dataset_folders import check_dataset_folder
 from lerobot_deltaco.policy.demonstrations import kept_frame_indices
+from lerobot_deltaco.policy.goals.keyframes import warn_if_inverted
 from lerobot_deltaco.policy.vision import load_efficientnet_lite0
 from lerobot_deltaco.training.frames import FramesInMemory
 from lerobot_deltaco.training.remote_job import check_remote_job
@@ -232,6 +233,8 @@ class InMemoryTraining:
                     "names."
                 )
             gripper = config.gripper_opening(self._frames.columns[ACTION])
+            if not config.locates_goals:  # which warns itself
+                warn_if_inverted(gripper, list(self._frames.spans.values()))
             use &= self._frames.until_release(gripper, config.frames_after_release)
         upsampled = []
         if config.upsampled_tasks is not None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+logger = logging.getLogger(__name__)
 
 _APPROACH = 2  # frames before the gripper closes
 _FOLLOWING = 0.8  # correlation of a state with the gripper's command, above which it is the gripper's
@@ -35,8 +38,8 @@ class Keyframes(NamedTuple):
 def find_keyframes(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Keyframes:
     """Finds the keyframes of episodes: the last closing that is followed by an opening, and that opening.
 
-    A gripper counts as closed where its command is below the middle of the commands' range, LeRobot's
-    convention for grippers. If an object slips and is grasped again, the last grasp counts.
+    A gripper counts as closed where its command is below the middle of the commands' range. If an object
+    slips and is grasped again, the last grasp counts.
 
     Args:
         states: Robot states of all frames, (frames, state).
@@ -71,10 +74,23 @@ def release_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[in
     return [_last_opening(closed, span) for span in spans]
 
 
-def starts_closed(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> int:
-    """Number of episodes in whose first frame the gripper is to be closed."""
+def warn_if_inverted(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> None:
+    """Warns if most episodes begin with a closed gripper: then grasps may be taken for releases.
+
+    Args:
+        gripper: Commands to the gripper in all frames, greater for more open, (frames,).
+        spans: First and last frame of each episode.
+    """
     closed = _is_closed(gripper)
-    return sum(closed[first] for first, _ in spans)
+    n_closed = sum(closed[first] for first, _ in spans)
+    if n_closed > len(spans) / 2:
+        logger.warning(
+            "The gripper is closed at the beginning of %d of %d episodes. If these values mean that it is "
+            "open, grasps and releases are mistaken for each other: set --policy.gripper_closed to the other "
+            "of low and high.",
+            n_closed,
+            len(spans),
+        )
 
 
 def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Tensor:

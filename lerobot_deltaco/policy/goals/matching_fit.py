@@ -133,13 +133,21 @@ class _Pairs:
 
 def _encoded(matching: PretrainedMatching, images: Tensor) -> ImageMaps:
     """Maps of images (n, 3, H, W) uint8, not normalized, in float16."""
-    parts = []
+    found: ImageMaps | None = None
     with tqdm(total=len(images), desc="Encoding scenes", unit="image", leave=False) as bar:
-        for some in images.split(_IMAGES_AT_A_TIME):
+        for first in range(0, len(images), _IMAGES_AT_A_TIME):
+            some = images[first : first + _IMAGES_AT_A_TIME]
             maps = matching.encode(some.float() / 255)
-            parts.append(ImageMaps(maps.fine.half(), maps.coarse.half()))
+            if found is None:
+                # At once, since there is no room for two copies of many large maps.
+                found = ImageMaps(
+                    *(kind.new_empty(len(images), *kind.shape[1:], dtype=torch.half) for kind in maps)
+                )
+            for all_maps, kind in zip(found, maps, strict=True):
+                all_maps[first : first + len(some)] = kind
             bar.update(len(some))
-    return ImageMaps(*(torch.cat(kind).contiguous() for kind in zip(*parts, strict=True)))
+    assert found is not None
+    return found
 
 
 @torch.no_grad()

@@ -47,7 +47,7 @@ class ImageMaps(NamedTuple):
 
     Attributes:
         fine: (batch, FINE_CHANNELS, h, w).
-        coarse: (batch, COARSE_CHANNELS, h, w), of images that were enlarged twice as much.
+        coarse: (batch, COARSE_CHANNELS, h, w), of images of twice the size.
     """
 
     fine: Tensor
@@ -109,9 +109,10 @@ class PretrainedMatching(nn.Module):
 
         def scaled(stride: int) -> Tensor:
             sides = [stride * cells for cells in size]
-            is_smaller = sides[0] < images.shape[-2]
+            # Averaging is for images that are scaled down: large ones, and those with much detail.
+            is_smaller = any(new < old for new, old in zip(sides, images.shape[-2:], strict=True))
             larger_or_smaller = F.interpolate(
-                images, size=sides, mode="bicubic", align_corners=False, antialias=is_smaller
+                images.float(), size=sides, mode="bicubic", align_corners=False, antialias=is_smaller
             )
             return larger_or_smaller.clamp(0, 1)
 

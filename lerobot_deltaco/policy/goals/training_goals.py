@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lerobot_deltaco.policy.goals.calibration import StateToImage
-from lerobot_deltaco.policy.goals.keyframes import find_keyframes, starts_closed
+from lerobot_deltaco.policy.goals.keyframes import find_keyframes, warn_if_inverted
 
 logger = logging.getLogger(__name__)
 
@@ -64,15 +64,7 @@ def find_training_goals(
             int((~found).sum()),
             len(found),
         )
-    n_closed = starts_closed(gripper, spans)
-    if n_closed > len(spans) / 2:
-        logger.warning(
-            "The gripper is closed at the beginning of %d of %d episodes. If these values mean that it is "
-            "open, grasps and releases are mistaken for each other: set --policy.gripper_closed to the other "
-            "of low and high.",
-            n_closed,
-            len(spans),
-        )
+    warn_if_inverted(gripper, spans)
     to_image.fit(first[found], last[found], keyframes.states[found, 0])
     places = to_image(keyframes.states).clamp(-1, 1)
     places = torch.where(found[:, None, None], places, 0.0)
