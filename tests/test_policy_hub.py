@@ -132,6 +132,14 @@ def test_the_metadata_are_what_the_hub_searches(dataset):
     assert foreign_card(dataset)[0].data.license == "apache-2.0"
 
 
+def test_the_card_says_how_the_gripper_closes_and_that_things_are_matched(dataset):
+    assert "is the gripper, which small values close" in foreign_card(dataset)[0].text
+    options = {"demo_encoder": "correspondence", "pretrained_matching": True, "gripper_closed": "high"}
+    card, _ = foreign_card(dataset, **options)
+    assert "is the gripper, which large values close" in card.text
+    assert "| matching | also by the features of EfficientNet-Lite0" in card.text
+
+
 def test_the_card_says_what_was_trained_and_on_what(dataset):
     train_config = TrainPipelineConfig(
         DatasetConfig(REPO_ID, episodes=[0, 1, 2, 3]), steps=12_345, batch_size=24, seed=77

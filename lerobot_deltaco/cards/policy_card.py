@@ -224,6 +224,8 @@ def _training(config: DeltacoConfig, train_config: TrainPipelineConfig | None) -
         "random shifts of observations": f"up to {config.crop_padding} pixels",
         "precision": config.dtype,
     }
+    if config.pretrained_matching:
+        options["matching"] = "also by the features of EfficientNet-Lite0, trained on ImageNet"
     if config.goal_image_size is not None:
         options["image size for finding goals"] = f"{config.goal_image_size} x {config.goal_image_size}"
     if config.gripper_index is not None:
