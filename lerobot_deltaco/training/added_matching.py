@@ -102,7 +102,7 @@ def _episodes_of_training(
     if not (chosen or held_back):
         return None
     name, folder = dataset.get("repo_id"), dataset.get("root")
-    is_folder = None not in (root, folder) and Path(str(root)).resolve() == Path(folder).resolve()
+    is_folder = root is not None and folder is not None and root.resolve() == Path(folder).resolve()
     if name != repo_id and not is_folder:
         logger.warning(
             "The policy was trained on some of the episodes of %s (%s). The matching is fitted to all "
