@@ -24,6 +24,7 @@ from lerobot_deltaco.evaluation.record import (
     record_path,
     write_record,
 )
+from lerobot_deltaco.reporting.curves import Curve, curves_figure
 from lerobot_deltaco.reporting.novelty import novelty, scenario_of
 from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS, TITLES, in_order, label_of, paper_result
 from lerobot_deltaco.reporting.report import FILES, write_report
@@ -716,6 +717,23 @@ def test_the_files(runs, tmp_path, capsys):
         assert 1000 < image.width < 3000
         assert 400 < image.height < 3000
         assert len(image.convert("RGB").getcolors(1 << 24)) > 10
+
+
+@pytest.mark.parametrize("n_curves", [1, 40])
+def test_curves_are_not_squeezed_by_their_legend(n_curves):
+    curves = [
+        Curve(f"some/method_{number}", [1000, 2000], np.full((2, 1), number / 100))
+        for number in range(n_curves)
+    ]
+    figure = curves_figure([("many", curves), ("few", curves[:1])])
+    figure.draw_without_rendering()
+    for ax in figure.axes:
+        assert ax.get_window_extent().height / figure.dpi > 3
+        legend = ax.get_legend()
+        assert legend.get_window_extent().y0 >= 0
+        assert legend.get_window_extent().height <= ax.get_window_extent().height
+    names = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert names[0].startswith(f"method {n_curves - 1} ")  # the best first
 
 
 def test_the_text(runs, tmp_path):

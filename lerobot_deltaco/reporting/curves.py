@@ -16,8 +16,10 @@ from lerobot_deltaco.reporting.paper_results import LEVELS, label_of, paper_resu
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-PANEL_SIZE = (9.0, 4.4)  # inches
+PANEL_SIZE = (9.0, 4.4)  # inches; higher, where the legend is
+_LEGEND_LINE, _LEGEND_FRAME = 0.205, 0.9  # inches
 DOTS_PER_INCH = 140
 # The same method has the same color in every image.
 COLORS = MappingProxyType(
@@ -72,20 +74,32 @@ def draw_curves(panels: Sequence[tuple[str, Sequence[Curve]]], authors_levels: b
     Returns:
         A PNG.
     """
-    # Only here, so that the command line answers quickly; and without pyplot, which would look for a screen.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    image = io.BytesIO()
+    FigureCanvasAgg(curves_figure(panels, authors_levels)).print_png(image)
+    return image.getvalue()
+
+
+def curves_figure(panels: Sequence[tuple[str, Sequence[Curve]]], authors_levels: bool = False) -> Figure:
+    """The image of `draw_curves` as a figure, whose panels are as high as their legends."""
+    # Only here, so that the command line answers quickly; and without pyplot, which would look for a screen.
     from matplotlib.figure import Figure
 
-    width, height = PANEL_SIZE
-    figure = Figure(figsize=(width, height * len(panels)), dpi=DOTS_PER_INCH, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    width, least_height = PANEL_SIZE
+    n_lines = [len(curves) + 2 * len(LEVELS) + 2 for _, curves in panels]
+    heights = [max(least_height, _LEGEND_FRAME + _LEGEND_LINE * number) for number in n_lines]
+    figure = Figure(figsize=(width, sum(heights)), dpi=DOTS_PER_INCH, layout="constrained")
+    axes = figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0]
     for ax, (title, curves) in zip(axes, panels, strict=True):
         _draw_panel(ax, curves, authors_levels)
         ax.set_title(title, loc="left", fontsize=12)
-    image = io.BytesIO()
-    canvas.print_png(image)
-    return image.getvalue()
+    return figure
+
+
+def _label(curve: Curve) -> str:
+    n_seeds = curve.rates.shape[1]
+    return f"{label_of(curve.experiment)} ({n_seeds} seed{'s' * (n_seeds > 1)})"
 
 
 def _draw_panel(ax: Axes, curves: Sequence[Curve], authors_levels: bool) -> None:
@@ -98,8 +112,7 @@ def _draw_panel(ax: Axes, curves: Sequence[Curve], authors_levels: bool) -> None
         method = curve.experiment.rpartition("/")[2]
         color, line = (COLORS[method], "-") if method in COLORS else next(other_styles)
         mean, sd = curve.rates.mean(axis=1), curve.rates.std(axis=1)
-        n_seeds = curve.rates.shape[1]
-        label = f"{label_of(curve.experiment)} ({n_seeds} seed{'s' * (n_seeds > 1)})"
+        label = _label(curve)
         if len(curve.steps) == 1:
             ax.errorbar(curve.steps, mean, yerr=sd, fmt="o", color=color, capsize=4, label=label)
         else:
@@ -113,7 +126,11 @@ def _draw_panel(ax: Axes, curves: Sequence[Curve], authors_levels: bool) -> None
         if authors_levels and published is not None:
             ax.axhline(published.rate, color=color, linewidth=1, linestyle=_DASHED, alpha=0.8)
             highest, has_levels = max(highest, published.rate), True
-    handles, _ = ax.get_legend_handles_labels()
+    # In the order in which the curves end, so that they can be told apart.
+    last = {_label(curve): curve.rates[-1].mean() for curve in curves}
+    handles, labels = ax.get_legend_handles_labels()
+    order = sorted(range(len(labels)), key=lambda number: -last[labels[number]])
+    handles = [handles[number] for number in order]
     for (label, level), shade in zip(LEVELS.items(), _SHADES_OF_LEVELS, strict=True):
         ax.axhline(level, color=shade, linewidth=1, linestyle=_DOTTED)
         name = f"{100 * level:.1f} %: {label}".replace(", ", ",\n")
