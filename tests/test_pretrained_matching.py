@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs.policies import PreTrainedConfig
+from safetensors.torch import load_file, save_file
 from small_policies import batch_of, observation, small_policy
 from test_correspondence import random_moves, table_dataset
 
@@ -146,8 +147,8 @@ def test_a_fit_is_a_function_of_its_seed(published, examples):
     first, second, other = (new_matching(published) for _ in range(3))
     for matching, seed in ((first, 0), (second, 0), (other, 1)):
         fit_matching(matching, *(part[:8] for part in examples), None, seed=seed, steps=2)
-    assert torch.equal(first.demo.fine.weight, second.demo.fine.weight)
-    assert not torch.equal(first.demo.fine.weight, other.demo.fine.weight)
+    assert torch.equal(first.demo.linear.weight, second.demo.linear.weight)
+    assert not torch.equal(first.demo.linear.weight, other.demo.linear.weight)
 
 
 def test_words_that_are_fitted_find_what_they_name(published, examples):
@@ -392,6 +393,24 @@ def test_the_command_adds_it_to_a_trained_policy(checkpoint, dataset, tmp_path, 
     files = {path.name for path in checkpoint.iterdir()} - {"README.md"}
     assert {path.name for path in out.iterdir()} == files
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.usefixtures("short_fit")
+def test_the_command_fits_it_anew_also_that_of_another_version(checkpoint, dataset, tmp_path):
+    root = ("--dataset.root", str(dataset.root))
+    first, second = tmp_path / "first", tmp_path / "second"
+    match.main([str(checkpoint), *root, "--out", str(first)])
+    name = "goals.matching.demo.linear.weight"
+    weights = load_file(first / "model.safetensors")
+    weights["goals.matching.demo.fine.weight"] = weights.pop(name)
+    save_file(weights, first / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(ValueError, match="was not saved by this version. `deltaco-match` fits it anew"):
+        DeltacoPolicy.from_pretrained(first)
+    match.main([str(first), *root, "--out", str(second), "--seed", "1"])
+    new, old = DeltacoPolicy.from_pretrained(second).state_dict(), load_file(checkpoint / "model.safetensors")
+    assert all(torch.equal(value, new[key]) for key, value in old.items())
+    assert new["goals.matching.fitted"]
+    assert not torch.equal(new[name], weights["goals.matching.demo.fine.weight"])
 
 
 @pytest.mark.usefixtures("short_fit")

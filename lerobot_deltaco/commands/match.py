@@ -41,9 +41,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="deltaco-match",
         description="Adds matching by pretrained features (pretrained_matching) to a policy that was trained "
-        "without it: it then also looks for what a demonstration moved by the features of "
-        "EfficientNet-Lite0. The policy's other weights stay as they are. It takes minutes and needs the "
-        "extra `offline`.",
+        "without it, or fits it anew: the policy then also looks for what a demonstration moved by the "
+        "features of EfficientNet-Lite0. The policy's other weights stay as they are. It takes minutes and "
+        "needs the extra `offline`.",
     )
     parser.add_argument(
         "policy",

@@ -26,6 +26,8 @@ from lerobot_deltaco.policy.task_file import (
 
 # Prefix that the names of the weights of `DeltacoPolicy.model` had in version 0.1.
 OLD_MODEL_PREFIX = "policy."
+# Of the names of the weights of matching by pretrained features.
+MATCHING_PREFIX = "goals.matching."
 # Options that name files whose contents a checkpoint holds, and the one that is a choice of each evaluation.
 _SOURCES = (
     "leave_out",
@@ -90,9 +92,15 @@ def check_loaded_weights(policy: nn.Module, path: str) -> None:
     expected = set(policy.state_dict())
     if stored != expected:
         missing, unknown = sorted(expected - stored), sorted(stored - expected)
-        if not unknown and all(name.startswith("goals.matching.") for name in missing):
+        if all(name.startswith(MATCHING_PREFIX) for name in missing + unknown):
+            if not unknown:
+                raise ValueError(
+                    f"The policy of {path} was trained without `pretrained_matching`. `deltaco-match` "
+                    "adds it."
+                )
             raise ValueError(
-                f"The policy of {path} was trained without `pretrained_matching`. `deltaco-match` adds it."
+                f"The matching by pretrained features of {path} was not saved by this version. "
+                "`deltaco-match` fits it anew to the training dataset."
             )
         raise ValueError(
             f"{path} does not have the weights of this policy: it lacks {missing[:3] or 'none'}, "

@@ -10,9 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from lerobot.datasets import LeRobotDatasetMetadata
+from safetensors.torch import load_file, save_file
 
-from lerobot_deltaco.common.run_folder import TRAIN_CONFIG
+from lerobot_deltaco.common.run_folder import TRAIN_CONFIG, WEIGHTS
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.modeling.checkpoint_files import MATCHING_PREFIX
 from lerobot_deltaco.modeling.goal_learning import fit_pretrained_matching
 from lerobot_deltaco.modeling.task_sources import read_eval_demonstrations
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
@@ -26,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 
 def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, seed: int) -> int:
-    """Saves a policy with matching that is fitted to the episodes of a dataset.
+    """Saves a policy with matching that is fitted to the episodes of a dataset, in place of any that it has.
 
     If it is the dataset that the policy was trained on, by its name or its folder, episodes that the training
     did not use are left out.
@@ -44,23 +46,21 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
 
     Raises:
         FileNotFoundError: There is no such checkpoint or dataset.
-        ValueError: The policy finds no goals by demonstrations and depths, has matching already, or does not
-            fit the dataset.
+        ValueError: The policy finds no goals by demonstrations and depths, or does not fit the dataset.
         VisionEncoderError: The weights of EfficientNet-Lite0 are missing.
     """
     if out.resolve().is_relative_to(checkpoint.resolve()):
         raise ValueError(f"{out} is in the folder of the checkpoint itself. Name a folder outside of it.")
     if not (checkpoint / "config.json").is_file():
         raise FileNotFoundError(f"{checkpoint} is no checkpoint: it has no config.json.")
-    policy = DeltacoPolicy.from_pretrained(checkpoint)
+    with tempfile.TemporaryDirectory() as folder:
+        policy = DeltacoPolicy.from_pretrained(_without_matching(checkpoint, Path(folder)))
     goals, config = policy.goals, policy.config
     if goals is None or not config.uses_demo or not config.grasp_depth:
         raise ValueError(
             "Matching by pretrained features is for policies with demo_encoder=correspondence and "
             "grasp_depth that get demonstrations."
         )
-    if goals.matching is not None:
-        raise ValueError(f"The policy of {checkpoint} has matching by pretrained features already.")
     check_dataset_folder("--dataset.root", root)
     load_efficientnet_lite0()  # for its errors, before minutes of decoding
     data = replace(config, demo_repo_id=repo_id, demo_root=None if root is None else str(root))
@@ -83,6 +83,22 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
         policy.save_pretrained(new)
         new.rename(out)
     return len(episodes.tasks)
+
+
+def _without_matching(checkpoint: Path, folder: Path) -> Path:
+    """The checkpoint itself if it has no matching; else a copy without it, which any version can load."""
+    config = json.loads((checkpoint / "config.json").read_text(encoding="utf-8"))
+    if not config.get("pretrained_matching"):
+        return checkpoint
+    copy = folder / "checkpoint"
+    shutil.copytree(checkpoint, copy)
+    (copy / "config.json").write_text(
+        json.dumps({**config, "pretrained_matching": False, "known_words": []}), encoding="utf-8"
+    )
+    weights = load_file(copy / WEIGHTS)
+    kept = {name: value for name, value in weights.items() if not name.startswith(MATCHING_PREFIX)}
+    save_file(kept, copy / WEIGHTS, metadata={"format": "pt"})
+    return copy
 
 
 def _episodes_of_training(

@@ -13,8 +13,8 @@ from lerobot_deltaco.policy.goals.correspondence import goal_loss
 from lerobot_deltaco.policy.goals.pretrained_matching import ImageMaps, PretrainedMatching
 from lerobot_deltaco.policy.memory import keep_freed_memory
 
-# Tried on validation tasks (docs/experiment-log.md): more steps and other regularization change nothing.
-_STEPS = 600
+# Tried on validation tasks (docs/experiment-log.md).
+_STEPS = 2000
 _MAX_EPISODES = 10_000  # drawn for the fit
 _PAIRS_PER_STEP = 32
 _LEARNING_RATE = 2e-3
@@ -35,7 +35,7 @@ def fit_matching(
     seed: int,
     steps: int = _STEPS,
 ) -> None:
-    """Fits the linear layers and the words.
+    """Fits the comparisons and the words.
 
     What one episode of a task grasps is to be found in the scene of another, and by some of the words of its
     task: a share of them is left out in each step, so that none is needed.
@@ -153,11 +153,13 @@ def _encoded(matching: PretrainedMatching, images: Tensor) -> ImageMaps:
 @torch.no_grad()
 def _initialize(matching: PretrainedMatching, generator: torch.Generator) -> None:
     """Draws initial weights as PyTorch's layers do, but from a generator."""
-    weighed = [matching.demo] if matching.named is None else [matching.demo, matching.named]
-    for layer in (layer for maps in weighed for layer in (maps.fine, maps.coarse)):
-        for weights in layer.parameters():
-            drawn = 2 * torch.rand(weights.shape, generator=generator) - 1
-            weights.copy_(layer.in_channels**-0.5 * drawn)
+    comparisons = [matching.demo] if matching.named is None else [matching.demo, matching.named]
+    for comparison in comparisons:
+        for layer in comparison.modules():
+            if isinstance(layer, torch.nn.Conv2d):
+                bound = layer.weight[0].numel() ** -0.5
+                for weights in layer.parameters():
+                    weights.copy_(bound * (2 * torch.rand(weights.shape, generator=generator) - 1))
     if matching.named is not None:
         matching.words.copy_(_WORD_STD * torch.randn(matching.words.shape, generator=generator))
         matching.words[-1] = 0

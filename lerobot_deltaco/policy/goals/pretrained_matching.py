@@ -2,14 +2,14 @@ r"""Matching by pretrained features (ours): finds what a task asks for by featur
 
 A network that learns from a few hundred objects compares them by color: among objects of one color, it picks
 nearly at random. The features of a network that was trained on photographs tell shapes apart, too. They are
-frozen; only their weighting is learned, by linear layers, which have too few weights to learn the training
-objects by heart. `policy/goals/matching_fit.py` fits them before a training, or for a trained policy.
+frozen; small networks behind them learn what to compare things by. `policy/goals/matching_fit.py` fits them
+before a training, or for a trained policy.
 
     demonstration's first image     scene                     instruction
             |                         |                            |
         encoder (frozen) <-------> encoder (frozen)          words it has
             |                         |        \                   |
-      weighed (linear) <-- same --> weighed   weighed (linear)   sum of the words' descriptors
+       comparison <------ same ---> comparison  comparison   sum of the words' descriptors
             |                         |           |                |
     descriptor of what was grasped    |           |                |
             |________ cosine _________|           |____ cosine ____|
@@ -78,8 +78,8 @@ class PretrainedMatching(nn.Module):
         super().__init__()
         self.detail = detail
         self.encoder = EfficientNetLite()
-        self.demo = WeighedMaps(descriptor_dim)
-        self.named = WeighedMaps(descriptor_dim) if n_words else None
+        self.demo = Comparison(descriptor_dim)
+        self.named = Comparison(descriptor_dim) if n_words else None
         if n_words:
             # With a bias, which stands for no word.
             self.words = nn.Parameter(torch.zeros(n_words + 1, descriptor_dim))
@@ -162,23 +162,30 @@ class PretrainedMatching(nn.Module):
         return self.named.similarity(self.named(maps), descriptors)
 
 
-class WeighedMaps(nn.Module):
-    """Features of places: maps of two kinds, each weighed by a linear layer, and added up.
+class Comparison(nn.Module):
+    """Features of places that things are compared by: a linear layer, and a small network of what is around.
+
+    Without the network, things are hardly compared by their shape.
 
     Args:
         dim: Number of features.
+        hidden_dim: Number of features inside the network.
     """
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, hidden_dim: int = 128) -> None:
         super().__init__()
-        self.fine = nn.Conv2d(FINE_CHANNELS, dim, 1)
-        self.coarse = nn.Conv2d(COARSE_CHANNELS, dim, 1)
+        channels = FINE_CHANNELS + COARSE_CHANNELS
+        self.linear = nn.Conv2d(channels, dim, 1)
+        self.around = nn.Sequential(
+            nn.Conv2d(channels, hidden_dim, 1), nn.ReLU(), nn.Conv2d(hidden_dim, dim, 3, padding=1)
+        )
         self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
 
     def forward(self, maps: ImageMaps) -> Tensor:
         """From normalized maps (batch, channels, h, w) to (batch, dim, 2 h, 2 w)."""
-        weighed = self.fine(maps.fine) + self.coarse(maps.coarse)
-        return F.interpolate(weighed, scale_factor=2, mode="bilinear", align_corners=False)
+        both = torch.cat(maps, dim=1)
+        features = self.linear(both) + self.around(both)
+        return F.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
 
     def similarity(self, features: Tensor, descriptors: Tensor) -> Tensor:
         """Scaled cosine of features (batch, dim, h, w) and descriptors (batch, dim): (batch, h, w)."""
