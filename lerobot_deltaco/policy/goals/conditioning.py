@@ -24,7 +24,7 @@ from lerobot_deltaco.policy.goals.words import KnownWords
 # Standard deviation of the error of depths by looks on novel objects; depths have a standard deviation of 1.
 LOOKS_STD = 0.7
 _LEAST_ATTENTION = 1e-9
-_WEIGHT_OF_WORDS = 2.0  # of their map's log probabilities; chosen on validation tasks
+_WEIGHT_OF_WORDS = 3.0  # of their map's log probabilities; chosen on validation tasks
 
 
 class FoundGoals(NamedTuple):
