@@ -75,7 +75,6 @@ from lerobot_deltaco.policy.task_file import (
     read_task_file,
     write_task_file,
 )
-from lerobot_deltaco.policy.vision import load_efficientnet_lite0
 
 
 class DeltacoPolicy(PreTrainedPolicy):
@@ -90,9 +89,6 @@ class DeltacoPolicy(PreTrainedPolicy):
         dataset_stats: Statistics of the training dataset, by which the processors normalize; None in
             evaluation.
         dataset_meta: Metadata of the training dataset; None in evaluation.
-
-    Raises:
-        VisionEncoderError: The weights that `pretrained_matching` needs for a training are missing.
 
     Attributes:
         model: Network that predicts actions.
@@ -129,11 +125,8 @@ class DeltacoPolicy(PreTrainedPolicy):
             demonstrated = self.eval_demonstrations.rows if self.eval_demonstrations else ()
             config.one_hot_tasks = one_hot_vocabulary(dataset_meta, demonstrated)
 
-        if config.pretrained_matching and dataset_meta is not None:
-            if config.pretrained_path is None:
-                load_efficientnet_lite0()  # for its errors, rather than at the first step
-            if config.uses_language:
-                config.known_words = config.known_words or vocabulary_of(dataset_meta.tasks.index)
+        if config.pretrained_matching and config.uses_language and dataset_meta is not None:
+            config.known_words = config.known_words or vocabulary_of(dataset_meta.tasks.index)
 
         self._frozen = make_frozen_encoder(config)
         self.model = make_policy_network(config)

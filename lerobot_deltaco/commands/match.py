@@ -1,4 +1,4 @@
-"""`deltaco-match`: adds matching by pretrained features to a trained policy."""
+"""`deltaco-match`: adds matching by pretrained features to a trained policy, or fits it anew."""
 
 from __future__ import annotations
 

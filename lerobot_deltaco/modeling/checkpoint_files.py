@@ -26,7 +26,7 @@ from lerobot_deltaco.policy.task_file import (
 
 # Prefix that the names of the weights of `DeltacoPolicy.model` had in version 0.1.
 OLD_MODEL_PREFIX = "policy."
-# Of the names of the weights of matching by pretrained features.
+# Prefix of the names of the weights of matching by pretrained features.
 MATCHING_PREFIX = "goals.matching."
 # Options that name files whose contents a checkpoint holds, and the one that is a choice of each evaluation.
 _SOURCES = (
@@ -98,9 +98,14 @@ def check_loaded_weights(policy: nn.Module, path: str) -> None:
                     f"The policy of {path} was trained without `pretrained_matching`. `deltaco-match` "
                     "adds it."
                 )
+            if not missing:
+                raise ValueError(
+                    f"The policy of {path} has matching by pretrained features. Load it with "
+                    "`pretrained_matching=true`."
+                )
             raise ValueError(
-                f"The matching by pretrained features of {path} was not saved by this version. "
-                "`deltaco-match` fits it anew to the training dataset."
+                f"The matching by pretrained features of {path} was saved by another version. "
+                "`deltaco-match` fits it anew to the training dataset; its training cannot be resumed."
             )
         raise ValueError(
             f"{path} does not have the weights of this policy: it lacks {missing[:3] or 'none'}, "

@@ -246,7 +246,9 @@ def load_efficientnet_lite0() -> nn.Module:
             f"The weights in the package {_LITE_PACKAGES[1]} are not the published ones (SHA-256 {digest}). "
             "Do not use them; install the package again."
         )
-    network = EfficientNet.from_name("efficientnet-lite0")
+    # Its initial weights are random, and those of a policy must not depend on these draws.
+    with torch.random.fork_rng(devices=[]):
+        network = EfficientNet.from_name("efficientnet-lite0")
     network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
     return network
 

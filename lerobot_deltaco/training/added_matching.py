@@ -1,4 +1,4 @@
-"""Adds matching by pretrained features to a trained policy."""
+"""Adds matching by pretrained features to a trained policy, or fits that of a policy anew."""
 
 from __future__ import annotations
 
@@ -86,19 +86,26 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
 
 
 def _without_matching(checkpoint: Path, folder: Path) -> Path:
-    """The checkpoint itself if it has no matching; else a copy without it, which any version can load."""
-    config = json.loads((checkpoint / "config.json").read_text(encoding="utf-8"))
-    if not config.get("pretrained_matching"):
-        return checkpoint
-    copy = folder / "checkpoint"
-    shutil.copytree(checkpoint, copy)
-    (copy / "config.json").write_text(
-        json.dumps({**config, "pretrained_matching": False, "known_words": []}), encoding="utf-8"
-    )
-    weights = load_file(copy / WEIGHTS)
+    """The checkpoint itself if it has no matching; else one without, whatever layout its matching has."""
+    weights = load_file(checkpoint / WEIGHTS)
     kept = {name: value for name, value in weights.items() if not name.startswith(MATCHING_PREFIX)}
-    save_file(kept, copy / WEIGHTS, metadata={"format": "pt"})
-    return copy
+    if len(kept) == len(weights):
+        return checkpoint
+    logger.warning("The policy of %s has matching by pretrained features, which is fitted anew.", checkpoint)
+    if not (checkpoint / TRAIN_CONFIG).is_file():
+        logger.warning(
+            "%s does not say which episodes it was trained on. All episodes of the dataset are used.",
+            checkpoint,
+        )
+    for file in checkpoint.iterdir():
+        (folder / file.name).symlink_to(file.resolve())
+    for name in ("config.json", WEIGHTS):
+        (folder / name).unlink()
+    config = json.loads((checkpoint / "config.json").read_text(encoding="utf-8"))
+    config |= {"pretrained_matching": False, "known_words": []}
+    (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
+    save_file(kept, folder / WEIGHTS, metadata={"format": "pt"})
+    return folder
 
 
 def _episodes_of_training(

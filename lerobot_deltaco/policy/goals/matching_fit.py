@@ -35,7 +35,7 @@ def fit_matching(
     seed: int,
     steps: int = _STEPS,
 ) -> None:
-    """Fits the comparisons and the words.
+    """Fits the compared features and the words.
 
     What one episode of a task grasps is to be found in the scene of another, and by some of the words of its
     task: a share of them is left out in each step, so that none is needed.
@@ -55,7 +55,7 @@ def fit_matching(
     generator = torch.Generator().manual_seed(seed)
     device = images.device
     if device.type == "cpu":
-        keep_freed_memory()  # encoding the images takes less than half of the time
+        keep_freed_memory()  # halves the time of encoding the images
     grasps = (~places.isnan().any(dim=1)).nonzero().flatten().cpu()
     drawn = grasps[torch.randperm(len(grasps), generator=generator)[:_MAX_EPISODES]].sort().values
     tasks = [tasks[row] for row in drawn.tolist()]
@@ -153,9 +153,9 @@ def _encoded(matching: PretrainedMatching, images: Tensor) -> ImageMaps:
 @torch.no_grad()
 def _initialize(matching: PretrainedMatching, generator: torch.Generator) -> None:
     """Draws initial weights as PyTorch's layers do, but from a generator."""
-    comparisons = [matching.demo] if matching.named is None else [matching.demo, matching.named]
-    for comparison in comparisons:
-        for layer in comparison.modules():
+    networks = [matching.demo] if matching.named is None else [matching.demo, matching.named]
+    for network in networks:
+        for layer in network.modules():
             if isinstance(layer, torch.nn.Conv2d):
                 bound = layer.weight[0].numel() ** -0.5
                 for weights in layer.parameters():

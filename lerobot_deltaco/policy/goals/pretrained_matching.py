@@ -9,7 +9,7 @@ before a training, or for a trained policy.
             |                         |                            |
         encoder (frozen) <-------> encoder (frozen)          words it has
             |                         |        \                   |
-       comparison <------ same ---> comparison  comparison   sum of the words' descriptors
+    compared features <- same -> compared   compared        sum of the words' descriptors
             |                         |           |                |
     descriptor of what was grasped    |           |                |
             |________ cosine _________|           |____ cosine ____|
@@ -78,8 +78,8 @@ class PretrainedMatching(nn.Module):
         super().__init__()
         self.detail = detail
         self.encoder = EfficientNetLite()
-        self.demo = Comparison(descriptor_dim)
-        self.named = Comparison(descriptor_dim) if n_words else None
+        self.demo = ComparedFeatures(descriptor_dim)
+        self.named = ComparedFeatures(descriptor_dim) if n_words else None
         if n_words:
             # With a bias, which stands for no word.
             self.words = nn.Parameter(torch.zeros(n_words + 1, descriptor_dim))
@@ -162,10 +162,11 @@ class PretrainedMatching(nn.Module):
         return self.named.similarity(self.named(maps), descriptors)
 
 
-class Comparison(nn.Module):
+class ComparedFeatures(nn.Module):
     """Features of places that things are compared by: a linear layer, and a small network of what is around.
 
-    Without the network, things are hardly compared by their shape.
+    With the network, words find shapes. What a demonstration shows is found as well without it
+    (docs/experiment-log.md).
 
     Args:
         dim: Number of features.
