@@ -52,3 +52,9 @@ def make(dataset):
     from small_policies import small_policy
 
     return functools.partial(small_policy, dataset)
+
+
+@pytest.fixture
+def short_fit(monkeypatch):
+    """A fit of matching in two steps, where what it learns does not matter."""
+    monkeypatch.setattr("lerobot_deltaco.policy.goals.matching_fit.fit_matching.__defaults__", (2,))

@@ -48,6 +48,7 @@ def dataset(tmp_path_factory):
     return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
 
 
+@pytest.mark.usefixtures("short_fit")
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_a_row_builds_its_policy_and_takes_a_training_step(dataset, monkeypatch, tmp_path, name):
     use_fake_encoder(monkeypatch)

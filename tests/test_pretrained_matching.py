@@ -283,12 +283,6 @@ def test_an_instruction_with_unknown_words_counts_only_without_a_demonstration()
 # Policies
 
 
-@pytest.fixture
-def short_fit(monkeypatch):
-    """A fit of two steps, where what it learns does not matter."""
-    monkeypatch.setattr("lerobot_deltaco.policy.goals.matching_fit.fit_matching.__defaults__", (2,))
-
-
 @pytest.mark.usefixtures("short_fit")
 def test_a_policy_with_it_trains_and_is_the_same_when_it_is_loaded(dataset, tmp_path):
     data = {"demo_repo_id": "test/table", "demo_root": str(dataset.root)}
