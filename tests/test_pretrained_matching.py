@@ -481,6 +481,13 @@ def test_the_command_says_what_it_cannot_do(checkpoint, dataset, tmp_path, capsy
     code, text = said(checkpoint, *root, "--out", checkpoint / "new")
     assert code == 1
     assert "Name a folder outside of it" in text
+    damaged = tmp_path / "damaged"
+    shutil.copytree(checkpoint, damaged)
+    (damaged / "model.safetensors").write_bytes(b"no weights")
+    code, text = said(damaged, *root, "--out", tmp_path / "new")
+    assert code == 1
+    assert "damaged" in text
+    assert "Traceback" not in text
     code, text = said(tmp_path / "nothing", *root, "--out", tmp_path / "new")
     assert code == 1
     assert "is no checkpoint" in text

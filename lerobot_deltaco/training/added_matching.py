@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lerobot.datasets import LeRobotDatasetMetadata
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from lerobot_deltaco.common.run_folder import TRAIN_CONFIG, WEIGHTS
@@ -87,7 +88,10 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
 
 def _without_matching(checkpoint: Path, folder: Path) -> Path:
     """The checkpoint itself if it has no matching; else one without, whatever layout its matching has."""
-    weights = load_file(checkpoint / WEIGHTS)
+    try:
+        weights = load_file(checkpoint / WEIGHTS)
+    except SafetensorError as error:
+        raise ValueError(f"{checkpoint / WEIGHTS} is damaged ({error}). Fetch or train it again.") from error
     kept = {name: value for name, value in weights.items() if not name.startswith(MATCHING_PREFIX)}
     if len(kept) == len(weights):
         return checkpoint
