@@ -4,6 +4,7 @@ import json
 import random
 import shutil
 import sys
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -96,6 +97,7 @@ def test_an_evaluation_set_is_a_function_of_the_seed_and_the_set(run, loaded):
     assert again == episodes
     other = evaluate(*loaded, plan, set_number=11)
     assert {episode.seed for episode in other}.isdisjoint(episode.seed for episode in episodes)
+    assert evaluate(*loaded, replace(plan, scene_set=10), set_number=11) == episodes
 
 
 def test_the_demonstrations_of_a_task_take_turns_and_are_recorded(loaded):
@@ -221,6 +223,28 @@ def test_the_command_writes_a_record_of_each_checkpoint_once(run, capsys, monkey
     monkeypatch.setattr(sets, "run_set", must_not_run)
     evaluate_command.main(arguments)
     assert capsys.readouterr().out.count("already evaluated") == 2
+
+
+def test_checkpoints_of_different_steps_are_evaluated_in_the_same_scenes_on_request(run, tmp_path, capsys):
+    arguments = [str(run), "--tasks", "4", "--trials", "2", "--scene-set", "2"]
+    evaluate_command.main([*arguments, "--out", str(tmp_path / "same")])
+    evaluate_command.main([*arguments[:-2], "--out", str(tmp_path / "own")])
+    same, own = (
+        [read_record(record_path(tmp_path / name, step)) for step in (1, 2)] for name in ("same", "own")
+    )
+    seeds = [[episode.seed for episode in record.episodes] for record in (*same, *own)]
+    assert seeds[0] == seeds[1] == seeds[3] != seeds[2]
+    assert [record.scene_set for record in (*same, *own)] == [2, 2, None, None]
+    # By default, the set is the step's, so that this record is there already, and that of step 1 is another.
+    capsys.readouterr()
+    evaluate_command.main([*arguments, "--out", str(tmp_path / "own"), "--steps", "2"])
+    assert "already evaluated" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        evaluate_command.main([*arguments, "--out", str(tmp_path / "own"), "--steps", "1"])
+    assert "belongs to another evaluation" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        evaluate_command.main([*arguments[:-1], "-1"])
+    assert "`scene_set` must be at least 0" in capsys.readouterr().err
 
 
 def test_records_of_other_evaluations_are_not_taken_for_this_one(run, capsys):

@@ -454,7 +454,9 @@ def test_a_record_of_the_first_format_says_what_was_so_then(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("wording", "templates"), ("adversarial_draw", "each")], ids=["wording", "draw"]
+    ("name", "value"),
+    [("wording", "templates"), ("adversarial_draw", "each"), ("scene_set", None)],
+    ids=["wording", "draw", "scenes"],
 )
 def test_the_first_records_of_the_second_format_say_what_was_so_then(tmp_path, name, value):
     content = {"format": RECORD_FORMAT, **asdict(record())}
@@ -584,10 +586,17 @@ def test_only_steps_that_all_seeds_have_count(tmp_path):
     assert deltaco.steps == (10_000, 20_000)
     assert (deltaco.last.count, deltaco.last.total) == (6, 12)
     assert bc_z.steps == (10_000, 20_000, 30_000)
-    missing, ends, uneven = report.notes
+    missing, ends, scenes, uneven = report.notes
     assert "scenario_a/bc_z has no records of seed 1" in missing
     assert "scenario_a/deltaco 20,000, scenario_a/bc_z 30,000" in ends
+    assert "different sets of scenes (numbers 20,000 and 30,000" in scenes
     assert "Left out of scenario_a/deltaco, seed 0: steps 30,000 and 40,000" in uneven
+
+
+def test_checkpoints_of_different_steps_may_share_a_set_of_scenes(tmp_path):
+    write(tmp_path, record(step=10), record("scenario_a/bc_z", step=20, scene_set=10))
+    (ends,) = make_report(find_records([tmp_path])).notes
+    assert "end at different steps" in ends
 
 
 def test_an_experiment_without_a_common_step_is_left_out(tmp_path):

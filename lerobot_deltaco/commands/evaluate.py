@@ -31,6 +31,21 @@ from lerobot_deltaco.evaluation.record import (
     record_path,
 )
 
+# What a record must share with the plan of an evaluation to be its record.
+_SETTINGS = (
+    "tasks",
+    "trials",
+    "scene_set",
+    "counterfactual",
+    "ambiguity",
+    "image_size",
+    "episode_length",
+    "objects",
+    "adversarial_probability",
+    "adversarial_draw",
+    "wording",
+)
+
 
 def main(arguments: list[str] | None = None) -> None:
     """Evaluates the checkpoints that have no record yet, and prints the success rates."""
@@ -42,6 +57,7 @@ def main(arguments: list[str] | None = None) -> None:
             options.tasks,
             options.trials,
             options.seed,
+            options.scene_set,
             options.counterfactual,
             options.ambiguity,
             objects=options.objects,
@@ -199,31 +215,11 @@ def _check_same_evaluation(
             f"{path} belongs to another run: {record.experiment!r} with seed {record.run_seed}. Expected "
             f"{experiment!r} with seed {description.seed}. Name another folder with --out."
         )
-    made_for = _settings(
-        record.tasks,
-        record.trials,
-        record.evaluation_seed,
-        record.counterfactual,
-        record.ambiguity,
-        record.image_size,
-        record.episode_length,
-        record.objects,
-        record.adversarial_probability,
-        record.adversarial_draw,
-        record.wording,
-    )
-    asked_for = _settings(
-        plan.tasks,
-        plan.trials,
-        plan.seed,
-        plan.counterfactual,
-        plan.ambiguity,
-        plan.image_size,
-        plan.episode_length,
-        plan.objects,
-        plan.adversarial_probability,
-        plan.adversarial_draw,
-        plan.wording,
+    made_for = {name: getattr(record, name) for name in _SETTINGS} | {"seed": record.evaluation_seed}
+    asked_for = {name: getattr(plan, name) for name in _SETTINGS} | {"seed": plan.seed}
+    # A record without a set of scenes has that of its step.
+    made_for["scene_set"], asked_for["scene_set"] = (
+        record.step if number is None else number for number in (record.scene_set, plan.scene_set)
     )
     if options.n_demonstrations is not None:
         made_for["n_demonstrations"] = record.policy.get("n_demonstrations", 1)
@@ -235,35 +231,6 @@ def _check_same_evaluation(
             f"{path} belongs to another evaluation: {made_for}. Expected {asked_for}. Use the same "
             "arguments, or name another folder for the records with --out."
         )
-
-
-def _settings(
-    tasks: str,
-    trials: int,
-    seed: int,
-    counterfactual: str,
-    ambiguity: str,
-    image_size: int,
-    episode_length: int,
-    objects: str | None,
-    adversarial_probability: float,
-    adversarial_draw: str,
-    wording: str,
-) -> dict[str, object]:
-    """The arguments of an evaluation, for comparison and for errors."""
-    return {
-        "tasks": tasks,
-        "trials": trials,
-        "seed": seed,
-        "counterfactual": counterfactual,
-        "ambiguity": ambiguity,
-        "image_size": image_size,
-        "episode_length": episode_length,
-        "objects": objects,
-        "adversarial_probability": adversarial_probability,
-        "adversarial_draw": adversarial_draw,
-        "wording": wording,
-    }
 
 
 def _text(run: Path, record: EvaluationRecord, remark: str) -> str:
@@ -325,7 +292,15 @@ def _parser() -> argparse.ArgumentParser:
         "--seed",
         type=int,
         default=plan.seed,
-        help="evaluation seed, from which the scenes derive, along with the step (default: %(default)s)",
+        help="evaluation seed, from which the scenes derive, along with the number of their set (default: "
+        "%(default)s)",
+    )
+    parser.add_argument(
+        "--scene-set",
+        type=int,
+        metavar="N",
+        help="number of the set of scenes: the same number gives checkpoints of different steps the same "
+        "scenes (default: the checkpoint's step)",
     )
     parser.add_argument(
         "--counterfactual",

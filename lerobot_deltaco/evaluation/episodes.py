@@ -49,13 +49,15 @@ def draw_episodes(
 
     Args:
         plan: Plan of the set.
-        set_number: Number of the set. Different sets share no scene.
+        set_number: Number of the set of scenes, unless the plan names one. Different sets share no scene.
         demonstrated: Task strings of which there are demonstrations; None if that is not known.
             Counterfactual demonstrations are of these tasks.
 
     Raises:
         ValueError: There is no other task for a counterfactual demonstration or instruction.
     """
+    if plan.scene_set is not None:
+        set_number = plan.scene_set
     task_ids, sentences = select_tasks(plan.tasks), plan.sentences
     tasks = [get_task(task_id) for task_id in task_ids]
     if plan.counterfactual == "demo" and demonstrated is not None:

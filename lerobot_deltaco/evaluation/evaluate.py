@@ -81,7 +81,8 @@ def evaluate(
         preprocessor: Preprocessor of the policy.
         postprocessor: Postprocessor of the policy.
         plan: Episodes to run.
-        set_number: Number of the evaluation set, usually the training step. Different sets share no scene.
+        set_number: Number of the evaluation set, usually the training step. Different sets share no scene,
+            unless the plan names a `scene_set`.
 
     Returns:
         The episodes, task after task.

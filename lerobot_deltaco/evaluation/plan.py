@@ -26,6 +26,9 @@ class EvaluationPlan:
         trials: Number of episodes of each task, at least 1.
         seed: Seed of the scenes, at least 0; the number of the set, the task and the trial also determine
             them.
+        scene_set: Number of the set of scenes, at least 0. None is the training step of what is evaluated, so
+            that each evaluation set of a training run has scenes of its own; with a number, checkpoints of
+            different steps can be compared in the same scenes.
         counterfactual: "none": demonstration and instruction are those of the scene's task. "demo" or
             "instruction": that one is another task's, which asks for another object of the scene and for the
             other container, if there is such a task.
@@ -50,6 +53,7 @@ class EvaluationPlan:
     tasks: str = "scenario_a_test"
     trials: int = 2
     seed: int = 0
+    scene_set: int | None = None
     counterfactual: Counterfactual = "none"
     ambiguity: Ambiguity = "container"
     image_size: int = 48
@@ -67,6 +71,8 @@ class EvaluationPlan:
         check_field_types(self)
         task_ids = select_tasks(self.tasks)
         ranges = {name: ENV_RANGES[name] for name in ("image_size", "episode_length")}
+        if self.scene_set is not None:
+            ranges["scene_set"] = (0, 2**63 - 1)
         check_ranges(self, {"trials": (1, 1_000_000), "seed": (0, 2**63 - 1), **ranges})
         objects = default_objects(self.tasks) if self.objects is None else self.objects
         object.__setattr__(self, "objects", objects)

@@ -30,7 +30,7 @@ BENCHMARK = "benchmark"
 # The `wording` of an evaluation with the benchmark's own instructions.
 TEMPLATES = "templates"
 # Fields that the first records of format 2 do not have, and what was so in all of them.
-_ADDED_TO_FORMAT_2 = MappingProxyType({"wording": TEMPLATES, "adversarial_draw": "each"})
+_ADDED_TO_FORMAT_2 = MappingProxyType({"wording": TEMPLATES, "adversarial_draw": "each", "scene_set": None})
 
 
 class RecordError(ValueError):
@@ -91,7 +91,7 @@ class EvaluationRecord:
         method: Method of the policy: deltaco, language_only, ...
         run_seed: Seed of the training run.
         step: Training step of the checkpoint.
-        evaluation_seed: Seed of the scenes, together with the step.
+        evaluation_seed: Seed of the scenes, together with the number of their set.
         counterfactual: "none"; "demo" or "instruction": that was another task's.
         ambiguity: Ambiguity of the scenes: "container", the paper's scheme (i), or "object", scheme (ii).
         tasks: The selection of tasks, such as "scenario_a_test".
@@ -110,6 +110,7 @@ class EvaluationRecord:
             distractors of a scene, as in the authors' code.
         wording: In whose words the instructions were: "templates", the benchmark's own; a file of sentences
             with its split and SHA-256; or the one sentence that all tasks had.
+        scene_set: Number of the set of scenes; None is the step.
     """
 
     experiment: str
@@ -132,6 +133,7 @@ class EvaluationRecord:
     adversarial_probability: float = ADVERSARIAL_PROBABILITY
     adversarial_draw: AdversarialDraw = "each"
     wording: str = TEMPLATES
+    scene_set: int | None = None
 
     @property
     def success_rate(self) -> float:

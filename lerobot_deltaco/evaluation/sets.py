@@ -37,7 +37,8 @@ def run_set(
 
     Args:
         folder: Folder that contains `evaluations`, usually that of the training run.
-        step: Training step of the policy, which is also the number of the set.
+        step: Training step of the policy, which is also the number of the set of scenes, unless the plan
+            names one.
         policy: In evaluation mode, on its device.
         preprocessor: Preprocessor of the policy.
         postprocessor: Postprocessor of the policy.
@@ -79,6 +80,7 @@ def run_set(
         image_size=plan.image_size,
         episode_length=plan.episode_length,
         wording=plan.wording,
+        scene_set=plan.scene_set,
     )
     write_lerobot_info(outcomes, record.seconds, extras_folder(folder, step, plan.counterfactual))
     write_record(record, record_path(folder, step, plan.counterfactual))

@@ -116,6 +116,13 @@ class Series:
         return task_rates(self.last_episodes)
 
     @property
+    def last_scene_sets(self) -> tuple[int, ...]:
+        """Numbers of the sets of scenes at the last step that counts, ascending; one, unless seeds differ."""
+        step = self.steps[-1]
+        numbers = [self.runs[seed][step].record.scene_set for seed in self.seeds]
+        return tuple(sorted({step if number is None else number for number in numbers}))
+
+    @property
     def sets(self) -> list[EvaluationSet]:
         """All evaluation sets by seed and step, those that do not count included."""
         return [self.runs[seed][step] for seed in self.seeds for step in sorted(self.runs[seed])]
@@ -312,6 +319,13 @@ def _notes_on_comparison(group: Sequence[Series]) -> Iterator[str]:
             "Experiments of one table end at different steps, so that their last rates are not of equally "
             f"long training: {', '.join(f'{name} {step:,}' for name, step in ends.items())}."
         )
+    scene_sets = {number for series in group if series.steps for number in series.last_scene_sets}
+    if len(scene_sets) > 1:
+        yield (
+            f"The last rates of one table are of different sets of scenes (numbers {_listed(scene_sets)}; by "
+            "default, the step), so that differences between them are paired by task, but not by scene. "
+            "`deltaco-evaluate --scene-set` evaluates checkpoints of different steps in the same scenes."
+        )
 
 
 def _notes_on_series(series: Series) -> Iterator[str]:
@@ -358,8 +372,12 @@ def _default_options() -> dict[str, Any]:
 
 def counted(noun: str, numbers: Sequence[int]) -> str:
     """For example "seeds 0, 1 and 2"; of many, only the first and the last."""
-    words = [f"{number:,}" for number in numbers]
-    if len(words) > 6:
-        return f"{len(words)} {noun}s from {words[0]} to {words[-1]}"
-    text = words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-    return f"{noun}{'s' * (len(words) > 1)} {text}"
+    if len(numbers) > 6:
+        return f"{len(numbers)} {noun}s from {numbers[0]:,} to {numbers[-1]:,}"
+    return f"{noun}{'s' * (len(numbers) > 1)} {_listed(numbers)}"
+
+
+def _listed(numbers: Iterable[int]) -> str:
+    """For example "0, 1 and 2"."""
+    words = [f"{number:,}" for number in sorted(numbers)]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
