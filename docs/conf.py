@@ -11,8 +11,8 @@ DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 sys.path[:0] = [str(DOCS), str(ROOT), str(ROOT / "envs")]
 
+import api_pages  # noqa: E402
 import docstrings  # noqa: E402
-import generated_pages  # noqa: E402
 
 project = "DeL-TaCo for LeRobot"
 author = "The contributors of lerobot_policy_deltaco"
@@ -27,8 +27,8 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
 ]
-exclude_patterns = ["_build", "generated"]
-myst_enable_extensions = ["colon_fence", "deflist"]
+exclude_patterns = ["_build"]
+myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 # Names that several modules have are not linked.
 suppress_warnings = ["ref.python"]
@@ -48,7 +48,7 @@ napoleon_use_ivar = True
 
 
 def setup(app):
-    """Generates pages before Sphinx looks for sources, and lets autodoc read Markdown docstrings."""
-    generated_pages.write(DOCS)
+    """Writes the API reference before Sphinx looks for sources, and lets autodoc read Markdown docstrings."""
+    api_pages.write(DOCS)
     app.connect("autodoc-process-docstring", docstrings.to_restructured_text, priority=100)
     app.connect("autodoc-skip-member", docstrings.skip_named_tuple_fields)

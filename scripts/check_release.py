@@ -53,7 +53,8 @@ class ReleaseError(Exception):
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs all checks, and stops at the first that fails."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    # Without abbreviations: `make release` looks for --rehearse itself.
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
     parser.add_argument(
         "--rehearse",
         action="store_true",
@@ -227,11 +228,20 @@ def uv() -> str:
 
 
 def _run(command: Sequence[str], folder: Path) -> str:
-    """Output of a command. It sees nothing of this environment's packages."""
+    """Output of a command. It sees nothing of this environment's packages.
+
+    Raises:
+        ReleaseError: It fails, or there is no such command.
+    """
     environment = {
         name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")
     }
-    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    try:
+        result = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+        )
+    except FileNotFoundError as error:
+        raise ReleaseError(f"`{command[0]}` is missing. Install it.") from error
     if result.returncode != 0:
         raise ReleaseError(f"`{' '.join(command)[:200]}` failed:\n{(result.stdout + result.stderr)[-3000:]}")
     return result.stdout

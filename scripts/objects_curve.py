@@ -12,12 +12,13 @@ from matplotlib.figure import Figure
 from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.evaluation.record import EpisodeResult
-from lerobot_deltaco.reporting.series import find_records, make_report
+from lerobot_deltaco.reporting.series import ReportError, find_records, make_report
 from lerobot_deltaco.reporting.statistics import KINDS
 from lerobot_deltaco.reporting.task_bootstrap import Estimate, mean_rate, task_rates
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "results" / "small_objects"
+RECORDS = FOLDER / "records"
 IMAGE = FOLDER / "objects.png"
 COLORS = {"all tasks": "#c8102e", "name": "#2b3a55", "color": "#e69f00", "shape": "#009e73"}
 
@@ -25,7 +26,7 @@ COLORS = {"all tasks": "#c8102e", "name": "#2b3a55", "color": "#e69f00", "shape"
 def curves() -> dict[str, dict[int, Estimate]]:
     """Success of all tasks and of each kind, by the number of training objects."""
     found: dict[str, dict[int, Estimate]] = defaultdict(dict)
-    for series in make_report(find_records([FOLDER / "records"])).regular:
+    for series in make_report(find_records([RECORDS])).regular:
         number = series.experiment.rpartition("/objects_")[2]
         if not number.isdecimal():
             continue  # another policy, with as many objects
@@ -40,10 +41,16 @@ def curves() -> dict[str, dict[int, Estimate]]:
 
 def main() -> None:
     """Writes the image."""
+    try:
+        found = curves()
+    except ReportError as error:
+        sys.exit(str(error))
+    if not found:
+        sys.exit(f"{RECORDS} has no records of the experiments objects_N, which are drawn.")
     figure = Figure(figsize=(6.5, 4.0), dpi=140, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     ax = figure.subplots()
-    for n, (name, rates) in enumerate(curves().items()):
+    for n, (name, rates) in enumerate(found.items()):
         numbers = sorted(rates)
         values = [rates[number].value for number in numbers]
         errors = [

@@ -2,18 +2,21 @@
 
     UV_PUBLISH_TOKEN=... HF_TOKEN=... make release HUB_USER=you DATASETS="data/train data/test"
 
-Everything that can be refused beforehand is refused before the first part is published. A part replaces what
-was published of it before, so that the command can be repeated after an interruption.
+Everything that can be refused beforehand is refused before the first part is published. The command can be
+repeated after an interruption: on the Hub, a part replaces what was published of it before, and the package
+index accepts the same files again. It accepts no other files of a version that it has.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from check_release import DISTRIBUTION, ROOT, ReleaseError, find_wheel, uv
@@ -29,6 +32,7 @@ from lerobot_deltaco.data.hub import (
 
 CHECKPOINT = ROOT / "checkpoints" / "pick_place"
 ENVIRONMENT = ROOT / "envhub"
+CARD = "README.md"
 PARTS = ("package", "policy", "environment", "datasets")
 
 
@@ -56,6 +60,24 @@ class Release:
         """Repository of the environment on the Hub, for LeRobot's `make_env`."""
         return f"{self.user}/deltaco"
 
+    @cached_property
+    def policy_files(self) -> dict[str, bytes]:
+        """Files of the trained policy's repository, by name.
+
+        Raises:
+            ReleaseError: They cannot be read, or the card does not name the policy.
+        """
+        return _folder(CHECKPOINT, {CHECKPOINT.relative_to(ROOT).as_posix(): self.policy_id})
+
+    @cached_property
+    def environment_files(self) -> dict[str, bytes]:
+        """Files of the environment's repository, by name.
+
+        Raises:
+            ReleaseError: They cannot be read, or the card does not name the environment.
+        """
+        return _folder(ENVIRONMENT, {"USER/NAME": self.environment_id})
+
     def dataset_id(self, root: Path) -> str:
         """Repository of a dataset on the Hub, named after the dataset's folder."""
         return f"{self.user}/deltaco_{root.resolve().name}"
@@ -64,15 +86,22 @@ class Release:
         """Checks everything that can be checked before the first part is published.
 
         Raises:
-            ReleaseError: A distribution, a dataset, a name or credentials are missing or not valid.
+            ReleaseError: A distribution, a card, a name or credentials are missing or not valid.
+            HubError: A dataset, a repository's name or credentials are missing or not valid.
         """
         if "package" in parts:
             self._distributions()
+            if shutil.which(uv()) is None:
+                raise ReleaseError("uv is missing, which uploads the package. Install it: pip install uv.")
             if "UV_PUBLISH_TOKEN" not in os.environ:
                 raise ReleaseError("Set UV_PUBLISH_TOKEN to a token of the package index.")
         if parts == ("package",):
             return
         check_repo_id(self.policy_id)
+        if "policy" in parts:
+            _ = self.policy_files
+        if "environment" in parts:
+            _ = self.environment_files
         if "datasets" in parts:
             ids = [self.dataset_id(root) for root in self.datasets]
             if len(set(ids)) < len(ids):
@@ -98,16 +127,11 @@ class Release:
 
     def publish_policy(self) -> list[str]:
         """Pushes the trained policy that the project comes with."""
-        files = _folder(CHECKPOINT)
-        here = CHECKPOINT.relative_to(ROOT).as_posix()
-        files["README.md"] = _replaced(files["README.md"], {here: self.policy_id})
-        return [push_files(files, self.policy_id, "Policy")]
+        return [push_files(self.policy_files, self.policy_id, "Policy")]
 
     def publish_environment(self) -> list[str]:
         """Pushes the files by which LeRobot makes the environment from the Hub."""
-        files = _folder(ENVIRONMENT)
-        files["README.md"] = _replaced(files["README.md"], {"USER/NAME": self.environment_id})
-        return [push_files(files, self.environment_id, "Environment")]
+        return [push_files(self.environment_files, self.environment_id, "Environment")]
 
     def publish_datasets(self) -> list[str]:
         """Pushes the datasets with their cards."""
@@ -170,22 +194,23 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _folder(root: Path) -> dict[str, bytes]:
-    """Files of a folder without subfolders, by name."""
-    return {path.name: path.read_bytes() for path in sorted(root.iterdir()) if path.is_file()}
-
-
-def _replaced(text: bytes, names: Mapping[str, str]) -> bytes:
-    """A text in which names that stand for a repository are replaced.
+def _folder(root: Path, names: Mapping[str, str]) -> dict[str, bytes]:
+    """Files of a folder without subfolders, by name. In its card, names are replaced by repositories.
 
     Raises:
-        ReleaseError: A name does not occur.
+        ReleaseError: The files cannot be read, there is no card, or a name does not occur in it.
     """
+    try:
+        files = {path.name: path.read_bytes() for path in sorted(root.iterdir()) if path.is_file()}
+    except OSError as error:
+        raise ReleaseError(f"{root} cannot be read: {error}.") from error
+    if CARD not in files:
+        raise ReleaseError(f"{root} has no {CARD}, which is the card of the repository.")
     for name, repo_id in names.items():
-        if name.encode() not in text:
-            raise ReleaseError(f"The card does not say {name!r}, which is replaced by {repo_id!r}.")
-        text = text.replace(name.encode(), repo_id.encode())
-    return text
+        if name.encode() not in files[CARD]:
+            raise ReleaseError(f"{root / CARD} does not say {name!r}, which is replaced by {repo_id!r}.")
+        files[CARD] = files[CARD].replace(name.encode(), repo_id.encode())
+    return files
 
 
 if __name__ == "__main__":

@@ -21,8 +21,11 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
 
+import api_pages  # noqa: E402
 import docstrings  # noqa: E402
-import generated_pages  # noqa: E402
+import generated_sections  # noqa: E402
+
+from lerobot_deltaco.reporting.page_tables import PageTableError  # noqa: E402
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PAGES = [
@@ -315,11 +318,11 @@ def test_the_experiments_page_lists_the_folders():
     assert all(f"| `{name}` |" in text for name in folders)
 
 
-# Generated pages
+# Generated sections and pages
 
 
 def test_every_policy_option_is_documented():
-    spec = generated_pages.documented(generated_pages.POLICY_OPTIONS)
+    spec = generated_sections.documented(generated_sections.POLICY_OPTIONS)
     # LeRobot's own, and what the policy finds out by itself.
     assert set(spec.types) - set(spec.arguments) == {
         "push_to_hub",
@@ -327,48 +330,59 @@ def test_every_policy_option_is_documented():
         "one_hot_tasks",
         "demo_feature_dim",
     }
-    text = generated_pages.options(generated_pages.POLICY_OPTIONS, "--policy.")
+    text = generated_sections.options(generated_sections.POLICY_OPTIONS, "--policy.")
     assert "`--policy.motion_modes` (int, default `1`)" in text
     assert "`--policy.compile` (bool, default `false`)" in text
     assert "`--policy.film` (str, not set by default)" in text
 
 
 def test_environment_options_show_the_values_of_constants():
-    text = generated_pages.options(generated_pages.ENVIRONMENT_OPTIONS, "--env.")
+    text = generated_sections.options(generated_sections.ENVIRONMENT_OPTIONS, "--env.")
     assert "`--env.episode_length` (int, default `30`)" in text
 
 
 def test_the_specification_has_every_observation_action_and_info():
-    text = generated_pages.environment()
+    text = generated_sections.environment()
     for heading in ("Observation", "Action", "Reward and success", "Info", "Arguments"):
-        assert f"## {heading}\n" in text
+        assert f"### {heading}\n" in text
     for name in ("pixels", "agent_pos", "is_success", "right_container", "render_size"):
         assert f"`{name}`" in text
 
 
 def test_generated_tables_add_up():
-    assert generated_pages.objects_table().count("\n") == 2 + 32
-    scenarios = generated_pages.scenarios_table()
+    assert generated_sections.objects_table().count("\n") == 2 + 32
+    scenarios = generated_sections.scenarios_table()
     assert "| `scenario_a_train` | 0 to 23, 36 to 44 | 198 |" in scenarios
     assert "| `scenario_a_test` | 24 to 35, 45 to 49 | 102 |" in scenarios
-    assert "| color | 32 to 39 | 48 |" in generated_pages.tasks_table()
+    assert "| color | 32 to 39 | 48 |" in generated_sections.tasks_table()
 
 
 def test_the_api_reference_has_every_public_module_but_the_commands():
-    text = "\n".join(generated_pages.api_pages().values())
+    text = "\n".join(api_pages.api_pages().values())
     for module in ("gym_deltaco.tasks", "lerobot_deltaco.modeling_deltaco", "lerobot_deltaco.policy.losses"):
         assert f".. automodule:: {module}\n" in text
     assert "lerobot_deltaco.commands" not in text
 
 
 def test_pages_are_written_once_and_stale_ones_removed(tmp_path):
-    stale = tmp_path / "generated" / "stale.md"
-    stale.parent.mkdir()
+    stale = tmp_path / api_pages.FOLDER / "stale.md"
+    stale.parent.mkdir(parents=True)
     stale.touch()
-    paths = generated_pages.write(tmp_path)
+    paths = api_pages.write(tmp_path)
     assert not stale.exists()
     written = [path.stat().st_mtime_ns for path in paths]
-    assert [path.stat().st_mtime_ns for path in generated_pages.write(tmp_path)] == written
+    assert [path.stat().st_mtime_ns for path in api_pages.write(tmp_path)] == written
+
+
+@pytest.mark.parametrize("name", generated_sections.SECTIONS)
+def test_the_pages_have_the_sections_that_the_code_gives(name):
+    page = (DOCS / name).read_text()
+    assert generated_sections.updated(page, name) == page, "Write them anew: python scripts/update_docs.py"
+
+
+def test_a_page_without_a_place_for_a_section_is_named():
+    with pytest.raises(PageTableError, match="From the code: the environment"):
+        generated_sections.updated("# A page", "benchmark.md")
 
 
 def test_markdown_docstrings_become_restructured_text():

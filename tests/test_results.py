@@ -114,7 +114,7 @@ def test_experiments_that_are_compared_are_evaluated_alike():
 
 def test_the_papers_tables_are_what_the_records_give():
     page = (ROOT / PAPER_PAGE).read_text()
-    assert updated_paper_page(page, ROOT) == page, "Write it anew: python scripts/result_tables.py"
+    assert updated_paper_page(page, ROOT) == page, "Write it anew: python scripts/update_docs.py"
 
 
 def test_the_papers_tables_have_each_row_once():
@@ -147,7 +147,7 @@ def test_a_page_without_a_place_for_the_table_is_rejected():
 
 def test_the_leaderboard_is_what_the_records_give():
     page = (ROOT / PAGE).read_text()
-    assert updated(page, ROOT) == page, "Write it anew: python scripts/result_tables.py"
+    assert updated(page, ROOT) == page, "Write it anew: python scripts/update_docs.py"
 
 
 def is_method(record):

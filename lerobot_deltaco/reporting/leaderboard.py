@@ -1,6 +1,6 @@
 """The table of docs/leaderboard.md, made from the committed records and `results/leaderboard.yaml`.
 
-`python scripts/result_tables.py`, in a clone of the repository, writes it anew.
+`python scripts/update_docs.py`, in a clone of the repository, writes it anew.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The tables of docs/paper.md: the paper's rows beside the records of the same rows at a small scale.
 
-`python scripts/result_tables.py`, in a clone of the repository, writes them anew.
+`python scripts/update_docs.py`, in a clone of the repository, writes them anew.
 """
 
 from __future__ import annotations

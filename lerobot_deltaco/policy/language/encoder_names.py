@@ -3,7 +3,8 @@
 from types import MappingProxyType
 from typing import NamedTuple
 
-MINILM_L6, MINILM_L3 = "all-MiniLM-L6-v2", "paraphrase-MiniLM-L3-v2"
+MINILM_L6 = "all-MiniLM-L6-v2"
+MINILM_L3 = "paraphrase-MiniLM-L3-v2"
 DEFAULT_LANGUAGE_ENCODER = MINILM_L3  # the authors'
 CLIP = "clip-vit-base-patch32"
 

@@ -1,6 +1,8 @@
-"""Pages that are made from the code when the site is built, so that they cannot drift from it.
+"""Sections of the documentation's pages that are made from the code, so that they cannot drift from it.
 
-Docstrings are read without importing their modules, which takes neither PyBullet nor LeRobot.
+They stand in the pages themselves, so that these can be read on GitHub, too. `python scripts/update_docs.py`
+writes them anew, and a test compares them. Docstrings are read without importing their modules, which takes
+neither PyBullet nor LeRobot.
 """
 
 from __future__ import annotations
@@ -8,22 +10,19 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, TASK_SETS, TASKS, get_task
+from lerobot_deltaco.reporting.page_tables import replaced
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = "PickPlaceEnv"
 ENVIRONMENT_OPTIONS = "DeltacoEnv"
 POLICY_OPTIONS = "DeltacoConfig"
-PACKAGES = {
-    "gym_deltaco": ROOT / "envs" / "gym_deltaco",
-    "lerobot_deltaco": ROOT / "lerobot_deltaco",
-}
-# The command line and the demo are described by their own pages and `--help`.
-WITHOUT_API = ("lerobot_deltaco.commands", "lerobot_deltaco.demo")
+SOURCES = (ROOT / "envs" / "gym_deltaco", ROOT / "lerobot_deltaco")
 
 
 class Documented(NamedTuple):
@@ -32,41 +31,22 @@ class Documented(NamedTuple):
     text: str  # Markdown, up to the sections
     arguments: dict[str, str]  # descriptions, in the docstring's order
     types: dict[str, str]  # of the fields of a dataclass, or of the constructor's arguments
-    defaults: dict[str, str]
+    defaults: dict[str, ast.expr]
 
 
-def write(docs: Path) -> list[Path]:
-    """Writes all generated files into the documentation's folder, and removes those of an earlier build.
+def updated(page: str, name: str) -> str:
+    """A page with its sections made anew.
 
     Args:
-        docs: The folder of the documentation.
+        page: Text of the page.
+        name: Its name, one of `SECTIONS`.
 
-    Returns:
-        The files.
+    Raises:
+        PageTableError: The page has no place for one of them.
     """
-    texts = {
-        "generated/environment.md": environment(),
-        "generated/environment_options.md": options(ENVIRONMENT_OPTIONS, prefix="--env."),
-        "generated/policy_options.md": options(POLICY_OPTIONS, prefix="--policy."),
-        "generated/objects.md": objects_table(),
-        "generated/tasks.md": tasks_table(),
-        "generated/scenarios.md": scenarios_table(),
-        **{f"api/generated/{name}.md": text for name, text in api_pages().items()},
-    }
-    for folder in ("generated", "api/generated"):
-        (docs / folder).mkdir(parents=True, exist_ok=True)
-        for path in (docs / folder).glob("*.md"):
-            if path.relative_to(docs).as_posix() not in texts:
-                path.unlink()
-    for name, text in texts.items():
-        path = docs / name
-        # An unchanged file keeps its date, so that Sphinx does not read it again.
-        if not path.exists() or path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
-    return [docs / name for name in texts]
-
-
-# Docstrings
+    for section, make in SECTIONS[name].items():
+        page = replaced(page, f"<!-- From the code: {section}. -->", f"<!-- End of {section}. -->", make())
+    return page
 
 
 def documented(name: str) -> Documented:
@@ -83,26 +63,26 @@ def documented(name: str) -> Documented:
     if docstring is None:
         raise LookupError(f"The class {name} has no docstring.")
     types: dict[str, str] = {}
-    defaults: dict[str, str] = {}
+    defaults: dict[str, ast.expr] = {}
     for statement in node.body:
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
             types[statement.target.id] = ast.unparse(statement.annotation)
             if statement.value is not None:
-                defaults[statement.target.id] = ast.unparse(statement.value)
+                defaults[statement.target.id] = statement.value
         elif isinstance(statement, ast.FunctionDef) and statement.name == "__init__":
             arguments = statement.args.args
             n_required = len(arguments) - len(statement.args.defaults)
             for k, argument in enumerate(arguments):
                 types[argument.arg] = ast.unparse(argument.annotation) if argument.annotation else ""
                 if k >= n_required:
-                    defaults[argument.arg] = ast.unparse(statement.args.defaults[k - n_required])
+                    defaults[argument.arg] = statement.args.defaults[k - n_required]
     text, *rest = re.split(r"^(?=(?:Args|Attributes|Raises|Returns):$)", docstring, flags=re.MULTILINE)
     section = next((part for part in rest if part.startswith("Args:")), "Args:")
     return Documented(text.strip(), _arguments(section), types, defaults)
 
 
 def _class(name: str) -> ast.ClassDef:
-    for folder in PACKAGES.values():
+    for folder in SOURCES:
         for path in sorted(folder.rglob("*.py")):
             text = path.read_text(encoding="utf-8")
             if f"class {name}" not in text:
@@ -110,7 +90,7 @@ def _class(name: str) -> ast.ClassDef:
             for node in ast.parse(text).body:
                 if isinstance(node, ast.ClassDef) and node.name == name:
                     return node
-    raise LookupError(f"There is no class {name} in {', '.join(PACKAGES)}.")
+    raise LookupError(f"There is no class {name} in {', '.join(folder.name for folder in SOURCES)}.")
 
 
 def _arguments(section: str) -> dict[str, str]:
@@ -129,16 +109,18 @@ def _arguments(section: str) -> dict[str, str]:
 
 
 def environment() -> str:
-    """The specification of the environment: its docstring, with its arguments as a table."""
+    """The specification of the environment: its docstring, a level down, with its arguments as a table."""
     spec = documented(ENVIRONMENT)
     rows = [
-        (f"`{name}`", f"`{spec.defaults[name]}`", description) for name, description in spec.arguments.items()
+        (f"`{name}`", f"`{_value(spec.defaults[name])!r}`", description)
+        for name, description in spec.arguments.items()
     ]
-    return f"{spec.text}\n\n## Arguments\n\n{table(('argument', 'default', 'meaning'), rows)}"
+    text = f"{spec.text}\n\n## Arguments\n\n{table(('argument', 'default', 'meaning'), rows)}"
+    return re.sub(r"^##", "###", text, flags=re.MULTILINE)
 
 
 def options(name: str, prefix: str) -> str:
-    """The options of a configuration, as a definition list.
+    """The options of a configuration, as a list.
 
     Args:
         name: Name of the dataclass.
@@ -148,29 +130,48 @@ def options(name: str, prefix: str) -> str:
     entries = []
     for option, description in spec.arguments.items():
         kind = spec.types[option].replace(" | None", "")
-        entries.append(f"`{prefix}{option}` ({kind}, {_default(spec.defaults[option])})\n: {description}\n")
-    return "\n".join(entries)
+        entries.append(f"- `{prefix}{option}` ({kind}, {_default(spec.defaults[option])}): {description}\n")
+    return "".join(entries)
 
 
-def _default(source: str) -> str:
+def _default(source: ast.expr) -> str:
     """A default value as the command line takes it."""
-    if source == "None":
+    value = _value(source)
+    if value is None:
         return "not set by default"
-    try:
-        value = ast.literal_eval(source)
-    except ValueError:
-        value = _constant(source)
     return f"default `{str(value).lower() if isinstance(value, bool) else value}`"
 
 
-def _constant(name: str) -> str:
-    """The value of a constant that is assigned a literal anywhere in the packages; else its name."""
-    for folder in PACKAGES.values():
+def _value(source: ast.expr) -> object:
+    """The value of a default: a literal, a constant of the packages, or what a factory makes.
+
+    Raises:
+        LookupError: It is something else.
+    """
+    if isinstance(source, ast.Name):
+        return _constant(source.id)
+    if isinstance(source, ast.Call) and ast.unparse(source) == "field(default_factory=list)":
+        return []
+    return ast.literal_eval(source)
+
+
+def _constant(name: str) -> object:
+    """The value of a constant, wherever in the packages it is assigned one.
+
+    Raises:
+        LookupError: There is none.
+    """
+    for folder in SOURCES:
         for path in sorted(folder.rglob("*.py")):
-            found = re.search(rf"^{name} = ([\w.'\"-]+)", path.read_text(encoding="utf-8"), re.MULTILINE)
-            if found:
-                return found[1].strip("'\"")
-    return name
+            text = path.read_text(encoding="utf-8")
+            if not re.search(rf"^{name}\b", text, re.MULTILINE):
+                continue
+            for node in ast.parse(text).body:
+                targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+                is_it = any(isinstance(target, ast.Name) and target.id == name for target in targets)
+                if is_it and isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                    return _value(node.value)
+    raise LookupError(f"The constant {name} is assigned nowhere.")
 
 
 # Tables
@@ -207,14 +208,14 @@ def tasks_table() -> str:
         examples.setdefault(task.kind, f"{task.index}: “{task.instruction}”")
     first_color = len(OBJECTS)
     first_shape = first_color + len(COLORS)
-    spans = {
+    rows_of_kind = {
         "name": (0, first_color - 1),
         "color": (first_color, first_shape - 1),
         "shape": (first_shape, first_shape + len(SHAPES) - 1),
     }
     rows = [
         (kind, f"{first} to {last}", str(counts[kind]), examples[kind])
-        for kind, (first, last) in spans.items()
+        for kind, (first, last) in rows_of_kind.items()
     ]
     return table(("object asked for by", "rows", "tasks", "first task"), rows)
 
@@ -239,27 +240,14 @@ def spans(numbers: Sequence[int]) -> str:
     return ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in found)
 
 
-# API reference
-
-
-def api_pages() -> dict[str, str]:
-    """A page for each package, with all of its public modules."""
-    pages: dict[str, str] = {}
-    for package, folder in PACKAGES.items():
-        for init in sorted(folder.rglob("__init__.py")):
-            name = ".".join([package, *init.parent.relative_to(folder).parts])
-            if name.startswith(WITHOUT_API):
-                continue
-            files = [init, *sorted(path for path in init.parent.glob("*.py") if path.name[0] != "_")]
-            modules = [name if path == init else f"{name}.{path.stem}" for path in files]
-            pages[name] = _api_page(name, modules)
-    return pages
-
-
-def _api_page(package: str, modules: Sequence[str]) -> str:
-    parts = [f"# `{package}`"]
-    for module in modules:
-        if module != package:
-            parts.append(f"## `{module.removeprefix(package + '.')}`")
-        parts.append(f"```{{eval-rst}}\n.. automodule:: {module}\n```")
-    return "\n\n".join(parts) + "\n"
+# The sections of each page, by their names.
+SECTIONS: Mapping[str, Mapping[str, Callable[[], str]]] = {
+    "benchmark.md": {
+        "the environment": environment,
+        "the environment's options": partial(options, ENVIRONMENT_OPTIONS, prefix="--env."),
+        "the tasks": tasks_table,
+        "the objects": objects_table,
+        "the task sets": scenarios_table,
+    },
+    "policy.md": {"the policy's options": partial(options, POLICY_OPTIONS, prefix="--policy.")},
+}
