@@ -56,7 +56,7 @@ small-scenario-a: $(INSTALLED) ## Scenario A at a small scale, without a GPU: ma
 	$(BIN)/deltaco-experiment small_a/deltaco small_a/language_only small_a/one_hot small_a/demo_only small_a/oracle \
 		--seed $(SEED) --jobs $(JOBS) $(SETTINGS) --out $(OUT) --report $(REPORT)
 
-test: $(INSTALLED) ## Run the default tests: a few minutes, no network, no GPU
+test: $(INSTALLED) ## Run the default tests: a few minutes, no internet, no GPU
 	$(BIN)/python -m pytest $(ARGS)
 
 test-slow: $(INSTALLED) ## Run the slow tests: the expert on all 300 tasks, the soak of 20 minutes, ...
@@ -76,6 +76,7 @@ docs: $(INSTALLED) ## Build the documentation, warnings being errors: docs/_buil
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs docs/_build/html
 
 release: $(INSTALLED) ## Check everything that a release needs; publish it with HUB_USER=you DATASETS="data/train"
+	$(if $(and $(HUB_USER),$(filter --rehearse,$(ARGS))),$(error A rehearsal publishes nothing: leave out HUB_USER))
 	$(BIN)/python scripts/check_release.py $(ARGS)
 	$(if $(HUB_USER),$(BIN)/python scripts/publish_release.py $(HUB_USER) --datasets $(DATASETS))
 

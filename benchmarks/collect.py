@@ -30,7 +30,8 @@ from lerobot_deltaco.data.collection_plan import CollectionPlan
 
 # Of all kinds.
 TASKS = range(0, N_TASKS, 15)
-# Of the smaller of two datasets: what both need once, such as the start of the processes, cancels out.
+# The small dataset has 1/4 of the episodes. The difference of the two times leaves out the start of the
+# processes.
 SMALL_SHARE = 4
 
 

@@ -117,6 +117,9 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error("Slurm needs --partition and --gpu-partition. --local runs everything here.")
     if options.shards < 1:
         parser.error(f"--shards must be at least 1. Got {options.shards}.")
+    for argument in options.sbatch:
+        if not argument.partition("=")[1]:
+            parser.error(f"--sbatch must be NAME=VALUE, or NAME= for one without a value. Got {argument!r}.")
     # Jobs start in folders of their own.
     for name in ("out", "report", "logs", "experiments"):
         setattr(options, name, getattr(options, name).resolve())
@@ -163,7 +166,11 @@ def _parser() -> argparse.ArgumentParser:
     slurm.add_argument("--venv-path", help="virtual environment to activate in a job, up to bin/activate")
     slurm.add_argument("--env-command", help="other command that a job begins with")
     slurm.add_argument(
-        "--sbatch", action="append", default=[], metavar="NAME=VALUE", help="more arguments of sbatch"
+        "--sbatch",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="more arguments of sbatch, such as qos=high or exclusive=; may be repeated",
     )
     return parser
 

@@ -626,13 +626,24 @@ def test_a_policy_that_picks_at_random_succeeds_in_1_of_6():
         ({"render_size": 7}, r"`render_size` must be at least 8\. Got 7"),
         ({"render_size": 100.5}, r"`render_size` must be .*\. Got 100\.5"),
         ({"objects": "some"}, r"`objects` must be one of all, scenario_a_train, random:N\. Got 'some'"),
+        ({"objects": ["all"]}, r"`objects` must be one of all, scenario_a_train, random:N\. Got \['all'\]"),
         ({"task_id": 24, "objects": "scenario_a_train"}, r"Task 24 asks for a gray .* bathtub, of which"),
         ({"adversarial_probability": 1.1}, r"`adversarial_probability` must be between 0 and 1\. Got 1\.1"),
         ({"adversarial_probability": -0.1}, r"between 0 and 1\. Got -0\.1"),
         ({"adversarial_probability": float("nan")}, r"between 0 and 1\. Got nan"),
+        ({"adversarial_probability": "0.6"}, r"between 0 and 1\. Got '0\.6'"),
+        ({"adversarial_probability": None}, r"between 0 and 1\. Got None"),
         ({"adversarial_draw": "both"}, r"`adversarial_draw` must be one of each, scene\. Got 'both'"),
         ({"adversarial_draw": None}, r"`adversarial_draw` must be one of each, scene\. Got None"),
         ({"render_mode": "human"}, r"`render_mode` must be 'rgb_array' or None\. Got 'human'"),
+        ({"instructions": "put it there"}, r"`instructions` must be a dictionary.*\. Got 'put it there'"),
+        ({"instructions": ["put it there"]}, r"a dictionary of lists .*\. Got \['put it there'\]"),
+        ({"instructions": {4: "put it there"}}, r"lists of sentences .*\. Got 'put it there' for task 4"),
+        ({"instructions": {4: {"put it there"}}}, r"\. Got \{'put it there'\} for task 4"),
+        ({"instructions": {4: []}}, r"\. Got \[\] for task 4"),
+        ({"instructions": {4: ["put it there", " "]}}, r"\. Got \['put it there', ' '\] for task 4"),
+        ({"instructions": {4: [None]}}, r"\. Got \[None\] for task 4"),
+        ({"instructions": {"4": ["put it there"]}}, r"no task: `task_id` must be an integer .*\. Got '4'"),
     ],
     ids=str,
 )
@@ -641,6 +652,13 @@ def test_bad_arguments_say_what_is_valid(arguments, message):
     with pytest.raises(ValueError, match=message):
         PickPlaceEnv(**arguments)
     assert connected_clients() == before
+
+
+@pytest.mark.parametrize("options", [["a"], "task_id", 4, []])
+def test_options_that_are_no_dictionary_are_refused_and_leave_the_scene(env, options):
+    with pytest.raises(ValueError, match=r"`options` must be a dictionary, such as .*, or None\. Got "):
+        env.reset(options=options)
+    env.step(STAY_OPEN)
 
 
 def test_a_reset_to_a_task_that_the_objects_do_not_allow_leaves_the_scene():
@@ -803,6 +821,34 @@ def test_a_forgotten_environment_leaves_neither_a_client_nor_files(temporary_fil
         del env
         gc.collect()
     assert connected_clients() == before
+    assert temporary_files() == []
+
+
+@pytest.mark.parametrize("what", ["tempfile.mkdtemp", "_color_texture", "pybullet.connect"])
+@pytest.mark.parametrize("error", [OSError("no space left"), KeyboardInterrupt()], ids=repr)
+def test_a_simulator_that_cannot_be_made_leaves_neither_a_client_nor_files(
+    temporary_files, monkeypatch, what, error
+):
+    def fail(*_, **__):
+        raise error
+
+    before = connected_clients()
+    env = PickPlaceEnv(image_size=8)
+    with monkeypatch.context() as patch:
+        patch.setattr(f"gym_deltaco.simulation.{what}", fail)
+        with pytest.raises(type(error)) as raised:
+            env.reset(seed=0)
+    assert connected_clients() == before
+    assert temporary_files() == []
+    del raised
+    env.reset(seed=0)
+    env.close()
+
+
+def test_without_a_free_client_no_files_are_left(temporary_files, monkeypatch):
+    monkeypatch.setattr("gym_deltaco.simulation.pybullet.connect", lambda _: -1)
+    with pytest.raises(RuntimeError, match="no free client left"):
+        PickPlaceEnv(image_size=8).reset(seed=0)
     assert temporary_files() == []
 
 

@@ -203,6 +203,17 @@ def test_an_interrupted_write_leaves_the_file_as_it_was(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_write_to_where_a_folder_is_leaves_no_other_file(tmp_path):
+    def write():
+        with atomic_write(tmp_path / "folder") as temporary:
+            temporary.write_text("whole")
+
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="folder"):
+        write()
+    assert list(tmp_path.iterdir()) == [tmp_path / "folder"]
+
+
 def test_it_runs_as_a_module():
     command = [sys.executable, "-m", "lerobot_deltaco.commands.gallery", "--help"]
     assert "--out DIR" in subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -194,12 +194,13 @@ def test_bare_names_are_written_for_ambiguity_scheme_ii(tmp_path, capsys):
     ("content", "status", "message"),
     [
         (five_each(299), 200, "has 1495 in all, and 0 for task 299"),
+        (five_each() + b"\n1500,1000,words", 200, "for task 1000. The authors' tasks are 0 to 299."),
         (b"<html>", 200, "must begin with a line that names the columns"),
         (b"\xff\xfe\x00", 200, "is no text in UTF-8"),
         (b"gone", 404, "the server answers 404 Not Found"),
         (b" " * 2000, 200, "over 1,000 bytes"),
     ],
-    ids=["too few", "a page", "no text", "gone", "too large"],
+    ids=["too few", "another task", "a page", "no text", "gone", "too large"],
 )
 def test_what_is_no_such_file_is_not_written(serve, tmp_path, capsys, monkeypatch, content, status, message):
     if "bytes" in message:

@@ -317,6 +317,13 @@ def test_other_indices_have_no_random_object(index):
         random_label(index)
 
 
+@pytest.mark.parametrize("find", [find_label, find_model])
+@pytest.mark.parametrize("index", [-1, 1.5, 32.5, "32", None, [1]])
+def test_what_is_no_index_of_an_object_is_an_error(find, index):
+    with pytest.raises(ValueError, match=r"integer of at least 0: 0 to 31 are the paper's, .*\. Got "):
+        find(index)
+
+
 def test_sets_of_random_objects_hold_the_training_objects_and_smaller_sets():
     fewer, more = select_objects("random:100"), select_objects("random:400")
     assert (len(set(fewer)), len(set(more))) == (100, 400)
@@ -326,7 +333,7 @@ def test_sets_of_random_objects_hold_the_training_objects_and_smaller_sets():
 
 
 @pytest.mark.parametrize(
-    "name", ["random:23", f"random:{MAX_OBJECTS + 1}", "random:", "random:-1", "some", 24]
+    "name", ["random:23", f"random:{MAX_OBJECTS + 1}", "random:", "random:-1", "some", 24, None, ["all"]]
 )
 def test_unknown_sets_are_an_error_that_names_the_valid_ones(name):
     with pytest.raises(ValueError, match="`objects` must be .*random:N"):

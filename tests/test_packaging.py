@@ -133,6 +133,15 @@ def test_imports_go_one_way(part):
             assert parents.isdisjoint(FORBIDDEN[part]), f"{path.name} imports {name}"
 
 
+@pytest.mark.parametrize(
+    ("name", "importers"),
+    [("pybullet", {"quiet_pybullet.py"}), ("gym_deltaco.quiet_pybullet", {"simulation.py"})],
+)
+def test_one_file_imports_the_simulator(name, importers):
+    assert {path.name for path in GYM_FILES if name in imported_modules(path)} == importers
+    assert not any(name in imported_modules(path) for path in LEROBOT_FILES)
+
+
 def test_importing_the_benchmark_loads_neither_torch_nor_lerobot():
     check = "import sys, gym_deltaco; print({'torch', 'lerobot', 'lerobot_deltaco'} & set(sys.modules))"
     result = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)

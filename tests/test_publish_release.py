@@ -1,5 +1,6 @@
 """`make release HUB_USER=...` publishes: rehearsed with real clients, a fake Hub and a fake package index."""
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,29 @@ def dataset(tmp_path_factory):
 def publish(*arguments, environment):
     code = f"import sys; sys.path.insert(0, {str(SCRIPTS)!r}); from publish_release import main; main()"
     return python(WITHOUT_CARD_CHECK + code, *arguments, environment=environment)
+
+
+@pytest.mark.parametrize(
+    ("part", "card", "message"),
+    [
+        ("policy", None, r"has no README\.md"),
+        ("policy", "A policy.", r"README\.md does not say 'checkpoints/pick_place'"),
+        ("environment", "An environment.", r"README\.md does not say 'USER/NAME'"),
+    ],
+)
+def test_a_card_that_cannot_be_published_is_refused_before_anything_is(
+    tmp_path, monkeypatch, part, card, message
+):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script = importlib.import_module("publish_release")
+    folder = tmp_path / "checkpoints" / "pick_place"
+    folder.mkdir(parents=True)
+    for name, value in (("ROOT", tmp_path), ("CHECKPOINT", folder), ("ENVIRONMENT", folder)):
+        monkeypatch.setattr(script, name, value)
+    if card is not None:
+        (folder / "README.md").write_text(card)
+    with pytest.raises(script.ReleaseError, match=message):
+        script.Release(USER, [], tmp_path).check((part,))
 
 
 def python(code, *arguments, environment, folder=None):

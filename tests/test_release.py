@@ -81,6 +81,23 @@ def test_a_folder_without_exactly_one_wheel_is_refused(tmp_path):
     assert check_release.find_wheel(tmp_path) == wheel
 
 
+def test_a_command_that_is_missing_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(check_release.ReleaseError, match="`git` is missing"):
+        check_release.check_working_tree(tmp_path)
+
+
+def test_a_rehearsal_is_not_published():
+    # -n: nothing is run.
+    command = ["make", "-n", "-C", str(ROOT), "release", "HUB_USER=me"]
+    result = subprocess.run([*command, "ARGS=--rehearse"], capture_output=True, text=True)
+    assert result.returncode != 0
+    assert "A rehearsal publishes nothing: leave out HUB_USER" in result.stderr
+    assert "publish_release.py" not in result.stdout
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "publish_release.py me" in result.stdout
+
+
 def test_the_versions_of_this_repository_agree():
     citation = (ROOT / "CITATION.cff").read_text()
     project = check_release.tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

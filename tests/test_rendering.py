@@ -3,6 +3,7 @@
 from contextlib import closing
 
 import numpy as np
+import pybullet
 import pytest
 
 from gym_deltaco.camera import Camera
@@ -32,7 +33,7 @@ def simulation():
 
 def together(simulation, camera, size):
     """The image that PyBullet renders of all bodies at once."""
-    simulation._show_static_parts(True)
+    simulation._show()
     return simulation._image(camera, size)[0]
 
 
@@ -59,13 +60,11 @@ def test_surfaces_at_the_same_depth_are_rendered_together(simulation, monkeypatc
         else:
             simulation.add_free_body(mesh, [mesh.vertices], where, yaw=0.0, mass=0.01)
     shown = []
-    show = Simulation._show_static_parts
-    monkeypatch.setattr(
-        Simulation, "_show_static_parts", lambda self, now: (shown.append(now), show(self, now))
-    )
+    show = Simulation._show
+    monkeypatch.setattr(Simulation, "_show", lambda self, **kinds: (shown.append(kinds), show(self, **kinds)))
     camera = Camera(target=(0, 0, 0), distance=0.4, yaw=20, pitch=-40)
     image = simulation.render(camera, 64)
-    assert shown[-1]  # all together, since both have the same upper face
+    assert shown[-1] == {}  # all together, since both have the same upper face
     np.testing.assert_array_equal(image, together(simulation, camera, 64))
 
 
@@ -84,6 +83,36 @@ def test_what_is_added_later_is_seen(simulation):
         assert not np.array_equal(images[-1], images[-2])
     simulation.reset()
     np.testing.assert_array_equal(simulation.render(camera, 32), images[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "n_calls"),
+    [*(("getCameraImage", n) for n in range(2)), *(("changeVisualShape", n) for n in range(8))],
+)
+def test_an_image_that_is_interrupted_does_not_change_later_ones(simulation, monkeypatch, name, n_calls):
+    camera = Camera(target=(0, 0, 0), distance=0.6, yaw=20, pitch=-40)
+    for where in (-0.1, 0.1):
+        mesh = box(0.1, (0.2, 0.2, 0.9))
+        simulation.add_static_body(mesh, [Box((0, 0, 0), (0.05, 0.05, 0.05))], (where, 0.0, 0.0))
+        simulation.add_free_body(mesh, [mesh.vertices], (where, 0.15, 0.0), yaw=0.0, mass=0.01)
+    expected = simulation.render(camera, 32)
+    np.testing.assert_array_equal(expected, together(simulation, camera, 32))
+    simulation.render(camera, 32)
+    function, calls = getattr(pybullet, name), []
+
+    def interrupted(*args, **kwargs):
+        calls.append(name)
+        if len(calls) == n_calls + 1:
+            raise KeyboardInterrupt
+        return function(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pybullet, name, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            simulation.render(camera, 16)  # its background is new
+    for _ in range(2):
+        np.testing.assert_array_equal(simulation.render(camera, 32), expected)
+    np.testing.assert_array_equal(together(simulation, camera, 32), expected)
 
 
 def test_a_camera_that_sees_nothing_sees_white(simulation):

@@ -98,7 +98,8 @@ def test_slurm_gets_arrays_that_wait_for_each_other(example, arguments, tmp_path
     )
     sbatch.chmod(0o755)
     monkeypatch.setenv("PATH", f"{sbatch.parent}:/usr/bin:/bin")
-    example.main([*arguments, "--partition=cpu", "--gpu-partition=gpu", "--cpus-per-task=4"])
+    more = ["--cpus-per-task=4", "--sbatch=comment=a=b", "--sbatch=exclusive="]
+    example.main([*arguments, "--partition=cpu", "--gpu-partition=gpu", *more])
     # After each array there is a job of datatrove's own.
     found = {path.name: path.read_text() for path in sorted(jobs.iterdir(), key=lambda path: int(path.name))}
     arrays = {number: script for number, script in found.items() if "merge_stats" not in script}
@@ -112,6 +113,14 @@ def test_slurm_gets_arrays_that_wait_for_each_other(example, arguments, tmp_path
     assert [re.findall(r"--gpus=(\d)", script) for script in arrays.values()] == [[]] * 2 + [["1"]] * 3 + [[]]
     for before, script in zip(arrays, list(arrays.values())[1:], strict=False):
         assert f"afterok:{before}" in script
+    for script in arrays.values():
+        assert {"#SBATCH --comment=a=b", "#SBATCH --exclusive"} <= set(script.splitlines())
+
+
+def test_an_argument_of_sbatch_without_a_value_is_refused(example, arguments, capsys):
+    with pytest.raises(SystemExit):
+        example.main([*arguments, "--dry-run", "--local", "--sbatch", "exclusive"])
+    assert "--sbatch must be NAME=VALUE, or NAME= for one without" in capsys.readouterr().err
 
 
 def test_without_partitions_slurm_is_refused(example, arguments, capsys):

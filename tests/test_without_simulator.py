@@ -1,6 +1,8 @@
 """Without PyBullet, a policy trains and acts, and what needs the simulator says what to install."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 from fresh_python import run_python
@@ -48,3 +50,23 @@ def test_a_policy_needs_no_simulator_and_what_does_says_so(tmp_path):
     assert result.returncode == 1, result.stderr
     assert last.startswith("deltaco-collect: The environment needs PyBullet")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_pybullet_that_does_not_load_is_told_from_one_that_is_missing(tmp_path):
+    (tmp_path / "pybullet.py").write_text("raise ImportError('libfoo.so is missing')")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-c", "import gym_deltaco.simulation"]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True)
+    last = result.stderr.splitlines()[-1]
+    assert "PyBullet, which is installed, but does not load: libfoo.so is missing. Build it again" in last
+
+
+def test_the_simulator_is_imported_without_a_standard_error():
+    """As of a service that closes it."""
+    program = "import gym_deltaco.quiet_pybullet as q; print(q.pybullet.isNumpyEnabled())"
+    for closing in ("2>&-", "2>/dev/null"):
+        command = ["sh", "-c", f'"$0" -c "$1" {closing}', sys.executable, program]
+        result = subprocess.run(command, capture_output=True, text=True)
+        assert (result.returncode, result.stdout) == (0, "1\n")
+    program = "import sys; sys.stderr.close(); import gym_deltaco.quiet_pybullet"
+    assert subprocess.run([sys.executable, "-c", program]).returncode == 0

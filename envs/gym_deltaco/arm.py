@@ -18,8 +18,9 @@ FINGER_THICKNESS = 0.007  # m
 FINGER_WIDTH = 0.024  # m
 
 MOVE_STEPS = 10  # physics steps of a control step
-GRIP_STEPS = 75  # the same, when the gripper opens or closes
-_RAMP_STEPS = 10  # of a control step's first physics steps, over which the joints' targets are interpolated
+GRIP_STEPS = 75  # physics steps of a control step in which the gripper opens or closes
+# Physics steps at the start of a control step, over which the joints' targets are interpolated
+_RAMP_STEPS = 10
 
 _ARM_JOINTS = list(range(6))
 _FINGER_JOINTS = [6, 7]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gym_deltaco import CONTROL_FPS, MIN_IMAGE_SIZE
 from gym_deltaco import kinematics as kin
-from gym_deltaco.instructions import check_tasks
+from gym_deltaco.instructions import check_instructions, check_tasks
 from gym_deltaco.layout import AMBIGUITIES, Ambiguity, sample_layout
 from gym_deltaco.object_sets import (
     ADVERSARIAL_PROBABILITY,
@@ -70,7 +70,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     | key                   | what                                                                         |
     |-----------------------|------------------------------------------------------------------------------|
     | `is_success`          | whether the task has succeeded in this episode                               |
-    | `task_id`             | index of the task, 0..299                                                    |
+    | `task_id`             | index of the task, 0..299, or 1000..1479 for those by color and shape        |
     | `objects`             | (3,) int64: indices of the objects in the scene; 0..31 are the paper's       |
     | `object_containers`   | (3,) int64: the container in which each of them lies: 0 green, 1 red         |
     | `container_quadrants` | (2, 2) int64: i (0 right, 1 left) and j (0 back, 1 front) of both            |
@@ -81,7 +81,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     | `right_container`     | whether something lies in the target container, and nothing in the other one |
 
     Args:
-        task_id: 0..299. `reset(options={"task_id": ...})` changes it from then on.
+        task_id: 0..299, or 1000..1479 for those by color and shape. `reset(options={"task_id": ...})`
+            changes it from then on.
         ambiguity: "container", the paper's scheme (i), or "object", scheme (ii).
         image_size: Height and width of `pixels`, at least 8.
         render_mode: "rgb_array" or None.
@@ -128,6 +129,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
                 raise ValueError(f"`{name}` must be at least {MIN_IMAGE_SIZE}. Got {size}.")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"`render_mode` must be 'rgb_array' or None. Got {render_mode!r}.")
+        if instructions is not None:
+            check_instructions(instructions)
         self.ambiguity: Ambiguity = ambiguity
         self.adversarial_probability = adversarial_probability
         self.adversarial_draw: AdversarialDraw = adversarial_draw
@@ -165,10 +168,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             gymnasium.error.ResetNeeded: There is none yet.
             gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """
-        if self._is_closed:
-            raise gym.error.ClosedEnvironmentError(
-                "The environment is closed. Make a new one with `gymnasium.make`."
-            )
+        self._check_open()
         if self._scene is None:
             raise gym.error.ResetNeeded("Call `reset` before `step` or `render`.")
         return self._scene
@@ -180,17 +180,21 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
         Args:
             seed: Seed of `np_random`; None continues its draws.
-            options: "task_id": the task of this and the following episodes, 0..299. Others are for wrappers.
+            options: "task_id": the task of this and the following episodes, 0..299, or 1000..1479 for those
+                by color and shape. Others are for wrappers.
 
         Returns:
             The first observation and info.
 
         Raises:
+            ValueError: There is no such task, the objects do not allow it, or `options` is no dictionary.
             InstructionsError: The environment has `instructions`, but none for the task.
+            gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """
-        if self._is_closed:
-            raise gym.error.ClosedEnvironmentError(
-                "The environment is closed. Make a new one with `gymnasium.make`."
+        self._check_open()
+        if options is not None and not isinstance(options, Mapping):
+            raise ValueError(
+                f'`options` must be a dictionary, such as {{"task_id": 4}}, or None. Got {options!r}.'
             )
         task = get_task((options or {}).get("task_id", self.task.index))
         check_task(task, self.objects)
@@ -253,6 +257,12 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         if self._simulation is not None:
             self._simulation.close()
             self._simulation = None
+
+    def _check_open(self) -> None:
+        if self._is_closed:
+            raise gym.error.ClosedEnvironmentError(
+                "The environment is closed. Make a new one with `gymnasium.make`."
+            )
 
     def _observation(self) -> Observation:
         arm = self.scene.arm

@@ -2,4 +2,4 @@
 
 
 class SimulatorMissingError(ImportError):
-    """PyBullet is not installed; the message says how to install it."""
+    """PyBullet is not installed, or does not load; the message says what to do."""

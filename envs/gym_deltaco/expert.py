@@ -19,13 +19,13 @@ OPEN, CLOSED = 1.0, -1.0
 # Heights and errors in m. The gripper's height is that of the end effector; the fingertips are 0.05 m below.
 _HOVER_Z = -0.215  # where the fingertips pass above every object
 _ALIGNED = np.array([0.013, 0.012])  # error in x and y within which the gripper comes down
-_STRADDLING = np.array([0.02, 0.03])  # the same, once it is down: its fingers slide along the object's sides
+_STRADDLING = np.array([0.02, 0.03])  # error in x and y that is allowed once the gripper is down
 _AROUND = np.array([0.02, 0.014, 0.015])  # error in x, y and z within which it closes
 _PAD_HEIGHT = 0.010  # of the middle of the pads above the fingertips
 _TIP_CLEARANCE = 0.004  # of the fingertips above the tray
 _PALM_CLEARANCE = 0.012  # of the object's top below the end effector
 _CARRY_CLEARANCE = 0.085  # of a carried object's lowest point above the tray
-_LIFTED_CLEARANCE = 0.06  # the same, from which on it may be carried
+_LIFTED_CLEARANCE = 0.06  # height of its lowest point above the tray from which an object may be carried
 _CARRY_SPEED = 0.8  # length of the motion at the most; diagonally, a held object would slip at full speed
 _DROP_SHARE = 0.3  # of the container, about its middle, where the drop point is drawn
 _OVER_CONTAINER = np.array([0.035, 0.022])  # error in x and y within which the object is lowered and let go
@@ -62,7 +62,7 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EX
 
     Args:
         env: The environment, without wrappers.
-        task_id: 0..299.
+        task_id: 0..299, or 1000..1479 for those by color and shape.
         seed: Seed of the scene, the drop point and the noise.
         noise: Standard deviation of the noise on the motions.
 

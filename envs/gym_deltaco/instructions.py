@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import csv
 import io
+import reprlib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -31,8 +33,9 @@ def read_instructions(path: str | Path, split: str = "all") -> dict[int, tuple[s
     """Reads the sentences of tasks from a CSV file.
 
     Args:
-        path: The file, in UTF-8, with the columns `task_id` (0 to 299) and `instruction`; or the authors'
-            file, with the columns "" (the row's number), "Task ID" and "Instruction".
+        path: The file, in UTF-8, with the columns `task_id` (0..299, or 1000..1479 for those by color and
+            shape) and `instruction`; or the authors' file, with the columns "" (the row's number), "Task ID"
+            and "Instruction".
         split: Split of the sentences; see `split_instructions`.
 
     Returns:
@@ -209,6 +212,35 @@ def write_instructions(path: Path, instructions: Mapping[int, str]) -> None:
         writer.writerows(instructions.items())
 
 
+def check_instructions(instructions: Mapping[int, Sequence[str]]) -> None:
+    """Checks that there are lists of sentences, by task.
+
+    Args:
+        instructions: The sentences of each task.
+
+    Raises:
+        ValueError: They are something else, or a sentence is empty; the message says what.
+    """
+    needed = (
+        '`instructions` must be a dictionary of lists of sentences by task, such as {4: ["Put it into the '
+        'green bin."]}; `gym_deltaco.instructions.read_instructions` makes one from a file.'
+    )
+    if not isinstance(instructions, Mapping):
+        raise ValueError(f"{needed} Got {reprlib.repr(instructions)}.")
+    for task_id, sentences in instructions.items():
+        try:
+            get_task(task_id)
+        except ValueError as error:
+            raise ValueError(f"`instructions` has sentences for what is no task: {error}") from None
+        if (
+            not isinstance(sentences, Sequence)
+            or isinstance(sentences, str)
+            or not sentences
+            or not all(isinstance(sentence, str) and sentence.strip() for sentence in sentences)
+        ):
+            raise ValueError(f"{needed} Got {reprlib.repr(sentences)} for task {task_id}.")
+
+
 def check_tasks(instructions: Mapping[int, Sequence[str]], task_ids: Iterable[int], source: str) -> None:
     """Checks that there are sentences for tasks.
 
@@ -237,16 +269,19 @@ def check_authors(rows: Iterable[tuple[int, str]], source: str) -> None:
         source: Origin of the rows, for the error message.
 
     Raises:
-        InstructionsError: A task has more or fewer.
+        InstructionsError: A task has more or fewer, or is none of these.
     """
-    counts = dict.fromkeys(range(N_TASKS), 0)
-    for task_id, _ in rows:
-        counts[task_id] += 1
-    wrong = [task_id for task_id, count in counts.items() if count != AUTHORS_SENTENCES_PER_TASK]
+    counts = Counter(task_id for task_id, _ in rows)
+    others = sorted(counts.keys() - range(N_TASKS))
+    if others:
+        raise InstructionsError(
+            f"{source} has instructions for task {others[0]}. The authors' tasks are 0 to {N_TASKS - 1}."
+        )
+    wrong = [task_id for task_id in range(N_TASKS) if counts[task_id] != AUTHORS_SENTENCES_PER_TASK]
     if wrong:
         raise InstructionsError(
             f"{source} must have {AUTHORS_SENTENCES_PER_TASK} instructions for each of the {N_TASKS} tasks. "
-            f"It has {sum(counts.values())} in all, and {counts[wrong[0]]} for task {wrong[0]}."
+            f"It has {counts.total()} in all, and {counts[wrong[0]]} for task {wrong[0]}."
         )
 
 

@@ -37,9 +37,6 @@ _IDENTITY = np.eye(3)
 _FLIP = np.diag([1.0, -1.0, -1.0])  # rolls a frame by pi about x
 _AXES = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}  # the plane that a rotation turns
 REST_JOINTS = np.array([1.57, -0.6, -0.6, 0.0, -1.57, 0.0])  # rad
-JOINT_LIMITS = np.deg2rad(
-    [[-180, 180], [-108, 114], [-92, 123], [-180, 180], [-123, 100], [-180, 180]]
-)  # rad
 
 SHOULDER = BASE_POSITION + WAIST_ORIGIN + SHOULDER_ORIGIN  # m, in the world
 _UPPER_ARM = float(np.hypot(ELBOW_ORIGIN[0], ELBOW_ORIGIN[2]))

@@ -8,6 +8,8 @@ from functools import cache
 from types import MappingProxyType
 from typing import Literal, get_args
 
+import numpy as np
+
 from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.random_objects import FIRST_INDEX, random_label, random_model
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel, Task, get_task
@@ -32,7 +34,6 @@ N_INDICES = (
 _OBJECTS_OF_TASK_SETS = MappingProxyType({"scenario_a_clean_train": "scenario_a_train"})
 
 
-@cache
 def select_objects(name: str) -> tuple[ObjectLabel, ...]:
     """The objects of a set.
 
@@ -44,15 +45,20 @@ def select_objects(name: str) -> tuple[ObjectLabel, ...]:
         ValueError: There is no such set.
     """
     count = re.fullmatch(r"random:(\d+)", name) if isinstance(name, str) else None
-    if count is None and name not in OBJECT_SETS:
+    if count is not None:
+        return _with_random_objects(int(count[1]))
+    if not isinstance(name, str) or name not in OBJECT_SETS:
         raise ValueError(f"`objects` must be one of {', '.join(OBJECT_SETS)}, random:N. Got {name!r}.")
-    if count is None:
-        return OBJECT_SETS[name]
+    return OBJECT_SETS[name]
+
+
+@cache
+def _with_random_objects(n_objects: int) -> tuple[ObjectLabel, ...]:
     paper = OBJECT_SETS["scenario_a_train"]
-    n_random = int(count[1]) - len(paper)
+    n_random = n_objects - len(paper)
     if not 0 <= n_random <= MAX_OBJECTS - len(paper):
         raise ValueError(
-            f"`objects` must be random:N with N from {len(paper)} to {MAX_OBJECTS}. Got {name!r}."
+            f"`objects` must be random:N with N from {len(paper)} to {MAX_OBJECTS}. Got 'random:{n_objects}'."
         )
     return (*paper, *(random_label(FIRST_INDEX + number) for number in range(n_random)))
 
@@ -63,7 +69,8 @@ def find_label(index: int) -> ObjectLabel:
     Raises:
         ValueError: There is no such object.
     """
-    return OBJECTS[index] if 0 <= index < len(OBJECTS) else random_label(index)
+    _check_index(index)
+    return OBJECTS[index] if index < FIRST_INDEX else random_label(index)
 
 
 def find_model(index: int) -> ObjectModel:
@@ -72,7 +79,16 @@ def find_model(index: int) -> ObjectModel:
     Raises:
         ValueError: There is no such object.
     """
+    _check_index(index)
     return object_model(index) if index < FIRST_INDEX else random_model(index)
+
+
+def _check_index(index: int) -> None:
+    if not isinstance(index, (int, np.integer)) or index < 0:
+        raise ValueError(
+            f"An object's index must be an integer of at least 0: 0 to {FIRST_INDEX - 1} are the paper's, "
+            f"{FIRST_INDEX} and above random ones. Got {index!r}."
+        )
 
 
 def default_objects(tasks: str) -> str:
@@ -97,8 +113,14 @@ def check_scenes(
         ValueError: There is no such set, a task asks for none of its objects, or the probability or its draw
             is not valid.
     """
-    if not 0 <= adversarial_probability <= 1:
-        raise ValueError(f"`adversarial_probability` must be between 0 and 1. Got {adversarial_probability}.")
+    try:
+        is_probability = 0 <= adversarial_probability <= 1
+    except TypeError:
+        is_probability = False
+    if not is_probability:
+        raise ValueError(
+            f"`adversarial_probability` must be between 0 and 1. Got {adversarial_probability!r}."
+        )
     if adversarial_draw not in ADVERSARIAL_DRAWS:
         raise ValueError(
             f"`adversarial_draw` must be one of {', '.join(ADVERSARIAL_DRAWS)}. Got {adversarial_draw!r}."

@@ -18,7 +18,20 @@ from types import MappingProxyType
 
 import numpy as np
 
-from gym_deltaco.solids import Color, Loft, Mesh, Row, merged, pointed_oval, polygon, rounded_square
+from gym_deltaco.solids import (
+    CIRCLE,
+    HALVED_SQUARE,
+    OCTAGON,
+    ROUNDED,
+    SQUARE,
+    Color,
+    Loft,
+    Mesh,
+    Row,
+    merged,
+    pointed_oval,
+    polygon,
+)
 from gym_deltaco.tasks import OBJECTS, ObjectLabel
 
 
@@ -159,27 +172,22 @@ BARK, BARK_LIGHT, BARK_DARK = _rgb("532"), _rgb("864"), _rgb("321")
 CREAM, CREAM_DARK = _rgb("ec8"), _rgb("a74")
 MAHOGANY, MAHOGANY_LIGHT = _rgb("532"), _rgb("743")
 
-_CIRCLE = polygon(12)
-_OCTAGON = polygon(8)
-_ROUNDED = rounded_square(0.5)
 _TRIANGLE = polygon(3)
-_SQUARE = np.array([(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)])
-_HALVED_SQUARE = np.array([(1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1)], float)
 
 
 def _round(*profile: Row) -> Loft:
-    return Loft(_CIRCLE, profile)
+    return Loft(CIRCLE, profile)
 
 
 def _round_part(*profile: Row) -> Loft:
-    return Loft(_OCTAGON, profile)
+    return Loft(OCTAGON, profile)
 
 
 def _block(low: Sequence[float], high: Sequence[float], paint: Color = WHITE) -> Loft:
     """A box between two corners."""
     (x, y, z), (half_x, half_y, half_z) = np.add(low, high) / 2.0, np.subtract(high, low) / 2.0
     half = (float(half_x), float(half_y))
-    return Loft(_SQUARE, [(half, (x, y, z - half_z), paint), (half, (x, y, z + half_z))])
+    return Loft(SQUARE, [(half, (x, y, z - half_z), paint), (half, (x, y, z + half_z))])
 
 
 def _mottled(shift: int, *colors: Color) -> tuple[Color, ...]:
@@ -223,9 +231,9 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
         grasp=60,
     ),
     "fountain vase": Recipe(
-        [Loft(_OCTAGON, [(16, 0, SAND_DARK), (23, 6, SAND), (23, 12), (18, 13, SAND_DARK), (18, 20, SAND),
-                         (12, 23), (10, 34, SAND_DARK), (11, 43), (15, 47, SAND), (15, 56), (11, 56),
-                         (8, 46, SAND_DARK)])],
+        [Loft(OCTAGON, [(16, 0, SAND_DARK), (23, 6, SAND), (23, 12), (18, 13, SAND_DARK), (18, 20, SAND),
+                        (12, 23), (10, 34, SAND_DARK), (11, 43), (15, 47, SAND), (15, 56), (11, 56),
+                        (8, 46, SAND_DARK)])],
         parts=[_round_part((18, 0), (23, 6), (23, 13)), _round_part((18, 13), (18, 20), (12, 25)),
                _round_part((11, 25), (11, 45)), _round_part((16, 45), (16, 56))],
         grasp=49,
@@ -251,18 +259,18 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
         grasp=31,
     ),
     "square prism bin": Recipe(
-        [Loft(_HALVED_SQUARE, [(14, 0, BRICK), (15, 17, (BRICK, BRICK_LIGHT)),
-                               (16, 33, (BRICK_LIGHT, BRICK)), (17.5, 50, (BRICK, BRICK_LIGHT)),
-                               (18.5, 66, (BRICK_LIGHT, BRICK)), (15.5, 66, BRICK_LIGHT),
-                               (12, 30, BRICK_DARK)])],
-        parts=[Loft(_SQUARE, [(16.5, 0), (18.5, 42), (18.5, 66)])],
+        [Loft(HALVED_SQUARE, [(14, 0, BRICK), (15, 17, (BRICK, BRICK_LIGHT)),
+                              (16, 33, (BRICK_LIGHT, BRICK)), (17.5, 50, (BRICK, BRICK_LIGHT)),
+                              (18.5, 66, (BRICK_LIGHT, BRICK)), (15.5, 66, BRICK_LIGHT),
+                              (12, 30, BRICK_DARK)])],
+        parts=[Loft(SQUARE, [(16.5, 0), (18.5, 42), (18.5, 66)])],
         grasp=54,
         yaw=0.3,
     ),
     "narrow tray": Recipe(
-        [Loft(_SQUARE, [((13.5, 34), 0, OCHRE), ((17.5, 42.5), 22), ((14.5, 39), 22, OCHRE_LIGHT),
-                        ((11, 33), 7, OCHRE_DARK)])],
-        parts=[Loft(_SQUARE, [((16, 36), 0), ((17.5, 40), 9), ((17.5, 42.5), 22)])],
+        [Loft(SQUARE, [((13.5, 34), 0, OCHRE), ((17.5, 42.5), 22), ((14.5, 39), 22, OCHRE_LIGHT),
+                       ((11, 33), 7, OCHRE_DARK)])],
+        parts=[Loft(SQUARE, [((16, 36), 0), ((17.5, 40), 9), ((17.5, 42.5), 22)])],
         grasp=13,
         yaw=0.3,
     ),
@@ -284,7 +292,7 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
     ),
     "bongo drum bowl": Recipe(
         [Loft(polygon(10), [(11, 23, SCARLET), (19, 35), (23, 45), (23, 58), (20, 58), (10, 38, MAROON)]),
-         Loft(_OCTAGON, [(18.5, 0, SCARLET), (17.5, 4), (14, 3)], closed=True),
+         Loft(OCTAGON, [(18.5, 0, SCARLET), (17.5, 4), (14, 3)], closed=True),
          *(_strut(turn, radii=(16.5, 10.5), heights=(2, 25), paint=SCARLET) for turn in range(18, 360, 60))],
         parts=[_round_part((18, 0), (12, 26)), _round_part((12, 26), (23, 45), (23, 58))],
         grasp=50,
@@ -304,17 +312,17 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
     ),
     "crooked lid trash can": Recipe(
         [Loft(polygon(20, (1.0, 0.9)), [(18.5, 0, STEEL), (20.5, 50, (STEEL, STEEL_DARK))]),
-         Loft(_CIRCLE, [(22, 0, STEEL_DARK), (22, 6, STEEL), (13, 9), (5, 9, STEEL_DARK), (5, 13, STEEL)],
+         Loft(CIRCLE, [(22, 0, STEEL_DARK), (22, 6, STEEL), (13, 9), (5, 9, STEEL_DARK), (5, 13, STEEL)],
               tilt=11, offset=(1, 0, 51))],
         parts=[_round_part((20, 0), (21.5, 36), (21.5, 57)), _round_part((21.5, 57), (6, 64))],
         grasp=46,
     ),
     "toilet bowl": Recipe(
-        [Loft(_ROUNDED, [((15, 20), 0, WHITE), ((14, 18), 10), ((20, 25), 22), ((20, 25), 31, IVORY),
-                         ((23, 29), 33, WHITE), ((23, 29), 42), ((17, 22), 42), ((9, 13), 24, ASH)])],
-        parts=[Loft(_ROUNDED, [((17, 22), 0), ((16, 20), 11)]),
-               Loft(_ROUNDED, [((15, 19), 11), ((22, 27), 31)]),
-               Loft(_ROUNDED, [((23, 29), 31), ((23, 29), 42)])],
+        [Loft(ROUNDED, [((15, 20), 0, WHITE), ((14, 18), 10), ((20, 25), 22), ((20, 25), 31, IVORY),
+                        ((23, 29), 33, WHITE), ((23, 29), 42), ((17, 22), 42), ((9, 13), 24, ASH)])],
+        parts=[Loft(ROUNDED, [((17, 22), 0), ((16, 20), 11)]),
+               Loft(ROUNDED, [((15, 19), 11), ((22, 27), 31)]),
+               Loft(ROUNDED, [((23, 29), 31), ((23, 29), 42)])],
         grasp=35,
         yaw=0.3,
     ),
@@ -326,12 +334,12 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
         grasp=40,
     ),
     "tongue chair": Recipe(
-        [Loft(_SQUARE, [((20, 19), (-2, 0, 0), CRIMSON), ((21, 20), (-1, 0, 7)), ((18, 20), (5, 0, 13), RED),
-                        ((17.5, 20), (5, 0, 20)), ((15.5, 20), (2.5, 0, 24)), ((11, 20), (-3, 0, 27)),
-                        ((8, 20), (-7, 0, 30)), ((7, 20), (-11, 0, 37)), ((7.5, 20), (-14.5, 0, 45)),
-                        ((6, 18), (-16, 0, 52))])],
+        [Loft(SQUARE, [((20, 19), (-2, 0, 0), CRIMSON), ((21, 20), (-1, 0, 7)), ((18, 20), (5, 0, 13), RED),
+                       ((17.5, 20), (5, 0, 20)), ((15.5, 20), (2.5, 0, 24)), ((11, 20), (-3, 0, 27)),
+                       ((8, 20), (-7, 0, 30)), ((7, 20), (-11, 0, 37)), ((7.5, 20), (-14.5, 0, 45)),
+                       ((6, 18), (-16, 0, 52))])],
         parts=[_block((-22, -20, 0), (20, 20, 11)), _block((-12.5, -20, 11), (23, 20, 24)),
-               Loft(_SQUARE, [((8, 20), (-4.5, 0, 24)), ((9, 20), (-13, 0, 43)), ((7, 20), (-15, 0, 52))])],
+               Loft(SQUARE, [((8, 20), (-4.5, 0, 24)), ((9, 20), (-13, 0, 43)), ((7, 20), (-15, 0, 52))])],
         grasp=17,
         yaw=0.25,
     ),
@@ -352,10 +360,10 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
     ),
     "short handle cup": Recipe(
         [_round((20, 0, NAVY), (20, 42), (17, 42), (16, 6, NAVY_DARK)),
-         Loft(_OCTAGON, [(12, -3, NAVY), (12, 3), (8, 3), (8, -3)], closed=True,
+         Loft(OCTAGON, [(12, -3, NAVY), (12, 3), (8, 3), (8, -3)], closed=True,
               tilt=90, turn=35, offset=(-10.3, 14.7, 21))],
         parts=[_round_part((20, 0), (20, 42)),
-               Loft(_SQUARE, [((3, 6), (0, 24, 11)), ((3, 6), (0, 24, 31))], turn=35)],
+               Loft(SQUARE, [((3, 6), (0, 24, 11)), ((3, 6), (0, 24, 31))], turn=35)],
         grasp=30,
         yaw=0.25,
     ),
@@ -379,10 +387,10 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
         grasp=14,
     ),
     "trapezoidal bin": Recipe(
-        [Loft(_HALVED_SQUARE, [((15, 19), 0, FAWN), ((17, 22), 20, (FAWN, FAWN_LIGHT)),
-                               ((19.5, 25), 40, (FAWN_LIGHT, FAWN)), ((16.5, 22), 40, FAWN_LIGHT),
-                               ((13, 18), 8, FAWN_DARK)])],
-        parts=[Loft(_SQUARE, [((16.5, 20), 0), ((19.5, 24), 24), ((19.5, 25), 40)])],
+        [Loft(HALVED_SQUARE, [((15, 19), 0, FAWN), ((17, 22), 20, (FAWN, FAWN_LIGHT)),
+                              ((19.5, 25), 40, (FAWN_LIGHT, FAWN)), ((16.5, 22), 40, FAWN_LIGHT),
+                              ((13, 18), 8, FAWN_DARK)])],
+        parts=[Loft(SQUARE, [((16.5, 20), 0), ((19.5, 24), 24), ((19.5, 25), 40)])],
         grasp=30,
         yaw=0.25,
     ),
@@ -396,10 +404,10 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
         yaw=0.3,
     ),
     "bathtub": Recipe(
-        [Loft(_ROUNDED, [((15, 32), 0, ZINC), ((19, 38), 18), ((22, 41.5), 22), ((22, 42.5), 26),
-                         ((17.5, 37), 26), ((12, 28), 7, ZINC_DARK)])],
-        parts=[Loft(_ROUNDED, [((16, 33), 0), ((20, 39), 17)]),
-               Loft(_ROUNDED, [((22, 42.5), 17), ((22, 42.5), 26)])],
+        [Loft(ROUNDED, [((15, 32), 0, ZINC), ((19, 38), 18), ((22, 41.5), 22), ((22, 42.5), 26),
+                        ((17.5, 37), 26), ((12, 28), 7, ZINC_DARK)])],
+        parts=[Loft(ROUNDED, [((16, 33), 0), ((20, 39), 17)]),
+               Loft(ROUNDED, [((22, 42.5), 17), ((22, 42.5), 26)])],
         grasp=18,
         yaw=0.2,
     ),
@@ -408,7 +416,7 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
               [((23, 34), 0, FROST), ((23, 34), 10, (FROST, FROST_LIGHT)), ((19, 30), 18),
                ((13, 23), 18), ((9, 19), 10, FROST), ((9, 19), 0)],
               closed=True, crease=60)],
-        parts=[Loft(_OCTAGON, [((23, 34), 0), ((23, 34), 11), ((18, 29), 18)])],
+        parts=[Loft(OCTAGON, [((23, 34), 0), ((23, 34), 11), ((18, 29), 18)])],
         grasp=10,
         yaw=0.3,
     ),
@@ -426,8 +434,8 @@ _RECIPES: Mapping[str, Recipe] = MappingProxyType({
     ),
     "box sofa": Recipe(_SOFA, parts=_SOFA, grasp=18, yaw=0.2),
     "two layered lampshade": Recipe(
-        [Loft(_CIRCLE, [(15.5, 0, GOLD), (15, 25), (22, 27, MUSTARD), (23, 31, YELLOW), (13.5, 60),
-                        (10.5, 60), (9, 0, MUSTARD)], closed=True)],
+        [Loft(CIRCLE, [(15.5, 0, GOLD), (15, 25), (22, 27, MUSTARD), (23, 31, YELLOW), (13.5, 60),
+                       (10.5, 60), (9, 0, MUSTARD)], closed=True)],
         parts=[_round_part((18.5, 0), (16, 27)), _round_part((23, 27), (23, 37), (15, 60))],
         grasp=31,
     ),

@@ -19,8 +19,21 @@ from types import MappingProxyType
 import numpy as np
 
 from gym_deltaco.objects import ObjectModel, Recipe, build_model
-from gym_deltaco.solids import Color, Loft, Paint, Row, pointed_oval, polygon, rounded_square
+from gym_deltaco.solids import (
+    CIRCLE,
+    HALVED_SQUARE,
+    OCTAGON,
+    ROUNDED,
+    SQUARE,
+    Color,
+    Loft,
+    Paint,
+    Row,
+    pointed_oval,
+    polygon,
+)
 from gym_deltaco.tasks import COLOR_SHAPE_PAIRS, OBJECTS, ObjectLabel
+from gym_deltaco.workspace import CAMERA
 
 FIRST_INDEX = len(OBJECTS)
 _SEED = 2210_04476  # of all random objects; another one gives other objects
@@ -84,7 +97,6 @@ class _Form:
         inside: Rings from the top inwards and down, for something hollow.
         is_ring: Whether it is open at the bottom, too.
         yaw: Greatest angle by which it may be turned, rad.
-        lift: Height of the tips of a boat above its middle.
         extras: Further solids, as functions of their paint, and their collision parts.
     """
 
@@ -143,7 +155,7 @@ def _cut_at_waists(rows: Sequence[Row]) -> list[Sequence[Row]]:
     cuts = [0]
     for number in range(1, len(rows) - 1):
         before, here, after = (_width(row) for row in rows[number - 1 : number + 2])
-        if here <= before and here <= after and min(before, after, key=lambda w: -w) > here:
+        if here <= before and here <= after and max(before, after) > here:
             cuts.append(number)
     cuts.append(len(rows) - 1)
     return [rows[first : last + 1] for first, last in pairwise(cuts)]
@@ -166,10 +178,7 @@ def _stands_out(below: Row, row: Row, above: Row) -> bool:
 
 # Forms. Each function draws one of its shape.
 
-_CIRCLE, _OCTAGON, _HEXAGON = polygon(12), polygon(8), polygon(6)
-_ROUNDED = rounded_square(0.5)
-_SQUARE = np.array([(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)])
-_HALVED_SQUARE = np.array([(1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1)], float)
+_HEXAGON = polygon(6)
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -183,7 +192,7 @@ def _pick[T](rng: np.random.Generator, options: Sequence[T]) -> T:
 def _round_outlines(rng: np.random.Generator, is_tall: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """A more or less round outline, and that of its parts; something tall falls over a hexagon."""
     fluted = polygon(16, (1.0, 0.92))
-    outlines = [(_CIRCLE, _OCTAGON), (_CIRCLE, _OCTAGON), (_OCTAGON, _OCTAGON), (fluted, _OCTAGON)]
+    outlines = [(CIRCLE, OCTAGON), (CIRCLE, OCTAGON), (OCTAGON, OCTAGON), (fluted, OCTAGON)]
     return _pick(rng, outlines if is_tall else [*outlines, (_HEXAGON, _HEXAGON)])
 
 
@@ -262,7 +271,7 @@ def _freeform(rng: np.random.Generator) -> _Form:
             radius = _between(rng, 12.5, 15) if number % 2 else _between(rng, 17, 19)
             outside.append((radius, (_between(rng, -1.5, 1.5), _between(rng, -1.5, 1.5), float(z))))
         outside += [(widest, height - 10), (widest, height)]
-        return _Form(outline, _OCTAGON, outside, (height - 10, height))
+        return _Form(outline, OCTAGON, outside, (height - 10, height))
     # A block that leans and narrows above its seat.
     depth, seat = _between(rng, 14, 24), _between(rng, 20, 26)
     height = _between(rng, seat + 12, min(seat + 24, 52))
@@ -274,7 +283,7 @@ def _freeform(rng: np.random.Generator) -> _Form:
         ((slim + 4, depth), (lean * 0.8, 0, seat + 4)),
         ((slim, depth * _between(rng, 0.6, 1.0)), (lean, 0, height)),
     ]
-    return _Form(_SQUARE, _SQUARE, outside, (0, seat), yaw=0.25)
+    return _Form(SQUARE, SQUARE, outside, (0, seat), yaw=0.25)
 
 
 def _bottle(rng: np.random.Generator) -> _Form:
@@ -319,7 +328,7 @@ def _canoe(rng: np.random.Generator) -> _Form:
 
 
 def _bench(half: tuple[float, float], place: tuple[float, float], top: float, paint: Paint) -> Loft:
-    return Loft(_SQUARE, [(half, (*place, top - 4), paint), (half, (*place, top - 1))])
+    return Loft(SQUARE, [(half, (*place, top - 4), paint), (half, (*place, top - 1))])
 
 
 def _cup(rng: np.random.Generator) -> _Form:
@@ -344,7 +353,7 @@ def _cup(rng: np.random.Generator) -> _Form:
     def handle(paint: Paint) -> Loft:
         profile: list[Row] = [(12, -3, paint), (12, 3), (8, 3), (8, -3)]
         return Loft(
-            _OCTAGON,
+            OCTAGON,
             profile,
             closed=True,
             tilt=90,
@@ -352,10 +361,8 @@ def _cup(rng: np.random.Generator) -> _Form:
             offset=(float(offset[0]), float(offset[1]), middle),
         )
 
-    part = Loft(
-        _SQUARE, [((3, 6), (0, top + 4, middle - 10)), ((3, 6), (0, top + 4, middle + 10))], turn=turn
-    )
-    return _Form(_CIRCLE, _OCTAGON, outside, band, inside, yaw=0.25, extras=[(handle, [part])])
+    part = Loft(SQUARE, [((3, 6), (0, top + 4, middle - 10)), ((3, 6), (0, top + 4, middle + 10))], turn=turn)
+    return _Form(CIRCLE, OCTAGON, outside, band, inside, yaw=0.25, extras=[(handle, [part])])
 
 
 def _bowl(rng: np.random.Generator) -> _Form:
@@ -366,7 +373,7 @@ def _bowl(rng: np.random.Generator) -> _Form:
         outside: list[Row] = [((x * foot, y * foot), 0), ((x, y), height - 12), ((x, y), height)]
         inside: list[Row] = [((x - 4, y - 5), height), ((x * 0.5, y * 0.6), 8)]
         yaw = 0.2 if y > 33 else 0.3
-        return _Form(_ROUNDED, _ROUNDED, outside, (height - 12, height), inside, yaw=yaw)
+        return _Form(ROUNDED, ROUNDED, outside, (height - 12, height), inside, yaw=yaw)
     outlines = _round_outlines(rng)
     top = _between(rng, 21, _MAX_RADIUS)
     if variant == "shallow":
@@ -393,22 +400,22 @@ def _trapezoidal_prism(rng: np.random.Generator) -> _Form:
     yaw = 0.3 if aspect == 1.0 or x < 18 else 0.2
     if height < 40 and rng.random() < 0.35:  # wider below
         outside: list[Row] = [((x, y), 0), ((x, y), 15), (small, height)]
-        return _Form(_SQUARE, _SQUARE, outside, (0, 15), yaw=yaw)
+        return _Form(SQUARE, SQUARE, outside, (0, 15), yaw=yaw)
     outside = [(small, 0), ((x, y), height - 11), ((x, y), height)]
     inside: list[Row] = []
     if rng.random() < 0.7:
         inside = [((x - 3, y - 3), height), ((small[0] - 3, small[1] - 4), 7)]
-    return _Form(_HALVED_SQUARE, _SQUARE, outside, (height - 11, height), inside, yaw=yaw)
+    return _Form(HALVED_SQUARE, SQUARE, outside, (height - 11, height), inside, yaw=yaw)
 
 
 def _cylinder(rng: np.random.Generator) -> _Form:
     outline, part_outline = _pick(
         rng,
         [
-            (_CIRCLE, _OCTAGON),
-            (_CIRCLE, _OCTAGON),
-            (_OCTAGON, _OCTAGON),
-            (polygon(20, (1.0, 0.92)), _OCTAGON),
+            (CIRCLE, OCTAGON),
+            (CIRCLE, OCTAGON),
+            (OCTAGON, OCTAGON),
+            (polygon(20, (1.0, 0.92)), OCTAGON),
         ],
     )
     radius, height = _between(rng, 17, 22), _between(rng, 32, 62)
@@ -434,7 +441,7 @@ def _round_hole(rng: np.random.Generator) -> _Form:
         outside: list[Row] = [(radius, 0), (radius, 16), (top, height)]
         inside: list[Row] = [(top - wall, height), (radius - wall - 2, 0)]
         band = (0.0, height if top == radius else 16.0)
-        return _Form(outline, _OCTAGON, outside, band, inside, is_ring=True)
+        return _Form(outline, OCTAGON, outside, band, inside, is_ring=True)
     x, height = _between(rng, 20, 22), _between(rng, 18.5, 24)
     y = x if rng.random() < 0.5 else _between(rng, x + 3, 36)
     hole = _between(rng, 0.4, 0.58)
@@ -446,7 +453,7 @@ def _round_hole(rng: np.random.Generator) -> _Form:
         ((x * hole, y * hole), 0),
     ]
     return _Form(
-        outline, _OCTAGON, outside, (0, max(side, 12.0)), inside, is_ring=True, yaw=np.pi if x == y else 0.3
+        outline, OCTAGON, outside, (0, max(side, 12.0)), inside, is_ring=True, yaw=np.pi if x == y else 0.3
     )
 
 
@@ -477,7 +484,8 @@ _HSV = MappingProxyType(
         "yellow": ((47, 56), (0.9, 1.0), (0.85, 1.0)),
     }
 )
-_TOWARDS_CAMERA = np.array([0.0, np.cos(np.radians(40)), np.sin(np.radians(40))])
+_ELEVATION = np.radians(-CAMERA.pitch)  # of the camera, which stands in the direction of y
+_TOWARDS_CAMERA = np.array([0.0, np.cos(_ELEVATION), np.sin(_ELEVATION)])
 _BLACK, _WHITE = (1 / 15, 1 / 15, 1 / 15), (1.0, 1.0, 1.0)
 
 

@@ -16,7 +16,7 @@ def episode_seed(seed: int, split: Split, task_id: int, episode: int, attempt: i
     Args:
         seed: The user's seed of the whole dataset or evaluation, at least 0.
         split: Purpose of the episode.
-        task_id: Index of the task, 0..299.
+        task_id: Index of the task, 0..299, or 1000..1479 for those by color and shape.
         episode: Number of the episode (or of the trial) of this task, from 0.
         attempt: Number of attempts at this episode that failed before.
 

@@ -35,8 +35,8 @@ _NO_SHAPE = -1
 _ANGULAR_DAMPING = 0.9  # of free bodies, 1/s: without it, round ones rock on their rims for seconds
 _BASE = -1
 _CONTACT_NORMAL = 7  # field of a contact point
-# Of an image's depths, which are 0 at the near plane, and 1 at the far plane and where there is nothing: a
-# difference that rounding cannot make up, and that is a few micrometers in the scenes.
+# Depths closer than this may be equal: rounding alone can cause it. Depth is 0 at the near plane and 1 at the
+# far plane; in the scenes, this is a few micrometers.
 _DEPTH_TOLERANCE = 2e-6
 _MAX_BACKGROUNDS = 64
 
@@ -125,28 +125,24 @@ class Simulation:
     """
 
     def __init__(self) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise RuntimeError(
-                "PyBullet has no free client left. Close the environments that are no longer used."
-            )
         # PyBullet reads textures and unions of hulls from files only.
         self._files = Path(tempfile.mkdtemp(prefix="gym_deltaco_"))
-        self._release = weakref.finalize(self, _release, self._client, self._files, os.getpid())
         self._texture_file = self._files / "colors.png"
-        _color_texture().save(self._texture_file)
+        try:
+            _color_texture().save(self._texture_file)
+            self._client = _connect()
+        except BaseException:
+            shutil.rmtree(self._files, ignore_errors=True)
+            raise
+        self._release = weakref.finalize(self, _release, self._client, self._files, os.getpid())
         self._hull_files: dict[object, str] = {}
         self._texture = -1
         # Body and link of what is visible; of what never moves, with what it looks like, and where it is.
         self._static_parts: dict[tuple[int, int], tuple[object, ...]] = {}
         self._moving_parts: list[tuple[int, int]] = []
-        self._hides_static_parts = False
+        # Whether static and moving parts are visible; None after a change that was interrupted.
+        self._shown: tuple[bool, bool] | None = (True, True)
         self._backgrounds: dict[object, _Background] = {}
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the client is still connected."""
-        return self._release.alive
 
     def close(self) -> None:
         """Disconnects the client. Closing twice is harmless."""
@@ -169,7 +165,7 @@ class Simulation:
         )
         pybullet.setGravity(0, 0, GRAVITY, physicsClientId=self._client)
         self._texture = pybullet.loadTexture(str(self._texture_file), physicsClientId=self._client)
-        self._static_parts, self._moving_parts, self._hides_static_parts = {}, [], False
+        self._static_parts, self._moving_parts, self._shown = {}, [], (True, True)
 
     def step(self) -> None:
         """Advances the world by `TIME_STEP`."""
@@ -212,6 +208,7 @@ class Simulation:
             The body's id.
         """
         body = self._add_body(mesh, self._hulls(mesh, hulls), position, yaw, mass, contact)
+        self._show()
         self._moving_parts.append((body, _BASE))
         return body
 
@@ -409,12 +406,12 @@ class Simulation:
         two depths are too close to tell which is nearer, all are rendered together.
         """
         background = self._background(camera, size)
-        self._show_static_parts(False)
+        self._show(static=False)
         pixels, depths = self._image(camera, size)
         lead = depths - background.depths  # below 0 where something moving is nearer
         is_something = depths < 1 - _DEPTH_TOLERANCE
         if (is_something & (np.abs(lead) < _DEPTH_TOLERANCE)).any():
-            self._show_static_parts(True)
+            self._show()
             return np.ascontiguousarray(self._image(camera, size)[0])
         image = background.pixels.copy()
         np.copyto(image, pixels, where=(is_something & (lead < 0))[..., None])
@@ -425,27 +422,25 @@ class Simulation:
         if key not in self._backgrounds:
             if len(self._backgrounds) == _MAX_BACKGROUNDS:
                 self._backgrounds.clear()
-            self._show_static_parts(True)
-            self._set_visibility(self._moving_parts, is_visible=False)
+            self._show(moving=False)
             pixels, depths = self._image(camera, size)
             self._backgrounds[key] = _Background(np.ascontiguousarray(pixels), depths)
-            self._set_visibility(self._moving_parts, is_visible=True)
         return self._backgrounds[key]
 
     def _add_static_part(self, body: int, mesh: Mesh, position: ArrayLike) -> None:
-        self._show_static_parts(True)
+        self._show()
         self._static_parts[body, _BASE] = (mesh, *np.asarray(position, dtype=np.float64).tolist())
 
-    def _show_static_parts(self, is_visible: bool) -> None:
-        if self._hides_static_parts == is_visible:
-            self._set_visibility(list(self._static_parts), is_visible)
-            self._hides_static_parts = not is_visible
-
-    def _set_visibility(self, parts: Sequence[tuple[int, int]], is_visible: bool) -> None:
-        """The renderer leaves out what is fully transparent; it blends nothing."""
-        color = (1, 1, 1, float(is_visible))
-        for body, link in parts:
-            pybullet.changeVisualShape(body, link, rgbaColor=color, physicsClientId=self._client)
+    def _show(self, static: bool = True, moving: bool = True) -> None:
+        """Shows or hides all parts of a kind. The renderer leaves out what is fully transparent."""
+        before, self._shown = self._shown or (None, None), None
+        kinds = (self._static_parts, self._moving_parts)
+        for parts, was_visible, is_visible in zip(kinds, before, (static, moving), strict=True):
+            if was_visible != is_visible:
+                color = (1, 1, 1, float(is_visible))
+                for body, link in parts:
+                    pybullet.changeVisualShape(body, link, rgbaColor=color, physicsClientId=self._client)
+        self._shown = static, moving
 
     def _image(self, camera: Camera, size: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """The visible bodies' colors, (size, size, 3), and depths, (size, size)."""
@@ -468,6 +463,16 @@ class Simulation:
         # Tuples of numbers, if PyBullet was built without NumPy.
         image = np.asarray(pixels, dtype=np.uint8).reshape(size, size, 4)
         return image[..., :3], np.asarray(depths, dtype=np.float32).reshape(size, size)
+
+
+def _connect() -> int:
+    """Connects a client without a window. Returns its id."""
+    client = pybullet.connect(pybullet.DIRECT)
+    if client < 0:
+        raise RuntimeError(
+            "PyBullet has no free client left. Close the environments that are no longer used."
+        )
+    return client
 
 
 def _release(client: int, files: Path, process: int) -> None:

@@ -200,3 +200,10 @@ def _rotation(degrees: float, axis: int) -> np.ndarray:
     matrix[[first, second], [first, second]] = cosine
     matrix[first, second], matrix[second, first] = -sine, sine
     return matrix
+
+
+# Outlines that several objects have.
+CIRCLE, OCTAGON = polygon(12), polygon(8)
+ROUNDED = rounded_square(0.5)
+SQUARE = np.array([(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)])
+HALVED_SQUARE = np.array([(1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1)], float)

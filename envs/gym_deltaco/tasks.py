@@ -40,11 +40,12 @@ CONTAINER_WORDS: tuple[ContainerWord, ...] = ("green", "red", "front", "back", "
 
 @dataclass(frozen=True)
 class ObjectLabel:
-    """Name, shape and color of one of the 32 objects. Its geometry is in `gym_deltaco.objects`.
+    """Name, shape and color of an object. Its geometry is in `gym_deltaco.objects` or `random_objects`.
 
     Attributes:
-        index: 0..31, the order of the paper's table; 0..23 are scenario A's training objects.
-        name: Name of the object, such as "conic cup".
+        index: 0..31 for the paper's objects, in the order of its table, where 0..23 are scenario A's training
+            objects; 32..10007 for random ones.
+        name: Name of the object, such as "conic cup"; a random one's is in no instruction.
         shape: One of `SHAPES`.
         color: One of `COLORS`.
     """

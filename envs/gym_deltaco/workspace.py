@@ -37,10 +37,6 @@ class Region(NamedTuple):
     low: NDArray[np.float64]  # (2,), m
     high: NDArray[np.float64]  # (2,), m
 
-    def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether each of the points (..., 2) lies in it."""
-        return np.all((points >= self.low) & (points <= self.high), axis=-1)
-
 
 class Quadrant(NamedTuple):
     """A quarter of the tray."""

@@ -90,7 +90,7 @@ class TaskVectorEnv(VectorEnv):
     if their seeds are fewer apart than their trials.)
 
     Args:
-        task_id: Index of the task, 0..299.
+        task_id: Index of the task, 0..299, or 1000..1479 for those by color and shape.
         pool: Pool of the vector environments that run the task.
         example: Environment like those of the pool. Only its spaces and metadata are read.
         fps: Frames per second at which LeRobot's videos of episodes play.
