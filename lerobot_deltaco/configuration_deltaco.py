@@ -31,6 +31,7 @@ from lerobot_deltaco.policy.options import (
     INPUTS,
     METHODS,
     MODALITIES,
+    PATHS,
     SCHEDULERS,
     Conditioning,
 )
@@ -38,15 +39,6 @@ from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS, VISION_INPUT
 from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAdamWConfig
 from lerobot_deltaco.training.task_batches import count_upsampled_tasks
 
-# Options that may be files and folders of this machine.
-PATHS = (
-    "demo_root",
-    "instruction_embeddings",
-    "instructions",
-    "vision_encoder",
-    "vision_encoder_weights",
-    "demo_features_dir",
-)
 GOAL_DETAILS = (1, 2, 4, 8)  # by which `goal_image_size` may be larger than `image_size`
 MAX_LAYER_SIZE = 100_000  # of `language_head` and `demo_head`
 # The least and the greatest valid value. Beyond them, memory would not do, or arithmetic would overflow.
@@ -106,11 +98,11 @@ class DeltacoConfig(PreTrainedConfig):
         encoder_loss: Ablation: encoder loss, instead of the method's: contrastive, cosine or none.
         language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'),
             all-MiniLM-L6-v2, all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The
-            extra `offline` brings the first two, which then need no network.
+            extra `offline` brings the first two, which are then not downloaded.
         instruction_embeddings: File with embeddings of instructions, which are then not computed: a
             checkpoint's tasks.safetensors, or one that `deltaco-embed` wrote. A machine with it needs no
             language model.
-        instructions: CSV file with sentences that people wrote for the benchmark's tasks, as
+        instructions: CSV file with human-written instructions for the benchmark's tasks, as
             `deltaco-instructions` downloads or checks it. In training, each sample's instruction is drawn
             from the sentences of its task. In evaluation, a sentence gets the demonstrations of its task.
         instructions_split: Split of the file's sentences for training: train, the sentences that are not held
@@ -129,7 +121,7 @@ class DeltacoConfig(PreTrainedConfig):
             one_hot), the method's other input says what to look for. pretrained: a frozen image encoder.
         vision_encoder: Frozen image encoder for `demo_encoder=pretrained`: clip-vit-base-patch32,
             r3m-resnet18, r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0 (which
-            the extra `offline` brings, without a network), a folder with an image model of transformers, or
+            the extra `offline` brings), a folder with an image model of transformers, or
             its name on the Hugging Face Hub.
         vision_encoder_weights: File with R3M's weights, which are otherwise downloaded.
         vision_image_size: Height and width to which the array of a demonstration's frames is scaled for that
@@ -138,7 +130,7 @@ class DeltacoConfig(PreTrainedConfig):
             0..1 instead of 0..255 and not scaled to 224 pixels.
         demo_variants: Number of variants of each demonstration (random crops, and random frames between the
             ends) that a pretrained encoder encodes before training; each sample gets one of them.
-        demo_features_dir: Folder that keeps those features for further trainings; none by default.
+        demo_features_dir: Folder that keeps those features for further training runs; none by default.
         demo_head: Sizes of the hidden layers of fully connected layers after a pretrained encoder, such as
             [256]; by default, there are no layers at all.
         demo_rows: Number of rows of the array of a demonstration's frames, m in the paper.

@@ -160,7 +160,7 @@ def test_the_card_says_what_was_trained_and_on_what(dataset):
     assert "contrastive, with the instructions of the batch; weight 10, temperature 0.1" in text
     encoder = LANGUAGE_ENCODERS["all-distilroberta-v1"].repo_id
     assert f"https://huggingface.co/{encoder}" in rows["language encoder"]
-    assert "independent re-creation" in text
+    assert "independent reimplementation" in text
     assert "arxiv.org/abs/2210.04476" in text
     assert "@inproceedings{yu2023deltaco" in card.text
 

@@ -63,3 +63,12 @@ FRAMES_BETWEEN = ("spread", "any")
 INITIAL_WEIGHTS = ("authors", "torch")
 SCHEDULERS = ("constant", "cosine")
 DTYPES = ("float32", "bfloat16")
+# Options that may be files and folders of this machine.
+PATHS = (
+    "demo_root",
+    "instruction_embeddings",
+    "instructions",
+    "vision_encoder",
+    "vision_encoder_weights",
+    "demo_features_dir",
+)
