@@ -32,7 +32,7 @@ from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.evaluation.episodes import counterfactual_task, scene_info
 from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
-from lerobot_deltaco.evaluation.record import read_record, record_path
+from lerobot_deltaco.evaluation.record import read_record, record_path, write_record
 from lerobot_deltaco.training.loop import InMemoryTraining
 
 TASKS = (4, 14, 55)
@@ -256,6 +256,36 @@ def test_records_of_other_evaluations_are_not_taken_for_this_one(run, capsys):
         with pytest.raises(SystemExit):
             evaluate_command.main([str(run), "--tasks", "4,14", "--trials", "1", "--steps", "last", *changed])
         assert "belongs to another evaluation" in capsys.readouterr().err
+
+
+def test_the_record_of_another_policy_is_not_taken_for_this_ones(run, tmp_path, capsys):
+    arguments = ["--tasks", "4", "--trials", "1", "--steps", "last", "--out", str(tmp_path / "out")]
+    evaluate_command.main([str(run), *arguments])
+    path = record_path(tmp_path / "out", 2)
+    record = read_record(path)
+    assert record.weights is not None
+    assert len(record.weights) == 64
+    write_record(replace(record, weights="0" * 64), path)
+    with pytest.raises(SystemExit):
+        evaluate_command.main([str(run), *arguments])
+    assert "belongs to another policy" in capsys.readouterr().err
+    # Records of earlier versions do not tell.
+    write_record(replace(record, weights=None), path)
+    evaluate_command.main([str(run), *arguments])
+    assert "already evaluated" in capsys.readouterr().out
+
+
+def test_a_record_with_other_demonstrations_is_another_evaluation(run, tmp_path, capsys):
+    arguments = [str(run), "--tasks", "4", "--trials", "1", "--steps", "last", "--out", str(tmp_path / "out")]
+    demos = ["--policy.demo_repo_id", "test/others", "--policy.demo_root", str(run.parent / "data")]
+    evaluate_command.main([*arguments, *demos])
+    assert read_record(record_path(tmp_path / "out", 2)).demonstrations == "test/others"
+    capsys.readouterr()
+    evaluate_command.main([*arguments, *demos])
+    assert "already evaluated" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        evaluate_command.main(arguments)
+    assert "'demonstrations': 'test/others'" in capsys.readouterr().err
 
 
 def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder(run, tmp_path, capsys):

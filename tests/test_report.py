@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 from gym_deltaco import ENV_ID
-from gym_deltaco.tasks import CONTAINER_WORDS, TASKS
+from gym_deltaco.tasks import COLOR_SHAPE_TASKS, CONTAINER_WORDS, TASKS
 from lerobot_deltaco.commands import report as report_command
+from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.record import (
     RECORD_FORMAT,
     EpisodeResult,
@@ -26,7 +27,14 @@ from lerobot_deltaco.evaluation.record import (
 )
 from lerobot_deltaco.reporting.curves import Curve, curves_figure
 from lerobot_deltaco.reporting.novelty import novelty, scenario_of
-from lerobot_deltaco.reporting.paper_results import PAPER_RESULTS, TITLES, in_order, label_of, paper_result
+from lerobot_deltaco.reporting.paper_results import (
+    PAPER_OPTIONS,
+    PAPER_RESULTS,
+    TITLES,
+    in_order,
+    label_of,
+    paper_result,
+)
 from lerobot_deltaco.reporting.report import FILES, write_report
 from lerobot_deltaco.reporting.series import ReportError, counted, find_records, make_report
 from lerobot_deltaco.reporting.statistics import (
@@ -319,6 +327,24 @@ def test_sentences_of_no_task():
     assert follow("demo", demonstration=None)["object", "demonstration"] == (0, 0)
 
 
+def test_tasks_by_color_and_shape_are_tasks():
+    own, other = COLOR_SHAPE_TASKS[0], COLOR_SHAPE_TASKS[100]
+    (item,) = [replace(episode(0), task_id=own.index, demonstration=other.instruction)]
+    assert unknown_sentences([item], "demo") == 0
+    found = {(row.kind, row.word): row.outcomes["success"].total for row in breakdown([item, episode(0)])}
+    assert (found["color_shape", "all"], found["name", "all"], found["all", "all"]) == (1, 1, 2)
+
+
+def test_the_page_has_columns_of_the_kinds_of_task_that_were_evaluated(tmp_path):
+    tasks = [task.index for task in COLOR_SHAPE_TASKS[:2]]
+    episodes = [replace(episode(0), task_id=task_id) for task_id in tasks]
+    changes = {"tasks": ",".join(map(str, tasks)), "episodes": episodes}
+    write_report([write(tmp_path / "runs", record(**changes))], tmp_path / "out")
+    assert "| color shape |" in (tmp_path / "out/report.md").read_text()
+    write_report([write(tmp_path / "paper", record())], tmp_path / "out")
+    assert "color shape" not in (tmp_path / "out/report.md").read_text()
+
+
 # The authors' numbers
 
 
@@ -455,8 +481,13 @@ def test_a_record_of_the_first_format_says_what_was_so_then(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("wording", "templates"), ("adversarial_draw", "each"), ("scene_set", None)],
-    ids=["wording", "draw", "scenes"],
+    [
+        ("wording", "templates"),
+        ("adversarial_draw", "each"),
+        ("scene_set", None),
+        ("weights", None),
+        ("demonstrations", None),
+    ],
 )
 def test_the_first_records_of_the_second_format_say_what_was_so_then(tmp_path, name, value):
     content = {"format": RECORD_FORMAT, **asdict(record())}
@@ -774,6 +805,12 @@ def test_the_text_says_what_differs_from_the_papers_architecture(tmp_path):
     text = (tmp_path / "out/report.md").read_text()
     assert "`demo_encoder=attention` (paper: `cnn`), `motion_modes=5` (paper: `1`)." in text
     assert "`backbone" not in text.split("## Learning curves")[0]
+
+
+def test_the_papers_architecture_is_that_of_the_policy_by_default():
+    """What the paper does not say is not among these options, such as the precision."""
+    policy = DeltacoConfig()
+    assert {name: getattr(policy, name) for name in PAPER_OPTIONS} == dict(PAPER_OPTIONS)
 
 
 def test_success_is_reported_by_novelty_and_object_and_as_differences(runs, tmp_path):

@@ -196,6 +196,7 @@ class Task:
 
 
 TASKS = tuple(Task(index) for index in range(N_TASKS))
+COLOR_SHAPE_TASKS = tuple(Task(index) for index in _PAIR_TASKS)
 
 
 @dataclass(frozen=True)

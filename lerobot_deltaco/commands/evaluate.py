@@ -20,6 +20,7 @@ from lerobot_deltaco.common.run_folder import (
     checkpoints,
     describe,
     is_checkpoint,
+    weights_digest,
 )
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.record import (
@@ -155,6 +156,11 @@ def _evaluate(
     if path.exists():
         record = read_record(path)
         _check_same_evaluation(path, record, plan, experiment, description, options)
+        if record.weights is not None and record.weights != weights_digest(checkpoint.folder):
+            raise RecordError(
+                f"{path} belongs to another policy: the weights of {checkpoint.folder} are not those that it "
+                "is about. Name another folder for the records with --out, or move that record away."
+            )
         remark = "already evaluated"
     if record is None or options.explain or options.videos:
         # Only here, since they take seconds to import.
@@ -186,6 +192,8 @@ def _evaluate(
                 run_seed=description.seed,
                 command=command,
                 processes=options.processes or default_processes(str(loaded.policy.config.device)),
+                weights=weights_digest(checkpoint.folder),
+                demonstrations=options.demo_repo_id,
             )
             remark = f"{record.seconds:.0f} s"
     sys.stdout.write(_text(run, record, remark))
@@ -221,6 +229,8 @@ def _check_same_evaluation(
     made_for["scene_set"], asked_for["scene_set"] = (
         record.step if number is None else number for number in (record.scene_set, plan.scene_set)
     )
+    if record.weights is not None:  # else, the record does not tell
+        made_for["demonstrations"], asked_for["demonstrations"] = record.demonstrations, options.demo_repo_id
     if options.n_demonstrations is not None:
         made_for["n_demonstrations"] = record.policy.get("n_demonstrations", 1)
         asked_for["n_demonstrations"] = options.n_demonstrations

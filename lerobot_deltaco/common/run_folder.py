@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,6 +85,12 @@ def checkpoints(run: Path) -> list[Checkpoint]:
 def is_checkpoint(folder: Path) -> bool:
     """Whether a folder is itself a checkpoint, such as `checkpoints/012000/pretrained_model` of a run."""
     return (folder / POLICY_CONFIG).is_file() and (folder / WEIGHTS).is_file()
+
+
+def weights_digest(checkpoint: Path) -> str:
+    """SHA-256 of the weights of a checkpoint, in hexadecimal."""
+    with (checkpoint / WEIGHTS).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _step_of(checkpoint: Path) -> int:

@@ -128,7 +128,7 @@ def counterfactual_task(others: Sequence[Task], info: Mapping[str, Any], rng: ra
 def scene_info(plan: EvaluationPlan, task: Task, seed: int) -> dict[str, Any]:
     """What the environment will say of a scene, as far as it is drawn, without building the scene."""
     rng, _ = seeding.np_random(seed)
-    labels = select_objects(plan.objects or "all")
+    labels = select_objects(plan.object_set)
     layout = sample_layout(
         task, plan.ambiguity, rng, labels, plan.adversarial_probability, plan.adversarial_draw
     )

@@ -74,15 +74,21 @@ class EvaluationPlan:
         if self.scene_set is not None:
             ranges["scene_set"] = (0, 2**63 - 1)
         check_ranges(self, {"trials": (1, 1_000_000), "seed": (0, 2**63 - 1), **ranges})
-        objects = default_objects(self.tasks) if self.objects is None else self.objects
-        object.__setattr__(self, "objects", objects)
-        check_scenes(task_ids, objects, self.adversarial_probability, self.adversarial_draw)
+        if self.objects is None:
+            object.__setattr__(self, "objects", default_objects(self.tasks))
+        check_scenes(task_ids, self.object_set, self.adversarial_probability, self.adversarial_draw)
         check_choices(self, counterfactual=COUNTERFACTUALS, ambiguity=AMBIGUITIES)
         if self.sentences is not None and self.counterfactual == "instruction":
             raise ValueError(
                 "A counterfactual instruction is another task's template: leave out `instructions` and "
                 "`instruction`, or set `counterfactual` to 'none' or 'demo'."
             )
+
+    @property
+    def object_set(self) -> str:
+        """Name of the set of objects that scenes are made of."""
+        assert self.objects is not None
+        return self.objects
 
     @property
     def sentences(self) -> dict[int, tuple[str, ...]] | None:

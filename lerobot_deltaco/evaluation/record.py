@@ -30,7 +30,15 @@ BENCHMARK = "benchmark"
 # The `wording` of an evaluation with the benchmark's own instructions.
 TEMPLATES = "templates"
 # Fields that the first records of format 2 do not have, and what was so in all of them.
-_ADDED_TO_FORMAT_2 = MappingProxyType({"wording": TEMPLATES, "adversarial_draw": "each", "scene_set": None})
+_ADDED_TO_FORMAT_2 = MappingProxyType(
+    {
+        "wording": TEMPLATES,
+        "adversarial_draw": "each",
+        "scene_set": None,
+        "weights": None,
+        "demonstrations": None,
+    }
+)
 
 
 class RecordError(ValueError):
@@ -111,6 +119,10 @@ class EvaluationRecord:
         wording: In whose words the instructions were: "templates", the benchmark's own; a file of sentences
             with its split and SHA-256; or the one sentence that all tasks had.
         scene_set: Number of the set of scenes; None is the step.
+        weights: SHA-256 of the checkpoint's weights; None in evaluations during training, and in records of
+            earlier versions.
+        demonstrations: Name of the dataset of demonstrations that was given for the evaluation; None if they
+            were the checkpoint's own, or if `weights` is None.
     """
 
     experiment: str
@@ -134,6 +146,8 @@ class EvaluationRecord:
     adversarial_draw: AdversarialDraw = "each"
     wording: str = TEMPLATES
     scene_set: int | None = None
+    weights: str | None = None
+    demonstrations: str | None = None
 
     @property
     def success_rate(self) -> float:

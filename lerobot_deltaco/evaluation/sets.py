@@ -11,7 +11,6 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
 
-from gym_deltaco.object_sets import default_objects
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.evaluation.evaluate import Evaluation, versions
 from lerobot_deltaco.evaluation.lerobot_info import write_lerobot_info
@@ -32,6 +31,8 @@ def run_set(
     run_seed: int,
     command: str,
     processes: int = 1,
+    weights: str | None = None,
+    demonstrations: str | None = None,
 ) -> EvaluationRecord:
     """Runs an evaluation set, and writes its record, and beside it the results in LeRobot's form.
 
@@ -47,6 +48,8 @@ def run_set(
         run_seed: Seed of the training run, for the record.
         command: Command line, for the record.
         processes: Number of processes that share the episodes.
+        weights: SHA-256 of the checkpoint's weights, for the record; None if there is no checkpoint.
+        demonstrations: Name of the dataset of demonstrations, for the record; None for the checkpoint's own.
 
     Returns:
         The record.
@@ -67,7 +70,7 @@ def run_set(
         evaluation_seed=plan.seed,
         counterfactual=plan.counterfactual,
         ambiguity=plan.ambiguity,
-        objects=plan.objects or default_objects(plan.tasks),
+        objects=plan.object_set,
         adversarial_probability=plan.adversarial_probability,
         adversarial_draw=plan.adversarial_draw,
         tasks=plan.tasks,
@@ -81,6 +84,8 @@ def run_set(
         episode_length=plan.episode_length,
         wording=plan.wording,
         scene_set=plan.scene_set,
+        weights=weights,
+        demonstrations=demonstrations,
     )
     write_lerobot_info(outcomes, record.seconds, extras_folder(folder, step, plan.counterfactual))
     write_record(record, record_path(folder, step, plan.counterfactual))

@@ -17,7 +17,7 @@ from lerobot_deltaco.reporting.page_tables import PageTableError, replaced
 from lerobot_deltaco.reporting.report_files import markdown_table
 from lerobot_deltaco.reporting.series import Series, find_records, make_report
 from lerobot_deltaco.reporting.statistics import KINDS, breakdown
-from lerobot_deltaco.reporting.task_bootstrap import mean_rate
+from lerobot_deltaco.reporting.task_bootstrap import estimate_text, mean_rate
 
 ROWS_FILE = Path("results", "leaderboard.yaml")
 PAGE = Path("docs", "leaderboard.md")
@@ -142,13 +142,12 @@ def _cells(row: Row, series: Series | None, tasks: str) -> Sequence[str]:
             f"The records of {row.method!r} are of the ambiguity scheme {recorded.ambiguity!r}. The "
             f"leaderboard is of {AMBIGUITY!r}."
         )
-    estimate = mean_rate(series.last_task_rates)
+    success = estimate_text(mean_rate(series.last_task_rates))
     rates: dict[str, Any] = {
         item.kind: item.outcomes["success"].rate
         for item in breakdown(series.last_episodes)
         if item.word == "all"
     }
-    success = f"{100 * estimate.value:.1f} [{100 * estimate.low:.1f}, {100 * estimate.high:.1f}]"
     kinds = ["–" if rates[kind] is None else f"{100 * rates[kind]:.1f}" for kind in KINDS]
     n_seeds = str(len(series.seeds))
     assert row.training is not None

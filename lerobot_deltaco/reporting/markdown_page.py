@@ -19,8 +19,8 @@ from lerobot_deltaco.reporting.paper_results import (
 from lerobot_deltaco.reporting.report_files import markdown_table
 from lerobot_deltaco.reporting.series import Report, Series, counted
 from lerobot_deltaco.reporting.statistics import (
+    ALL_KINDS,
     CUES,
-    KINDS,
     N_BEST_SETS,
     OUTCOMES,
     WORDS,
@@ -32,7 +32,7 @@ from lerobot_deltaco.reporting.statistics import (
     followed,
     paper_rate,
 )
-from lerobot_deltaco.reporting.task_bootstrap import Estimate, mean_rate
+from lerobot_deltaco.reporting.task_bootstrap import estimate_text, mean_rate
 
 CURVES_IMAGE = "curves.png"
 BESIDE_PAPER_IMAGE = "beside_paper.png"
@@ -120,10 +120,12 @@ def _comparison_section(comparison: str, group: Sequence[Series]) -> str:
             for experiment, rows in breakdowns.items()
         ],
     )
+    found = {row.kind for rows in breakdowns.values() for row in rows}
+    kinds_of_task = [kind for kind in ALL_KINDS if kind in found]
     columns = [
-        *((kind, "all") for kind in KINDS),
+        *((kind, "all") for kind in kinds_of_task),
         *(("all", word) for word in WORDS),
-        *((kind, word) for kind in KINDS for word in WORDS),
+        *((kind, word) for kind in kinds_of_task for word in WORDS),
     ]
     kinds = markdown_table(
         ["experiment", *(_group_name(kind, word) for kind, word in columns)],
@@ -168,7 +170,7 @@ def _difference_section(group: Sequence[Series]) -> str:
     table = markdown_table(
         ["experiment", f"difference to {label_of(group[0].experiment)}, in points [95 %]"],
         [
-            [label_of(series.experiment), _estimate_text(estimate)]
+            [label_of(series.experiment), estimate_text(estimate)]
             for series, _, estimate in differences(group)
         ],
     )
@@ -240,11 +242,7 @@ def rate_text(paper: PaperRate) -> str:
 
 def last_text(series: Series) -> str:
     """The rate at the last step that counts in %, with its interval over tasks: "24.1 [20.9, 27.6]"."""
-    return _estimate_text(mean_rate(series.last_task_rates))
-
-
-def _estimate_text(estimate: Estimate) -> str:
-    return f"{_percent(estimate.value)} [{_percent(estimate.low)}, {_percent(estimate.high)}]"
+    return estimate_text(mean_rate(series.last_task_rates))
 
 
 def _group_name(kind: str, word: str) -> str:
@@ -253,8 +251,8 @@ def _group_name(kind: str, word: str) -> str:
 
 
 def _success(rows: Sequence[BreakdownRow], kind: str, word: str) -> str:
-    (row,) = (row for row in rows if (row.kind, row.word) == (kind, word))
-    return _percent(row.outcomes["success"].rate)
+    row = next((row for row in rows if (row.kind, row.word) == (kind, word)), None)
+    return "–" if row is None else _percent(row.outcomes["success"].rate)
 
 
 def _counterfactual_section(group: Sequence[Series]) -> str:

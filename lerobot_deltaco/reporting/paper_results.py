@@ -26,14 +26,24 @@ LEVELS: Mapping[str, float] = MappingProxyType(
 PAPER_OPTIONS: Mapping[str, object] = MappingProxyType(
     {
         "backbone": "paper",
+        "image_size": 48,
         "demo_encoder": "cnn",
+        "language_encoder": "paraphrase-MiniLM-L3-v2",
+        "pretrained_matching": False,
+        "encoder_loss_weight": 10.0,
+        "temperature": 0.1,
         "motion_modes": 1,
         "gripper_loss": "squared_error",
         "crop_padding": 4,
+        "demo_crop_padding": 4,
+        "recolor_share": 0.0,
         "drop_n_last_frames": 0,
+        "frames_after_release": None,
         "optimizer_lr": 3e-4,
         "optimizer_weight_decay": 0.0,
+        "optimizer_l2": 0.0,
         "scheduler_name": "constant",
+        "grad_clip_norm": 0.0,
     }
 )
 

@@ -19,7 +19,7 @@ from lerobot_deltaco.reporting.paper_results import (
 )
 from lerobot_deltaco.reporting.report_files import markdown_table
 from lerobot_deltaco.reporting.series import Series, find_records, make_report
-from lerobot_deltaco.reporting.task_bootstrap import Estimate, mean_rate, paired_difference
+from lerobot_deltaco.reporting.task_bootstrap import estimate_text, mean_rate, paired_difference
 
 PAPER_PAGE = Path("docs", "paper.md")
 PAPER_BEGIN = "<!-- The tables are made from the records in results/. -->"
@@ -86,10 +86,10 @@ def _cells(
         return [*cells, NOT_RUN, "", paper_difference, ""]
     difference = ""
     if name != reference and deltaco is not None:
-        difference = _text(paired_difference(measured.last_task_rates, deltaco.last_task_rates), "+")
+        difference = estimate_text(paired_difference(measured.last_task_rates, deltaco.last_task_rates), "+")
     return [
         *cells,
-        _text(mean_rate(measured.last_task_rates)),
+        estimate_text(mean_rate(measured.last_task_rates)),
         str(len(measured.seeds)),
         paper_difference,
         difference,
@@ -104,8 +104,3 @@ def _measured(name: str, root: Path) -> Series | None:
     if not records.is_dir():
         return None
     return next(series for series in make_report(find_records([records])).regular)
-
-
-def _text(estimate: Estimate, sign: str = "") -> str:
-    value = f"{100 * estimate.value:{sign}.1f}"
-    return f"{value} [{100 * estimate.low:{sign}.1f}, {100 * estimate.high:{sign}.1f}]"

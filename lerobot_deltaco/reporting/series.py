@@ -76,13 +76,13 @@ class Series:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name in tables, with the counterfactual."""
         suffix = "" if self.counterfactual == "none" else f" (another task's {self.counterfactual})"
         return self.experiment + suffix
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Of training, ascending."""
+        """Seeds of training, ascending."""
         return tuple(sorted(self.runs))
 
     @cached_property

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gym_deltaco.object_sets import find_label
-from gym_deltaco.tasks import CONTAINER_COLORS, TASKS, Task, get_task
+from gym_deltaco.tasks import COLOR_SHAPE_TASKS, CONTAINER_COLORS, TASKS, Task, get_task
 from gym_deltaco.workspace import Quadrant, container_matches
 from lerobot_deltaco.evaluation.record import Counterfactual, EpisodeResult
 
@@ -110,6 +110,7 @@ OUTCOMES = MappingProxyType[str, Callable[[EpisodeResult], bool]](
     }
 )
 KINDS = ("name", "color", "shape")  # of the paper's tasks
+ALL_KINDS = (*KINDS, "color_shape")
 WORDS = ("color_word", "position_word")
 
 
@@ -117,7 +118,7 @@ class BreakdownRow(NamedTuple):
     """What happened in the episodes of a group of tasks.
 
     Attributes:
-        kind: Kind of words for their object: name, color, shape, or "all".
+        kind: Kind of words for their object: name, color, shape, color_shape (ours), or "all".
         word: Kind of word for their container: color_word (green, red), position_word (front, back, left,
             right), or "all".
         outcomes: For each of `OUTCOMES`, in how many episodes it came about.
@@ -129,9 +130,13 @@ class BreakdownRow(NamedTuple):
 
 
 def breakdown(episodes: Sequence[EpisodeResult]) -> list[BreakdownRow]:
-    """Outcomes of all episodes, by kind of task, by kind of container word, and by both."""
+    """Outcomes of all episodes, by kind of task, by kind of container word, and by both.
+
+    There are always rows of the paper's kinds of task; of others, where there are episodes.
+    """
     rows = []
-    for kind in ("all", *KINDS):
+    found = {get_task(episode.task_id).kind for episode in episodes}
+    for kind in ("all", *(kind for kind in ALL_KINDS if kind in KINDS or kind in found)):
         for word in ("all", *WORDS):
             group = [
                 episode
@@ -230,7 +235,7 @@ def followed(episodes: Sequence[EpisodeResult], counterfactual: Counterfactual) 
 
 
 def unknown_sentences(episodes: Sequence[EpisodeResult], counterfactual: Counterfactual) -> int:
-    """In how many episodes the cue that is another task's is a sentence of none of the 300 tasks.
+    """In how many episodes the cue that is another task's is a sentence of none of the benchmark's tasks.
 
     Nobody knows then what it asks for: as a cue it is not counted.
     """
@@ -239,7 +244,7 @@ def unknown_sentences(episodes: Sequence[EpisodeResult], counterfactual: Counter
     return sum(counterfactual != "none" and cues[changed] is None for cues in tasks)
 
 
-_TASK_OF_SENTENCE = MappingProxyType({task.instruction: task for task in TASKS})
+_TASK_OF_SENTENCE = MappingProxyType({task.instruction: task for task in (*TASKS, *COLOR_SHAPE_TASKS)})
 
 
 def _cue_tasks(episode: EpisodeResult, counterfactual: Counterfactual) -> dict[Cue, Task | None]:

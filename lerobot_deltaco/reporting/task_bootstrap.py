@@ -33,6 +33,17 @@ class Estimate(NamedTuple):
     high: float
 
 
+def estimate_text(estimate: Estimate, sign: str = "") -> str:
+    """An estimate in %, such as "25.8 [20.1, 31.4]".
+
+    Args:
+        estimate: The estimate.
+        sign: "+" for a sign before positive numbers, too.
+    """
+    value, low, high = (f"{100 * number:{sign}.1f}" for number in estimate)
+    return f"{value} [{low}, {high}]"
+
+
 def task_rates(episodes: Iterable[EpisodeResult]) -> dict[int, float]:
     """Success rate of each task, 0..1, over all its episodes."""
     outcomes = defaultdict(list)

@@ -13,7 +13,7 @@ from lerobot_deltaco.reporting.curves import DOTS_PER_INCH
 from lerobot_deltaco.reporting.paper_results import CHANCE, in_order, label_of
 from lerobot_deltaco.reporting.report_files import csv_bytes, markdown_table, write_files
 from lerobot_deltaco.reporting.series import Series, check_same_scenes, find_records, make_report
-from lerobot_deltaco.reporting.task_bootstrap import Estimate, mean_rate, paired_difference
+from lerobot_deltaco.reporting.task_bootstrap import Estimate, estimate_text, mean_rate, paired_difference
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -241,6 +241,5 @@ def _markdown(results: Sequence[WordingResult]) -> str:
 
 
 def _cell(result: WordingResult) -> str:
-    value, low, high = (100 * number for number in result.rate)
-    text = f"{value:.1f} [{low:.1f}, {high:.1f}]"
+    text = estimate_text(result.rate)
     return text if result.share is None else f"{text} ({100 * result.share:.0f} %)"
