@@ -1,18 +1,24 @@
 """The page without a browser: what its buttons do, with a small untrained policy in the real environment."""
 
+import asyncio
 import gc
+import inspect
 import io
 import json
 import os
 import random
 import re
 import shutil
+import socket
 import subprocess
 import sys
 import threading
 import time
+import weakref
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import httpx
@@ -22,6 +28,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from huggingface_hub.errors import LocalEntryNotFoundError
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
@@ -35,7 +42,7 @@ from lerobot_deltaco.evaluation.explanation import GRASP_COLOR, draw_explanation
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.play import engine as engine_module
 from lerobot_deltaco.play import sources
-from lerobot_deltaco.play.checkpoints import find_checkpoint
+from lerobot_deltaco.play.checkpoints import checkpoints_folder, find_checkpoint
 from lerobot_deltaco.play.datasets import EpisodeDataset
 from lerobot_deltaco.play.demonstrations import Demonstration
 from lerobot_deltaco.play.engine import Engine
@@ -47,6 +54,8 @@ from lerobot_deltaco.play.videos import LIFETIME, VideoFiles
 from lerobot_deltaco.play.worker import Worker
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet, load_demonstrations
 from lerobot_deltaco.policy.goals.conditioning import FoundGoals
+from lerobot_deltaco.policy.options import PATHS
+from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS
 
 # Two names and a color, each in a container's color and at a place.
 DEMONSTRATED = [TASKS[index].instruction for index in (4, 15, 36, 204)]
@@ -224,6 +233,41 @@ def test_a_stream_that_is_left_is_closed_and_the_next_one_runs():
     assert worker.call(lambda: 2) == 2
 
 
+def test_the_thread_of_a_worker_ends_with_it():
+    worker = Worker()
+    thread = worker.call(threading.current_thread)
+    del worker
+    gc.collect()
+    thread.join(30)
+    assert not thread.is_alive()
+
+
+def test_what_a_function_used_is_not_kept():
+    class Something:
+        pass
+
+    worker, used = Worker(), Something()
+    known = weakref.ref(used)
+    worker.call(partial(id, used))
+    del used
+    deadline = time.monotonic() + 30
+    while known() is not None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_the_end_of_the_program_does_not_wait_for_an_episode():
+    code = (
+        "import itertools, time\n"
+        "from lerobot_deltaco.play.worker import Worker\n"
+        "stream = Worker().stream(lambda: (time.sleep(0.01 if n < 9 else 600) for n in itertools.count()))\n"
+        "for n in range(9): next(stream)\n"
+        "print('over')"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "over\n", "")
+
+
 # Checkpoints
 
 
@@ -277,20 +321,47 @@ def test_a_repository_that_cannot_be_fetched_is_explained():
         ),
         ("policy_preprocessor.json", lambda content: content.update(steps=3), "no list of steps"),
         ("config.json", lambda content: content.update(type="act"), "of the type 'act'"),
-        ("config.json", lambda content: content.update(demo_root="/etc"), "`demo_root`"),
     ],
 )
-def test_a_checkpoint_that_could_run_code_or_read_files_is_refused(
-    checkpoints, tmp_path, file, change, message
-):
+def test_a_checkpoint_that_could_run_code_is_refused(checkpoints, tmp_path, file, change, message):
     folder = damaged(checkpoints, tmp_path, file, change)
     with pytest.raises(PlayError, match=message):
         find_checkpoint(str(folder), [tmp_path], False)
 
 
+def test_every_option_that_may_be_a_file_is_known():
+    """Those that the configuration describes as one."""
+    described = dict(
+        re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", inspect.cleandoc(DeltacoConfig.__doc__), re.MULTILINE)
+    )
+    is_path = re.compile("^(CSV file|File|Folder) |a folder with")
+    assert {name for name, text in described.items() if is_path.search(text)} == set(PATHS)
+
+
+@pytest.mark.parametrize("value", ["/etc/passwd", "", ["x/y"]], ids=["a file", "nothing", "a list"])
+@pytest.mark.parametrize("option", [*PATHS, "demo_repo_id"])
+def test_a_checkpoint_that_could_read_or_write_files_is_refused(checkpoints, tmp_path, option, value):
+    folder = damaged(checkpoints, tmp_path, "config.json", lambda content: content.update({option: value}))
+    with pytest.raises(PlayError, match=f"`{option}`"):
+        find_checkpoint(str(folder), [tmp_path], False)
+
+
+@pytest.mark.parametrize("encoder", [*VISION_ENCODERS, None])
+def test_a_checkpoint_whose_image_encoder_would_be_downloaded_is_refused(checkpoints, tmp_path, encoder):
+    def change(content):
+        content.update(demo_encoder="pretrained", vision_encoder=encoder)
+
+    folder = damaged(checkpoints, tmp_path, "config.json", change)
+    if encoder == "efficientnet-lite0":
+        assert find_checkpoint(str(folder), [tmp_path], True) == folder.resolve()
+        return
+    with pytest.raises(PlayError, match=f"image encoder {encoder!r}.*downloaded.*efficientnet-lite0 alone"):
+        find_checkpoint(str(folder), [tmp_path], True)
+
+
 def test_a_broken_checkpoint_is_explained(checkpoints, tmp_path):
     folder = damaged(checkpoints, tmp_path, "config.json", lambda content: content.update(method="magic"))
-    with pytest.raises(PlayError, match="cannot be loaded .*magic"):
+    with pytest.raises(PlayError, match="^The checkpoint cannot be loaded: `method` must be one of .*magic"):
         Player(folder)
     (folder / "config.json").write_text("{")
     with pytest.raises(PlayError, match=r"config.json cannot be read"):
@@ -298,6 +369,36 @@ def test_a_broken_checkpoint_is_explained(checkpoints, tmp_path):
     (folder / "model.safetensors").unlink()
     with pytest.raises(PlayError, match=r"model.safetensors is missing"):
         find_checkpoint(str(folder), [tmp_path], False)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("tasks.safetensors", b"nothing", "tasks.safetensors cannot be used: .* deltaco-embed wrote"),
+        ("model.safetensors", b"nothing", "its files are damaged or of another version"),
+        ("policy_preprocessor.json", b"{", "policy_preprocessor.json is no file of a processor"),
+    ],
+)
+def test_visitors_do_not_see_paths_of_the_machine(checkpoints, tmp_path, caplog, file, content, message):
+    folder = shutil.copytree(checkpoints / "goals", tmp_path / "damaged")
+    (folder / file).write_bytes(content)
+    with pytest.raises(PlayError, match=f"^The checkpoint cannot be loaded: {message}") as caught:
+        Player(folder)
+    assert str(tmp_path) not in str(caught.value)
+    assert str(folder) in caplog.text  # for whoever serves the page
+
+
+def test_an_engine_that_cannot_import_shows_no_details(engine, monkeypatch, caplog):
+    def fail():
+        raise OSError("/home/host/secret")
+
+    monkeypatch.setattr(engine_module, "_import_episodes", fail)
+    engine._start()
+    assert engine.status.is_done
+    assert not engine.status.is_ready
+    assert "LeRobot cannot be loaded" in engine.status.text
+    assert "secret" not in engine.status.text
+    assert "secret" in caplog.text
 
 
 def test_an_engine_says_why_it_cannot_start(checkpoints):
@@ -312,8 +413,10 @@ def test_an_engine_becomes_ready_in_the_background(engine):
     threads = torch.get_num_threads()
     try:
         engine.start()
+        deadline = time.monotonic() + 120
         while not engine.status.is_done:
-            threading.Event().wait(0.05)
+            assert time.monotonic() < deadline, engine.status.text
+            time.sleep(0.05)
         assert engine.status.is_ready
     finally:
         torch.set_num_threads(threads)
@@ -455,6 +558,19 @@ def test_videos_are_files_of_the_page_and_are_forgotten():
     assert not second.parent.exists()
 
 
+def test_a_video_that_is_forgotten_at_that_moment_is_written_again(monkeypatch):
+    files, touch = VideoFiles(), os.utime
+    path = Path(files.put(b"one"))
+
+    def touch_too_late(touched, *args):
+        path.unlink()
+        touch(touched, *args)
+
+    monkeypatch.setattr(os, "utime", touch_too_late)
+    assert Path(files.put(b"one")) == path
+    assert path.read_bytes() == b"one"
+
+
 # Datasets
 
 
@@ -527,10 +643,67 @@ def test_what_is_no_dataset_is_explained(actions, checkpoints, session, tmp_path
         EpisodeDataset("USER/NAME", [], True)
 
 
+class Repository:
+    """The Hub's answer about a repository."""
+
+    def __init__(self, *sizes):
+        self.sha = "0123abc"
+        self.siblings = [SimpleNamespace(size=size) for size in sizes]
+
+
+def serve(monkeypatch, repository, n_free):
+    """Lets the Hub answer, and the disk have that many bytes free. Returns the revisions that are fetched."""
+    fetched = []
+
+    def fetch(repo_id, revision, **_):
+        fetched.append(revision)
+        raise LocalEntryNotFoundError("enough")
+
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(sources.HfApi, "repo_info", lambda *args, **kwargs: repository)
+    monkeypatch.setattr(sources.shutil, "disk_usage", lambda folder: SimpleNamespace(free=n_free))
+    monkeypatch.setattr(sources, "snapshot_download", fetch)
+    return fetched
+
+
+def test_the_files_whose_size_was_checked_are_fetched(monkeypatch):
+    fetched = serve(monkeypatch, Repository(10**6, None), 10**10)
+    with pytest.raises(PlayError, match="'USER/NAME' cannot be fetched"):
+        find_checkpoint("USER/NAME", [], True)
+    assert fetched == ["0123abc"]
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "n_free", "message"),
+    [
+        (2 * 10**9, 10**12, "has 2.0 GB; at most 1 are loaded"),
+        (10**9, 5_900_000_000, "disk .* too full, with less than 5 GB"),
+    ],
+)
+def test_what_is_too_large_is_not_fetched(monkeypatch, n_bytes, n_free, message):
+    fetched = serve(monkeypatch, Repository(n_bytes), n_free)
+    with pytest.raises(PlayError, match=message):
+        find_checkpoint("USER/NAME", [], True)
+    assert not fetched
+
+
+def test_a_disk_that_fails_is_not_shown(monkeypatch, caplog):
+    serve(monkeypatch, Repository(10), 10**10)
+
+    def fail(*args, **kwargs):
+        raise PermissionError(13, "Permission denied", "/home/host/.cache")
+
+    monkeypatch.setattr(sources, "snapshot_download", fail)
+    with pytest.raises(PlayError, match="cannot be fetched") as caught:
+        find_checkpoint("USER/NAME", [], True)
+    assert "/home/host" not in str(caught.value)
+    assert "/home/host" in caplog.text
+
+
 def test_of_a_repository_only_data_are_fetched(checkpoints, monkeypatch):
     fetched = []
 
-    def fetch(repo_id, repo_type, allow_patterns, token):
+    def fetch(repo_id, repo_type, revision, allow_patterns, token):
         assert token is False  # the host may see more than its visitors
         fetched.append((repo_id, repo_type))
         assert all(pattern.startswith(("meta/", "data/", "videos/")) for pattern in allow_patterns)
@@ -691,6 +864,130 @@ def test_a_run_leaves_the_checkpoints_own_option(actions, either, engine):
     assert np.array_equal(plain.view, again.view)
 
 
+# The page
+
+
+@pytest.fixture
+def page(engine):
+    """The page, which is not served, once the engine is ready."""
+    pytest.importorskip("gradio", reason="the extra `play` is not installed")
+    from lerobot_deltaco.play.page import build_page
+
+    threads = torch.get_num_threads()
+    try:
+        engine._start()
+    finally:
+        torch.set_num_threads(threads)
+    return build_page(engine)
+
+
+def component(page, name):
+    (found,) = (block for block in page.blocks.values() if getattr(block, "elem_id", None) == name)
+    return found
+
+
+def event_of(page, name, event):
+    """The number of an event, and its handler, which gives one update or several."""
+    blocks = {None: page} if name is None else {name: component(page, name)}
+    target = (blocks[name]._id, event)
+    ((number, handler),) = ((number, item.fn) for number, item in page.fns.items() if target in item.targets)
+    return number, handler
+
+
+def updates_of(page, name, event, session, *inputs):
+    """What a user's event changes on the page."""
+    update = event_of(page, name, event)[1](session, *inputs)
+    return [update] if isinstance(update, dict) else list(update)
+
+
+def shown(page, updates, name):
+    """What a component shows after updates; None if they leave it alone."""
+    values = [update[component(page, name)] for update in updates if component(page, name) in update]
+    value = values[-1] if values else None
+    return value["value"] if isinstance(value, dict) else value
+
+
+def session_after(updates):
+    sessions = [value for update in updates for value in update.values() if isinstance(value, Session)]
+    return sessions[-1] if sessions else None
+
+
+def test_the_page_opens_the_first_checkpoint_and_says_which(page, engine, checkpoints):
+    updates = updates_of(page, None, "load", Session())
+    session = session_after(updates)
+    assert session.checkpoint == engine.default_checkpoint
+    assert shown(page, updates, "status") == f"Ready. The checkpoint is {engine.default_checkpoint}."
+    assert shown(page, updates, "sentence") == session.sentence
+    assert shown(page, updates, "message") == ""
+    updates = updates_of(page, "load", "click", session, str(checkpoints / "language"))
+    assert shown(page, updates, "status") == f"Ready. The checkpoint is {checkpoints / 'language'}."
+
+
+@pytest.mark.parametrize(
+    ("name", "event", "inputs"),
+    [
+        ("run", "click", ["go"]),
+        ("swap_sentence", "click", []),
+        ("seed", "blur", [4, 3]),
+        ("modality", "input", [BOTH]),
+    ],
+)
+def test_after_an_idle_hour_the_page_begins_anew(page, engine, name, event, inputs):
+    updates = updates_of(page, name, event, Session(), *inputs)
+    session = session_after(updates)
+    assert session.checkpoint == engine.default_checkpoint
+    assert "begun anew" in shown(page, updates, "message")
+    assert shown(page, updates, "sentence") == session.sentence
+    assert shown(page, updates, "seed") == session.scene.seed
+    if event == "click":
+        assert "uccess" in shown(page, updates, "latest_text")
+
+
+def test_what_fails_after_an_idle_hour_is_explained_in_a_new_session(page, engine):
+    updates = updates_of(page, "use", "click", Session())
+    assert "Let the expert do it first" in shown(page, updates, "message")
+    assert session_after(updates).checkpoint == engine.default_checkpoint
+
+
+def test_leaving_the_seed_as_it_is_leaves_the_instruction(page, session):
+    updates = updates_of(page, "seed", "blur", session, session.scene.task_id, session.scene.seed)
+    assert shown(page, updates, "sentence") is None
+    assert session_after(updates) is session
+
+
+def test_a_page_that_cannot_write_a_video_says_so(page, actions, session, monkeypatch):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    recorded = last(actions.run_expert(session))
+    monkeypatch.setattr(VideoFiles, "put", fail)
+    for name, inputs in (("use", []), ("run", ["go"])):
+        used = actions.use_recorded(recorded)
+        updates = updates_of(page, name, "click", used, *inputs)
+        assert "not your fault" in shown(page, updates, "message")
+        assert session_after(updates) is None
+
+
+def test_a_page_that_is_too_busy_refuses_further_clicks(page):
+    from lerobot_deltaco.play.page import MAX_WAITING
+
+    number, _ = event_of(page, "swap_sentence", "click")
+
+    async def click(n_users):
+        # The page's queue is not started here, so that all of them wait.
+        transport = httpx.ASGITransport(app=page.app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+            clicks = [
+                {"data": [None], "fn_index": number, "session_hash": f"user {user}"}
+                for user in range(n_users)
+            ]
+            answers = [await client.post("/gradio_api/queue/join", json=each) for each in clicks]
+        return [answer.status_code for answer in answers]
+
+    # At 503, Gradio's page says that it is busy.
+    assert asyncio.run(click(MAX_WAITING + 1)) == [200] * MAX_WAITING + [503]
+
+
 # Bad input
 
 
@@ -714,6 +1011,13 @@ def test_a_sentence_is_data():
     assert (
         checked_sentence(" <img src=x onerror=alert(1)> {{7*7}} ") == "<img src=x onerror=alert(1)> {{7*7}}"
     )
+
+
+def test_the_same_scene_again_leaves_the_instruction(actions, session):
+    session = last(actions.run(session, "what I wrote"))
+    assert actions.choose_scene(session, session.scene.task_id, session.scene.seed) is session
+    other = actions.choose_scene(session, session.scene.task_id, session.scene.seed + 1)
+    assert other.sentence == TASKS[session.scene.task_id].instruction
 
 
 @pytest.mark.parametrize("seed", [None, "x", -1, 1.5, float("nan"), float("inf"), 2**40])
@@ -743,6 +1047,69 @@ def test_the_command_says_that_the_projects_checkpoint_is_missing(tmp_path, monk
         play_command.main([])
     assert exit_.value.code == 2
     assert f"not at {tmp_path}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--port", "70000"], "--port must be 1 to 65535. Got 70000."),
+        (["--port", "0"], "--port must be 1 to 65535. Got 0."),
+        (["--allow", "MISSING"], "--allow must be a folder. There is none at MISSING."),
+        (["--allow", __file__], f"--allow must be a folder. There is none at {__file__}."),
+    ],
+)
+def test_a_bad_argument_is_refused(arguments, message, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        play_command.main(arguments)
+    assert exit_.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken_or_an_address_of_another_machine_is_refused(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(SystemExit) as exit_:
+            play_command.main(["--port", str(port)])
+    assert exit_.value.code == 1
+    error = capsys.readouterr().err
+    assert error == f"deltaco-play: Port {port} is taken. Choose another with --port.\n"
+    with pytest.raises(SystemExit) as exit_:
+        play_command.main(["--host", "192.0.2.1", "--port", str(port)])
+    assert exit_.value.code == 1
+    assert f"cannot be served at 192.0.2.1, port {port}: " in capsys.readouterr().err
+
+
+def test_an_interrupt_while_gradio_is_imported_is_one_line(monkeypatch, capsys):
+    class Interrupt:
+        def find_spec(self, name, *_):
+            if name == "lerobot_deltaco.play.page":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "lerobot_deltaco.play.page", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Interrupt(), *sys.meta_path])
+    with pytest.raises(SystemExit) as exit_:
+        play_command.main(["--port", str(free_port())])
+    assert exit_.value.code == 130
+    assert capsys.readouterr().err == "\ndeltaco-play: Interrupted.\n"
+
+
+def free_port():
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return server.getsockname()[1]
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "::1", "[::1]"])
+def test_the_current_folder_is_offered_to_this_machine_alone(checkpoints, tmp_path, monkeypatch, host):
+    monkeypatch.chdir(tmp_path)
+    own = checkpoints_folder()
+    assert play_command.allowed_folders(host, [], "USER/NAME") == [own, tmp_path]
+    for others in ("0.0.0.0", "::", "192.168.1.2", "robot.example", ""):
+        assert play_command.allowed_folders(others, [], "USER/NAME") == [own]
+        assert play_command.allowed_folders(others, [checkpoints], "USER/NAME") == [own, checkpoints]
+    assert play_command.allowed_folders(host, [checkpoints], "USER/NAME") == [own, checkpoints]
+    goals = checkpoints / "goals"
+    assert play_command.allowed_folders("0.0.0.0", [], str(goals)) == [own, goals]
 
 
 def test_the_page_stands_before_anything_heavy_is_imported():

@@ -9,9 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.play.sources import CHECKPOINT, find_folder, read_json
+from lerobot_deltaco.policy.options import PATHS
+from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS
 
 DEFAULT_NAME = "pick_place"
 
@@ -26,8 +29,13 @@ _STEPS = {
     "normalizer_processor",
     "unnormalizer_processor",
 }
-# Options that name files, which a checkpoint does not need: it brings its own.
-_FILE_OPTIONS = ("demo_repo_id", "demo_root", "instruction_embeddings")
+# Options that name files or a dataset, which a checkpoint does not need: it brings its own. Files of this
+# machine would be read, shown in a message or written.
+_FILE_OPTIONS = (*(option for option in PATHS if option != "vision_encoder"), "demo_repo_id")
+# Image encoders that come as Python packages. The others would be downloaded, whatever their size.
+_PACKAGED_ENCODERS = tuple(
+    name for name, spec in VISION_ENCODERS.items() if spec.kind == "efficientnet_lite0"
+)
 
 
 def checkpoints_folder() -> Path:
@@ -75,6 +83,7 @@ def check_files(folder: Path, name: str) -> None:
     named = [option for option in _FILE_OPTIONS if config.get(option) is not None]
     if named:
         raise PlayError(f"{name!r} names files of another place in `{named[0]}`. Save the policy again.")
+    _check_image_encoder(config, name)
     for file in _PROCESSORS:
         steps = read_json(folder / file, name).get("steps")
         if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
@@ -90,3 +99,24 @@ def check_files(folder: Path, name: str) -> None:
                 not isinstance(state_file, str) or not re.fullmatch(r"[\w-]+\.safetensors", state_file)
             ):
                 raise PlayError(f"{name!r} is refused: {file} names the file {state_file!r}.")
+
+
+def _check_image_encoder(config: dict[str, Any], name: str) -> None:
+    """Checks that a policy's frozen image encoder is one that comes with the project.
+
+    Raises:
+        PlayError: It is not.
+    """
+    encoder = config.get("vision_encoder")
+    # A list, since what a file says may not be hashable.
+    if encoder is not None and encoder not in list(VISION_ENCODERS):
+        raise PlayError(
+            f"{name!r} is refused: its `vision_encoder` is {encoder!r}, not one of "
+            f"{', '.join(VISION_ENCODERS)}."
+        )
+    if config.get("demo_encoder") == "pretrained" and encoder not in _PACKAGED_ENCODERS:
+        raise PlayError(
+            f"{name!r} is refused: its image encoder {encoder!r} would have to be downloaded. Of policies "
+            f"with a pretrained image encoder, this page loads those with {' or '.join(_PACKAGED_ENCODERS)} "
+            "alone."
+        )

@@ -74,9 +74,11 @@ class Engine:
         except PlayError as error:
             self._status = Status(str(error), is_done=True)
         # Whatever it is, the page has to say that it will not become ready.
-        except Exception as error:
+        except Exception:
             logger.exception("The page cannot become ready.")
-            self._status = Status(f"LeRobot cannot be loaded ({type(error).__name__}): {error}", is_done=True)
+            self._status = Status(
+                "LeRobot cannot be loaded. The terminal of the page has the details.", is_done=True
+            )
 
     def load(self, name: str) -> None:
         """Loads a checkpoint, unless it is loaded.

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import random
+import traceback
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -37,10 +40,13 @@ from lerobot_deltaco.policy.demonstrations import DemonstrationSet
 from lerobot_deltaco.policy.goals.conditioning import FoundGoals
 from lerobot_deltaco.policy.language.instruction_table import LanguageEncoderError
 
+logger = logging.getLogger(__name__)
+
 MAX_SEED = 2**32 - 1
 MAX_SENTENCE = 200  # characters
 RENDER_SIZE = 288  # px, of the images for people
 _CAMERA = "observation.image"
+_PROJECT = "lerobot_deltaco."  # its modules
 
 
 class Scene(NamedTuple):
@@ -185,9 +191,10 @@ class Player:
             loaded = load_policy(folder, ["--device=cpu", "--demo_episode=null", "--compile=false"])
         # Whatever is wrong with files that come from anywhere: the page says so and goes on.
         except Exception as error:
-            cause = error.__cause__ or error.__context__
-            reason = " ".join(f"{error} {cause or ''}".split())[:300]
-            raise PlayError(f"The checkpoint cannot be loaded ({type(error).__name__}): {reason}") from error
+            # The details, which name files of this machine, are for the terminal.
+            logger.warning("The checkpoint %s cannot be loaded.", folder, exc_info=error)
+            reason = _own_message(error, folder) or "its files are damaged or of another version."
+            raise PlayError(f"The checkpoint cannot be loaded: {reason}") from error
         self.policy, self._preprocessor, self._postprocessor = loaded
         config = self.policy.config
         cameras = config.image_features
@@ -355,6 +362,16 @@ def outcome(info: dict[str, Any], reached: int) -> str:
     target = f"{name(info['target_object'])} in the {CONTAINER_COLORS[info['target_container']]} bin"
     parts.append(f"The scene's own task is the {target}.")
     return " ".join(parts)
+
+
+def _own_message(error: Exception, folder: Path) -> str | None:
+    """Message of a check of this project's, without the path of the checkpoint; None for any other error."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    is_raised_here = frame.f_globals.get("__name__", "").startswith(_PROJECT)
+    if not type(error).__module__.startswith(_PROJECT) and not (type(error) is ValueError and is_raised_here):
+        return None
+    message = " ".join(str(error).replace(f"{folder}{os.sep}", "").removeprefix(f"{folder}: ").split())
+    return message.replace(str(folder), "the checkpoint")[:300]
 
 
 @contextmanager

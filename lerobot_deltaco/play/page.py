@@ -22,12 +22,25 @@ from lerobot_deltaco.play.layout import (
     lay_out_start,
 )
 from lerobot_deltaco.play.session import Actions, Session
-from lerobot_deltaco.play.shown import Updates, show_demonstration, show_instruction, show_run, show_scene
+from lerobot_deltaco.play.shown import (
+    Updates,
+    show_demonstration,
+    show_instruction,
+    show_run,
+    show_scene,
+    show_start,
+)
 from lerobot_deltaco.play.videos import VideoFiles
 
 logger = logging.getLogger(__name__)
 
 _HOUR = 3600  # s
+# Events that wait for their turn. More are refused, and their users are told that the page is busy.
+MAX_WAITING = 32
+_FORGOTTEN = (
+    "The page forgets what you chose after an hour without a click. It has begun anew, with its first "
+    "checkpoint and a random scene."
+)
 _ONE_AT_A_TIME = {"concurrency_id": "simulator", "concurrency_limit": 1, "api_visibility": "private"}
 
 
@@ -67,6 +80,7 @@ def build_page(engine: Engine) -> gr.Blocks:
                     alone: the user may be writing in it.
             """
             updates = {
+                **show_start(start, session),
                 **show_scene(scene, session),
                 **show_demonstration(demonstration, session, files),
                 **show_instruction(instruction, session),
@@ -80,16 +94,26 @@ def build_page(engine: Engine) -> gr.Blocks:
         def shown_message(text: str) -> Updates:
             return {instruction.message: gr.update(value=text, visible=bool(text))}
 
-        def changes(action: Callable[..., Session]) -> Callable[..., Updates]:
+        def begin(session: Session, notice: str = _FORGOTTEN) -> tuple[Session, Updates]:
+            """The session and, if it had to be opened anew, what is then shown, with a notice."""
+            resumed = actions.resumed(session)
+            if resumed is session:
+                return session, {}
+            return resumed, {session_state: resumed, **everything(resumed), **shown_message(notice)}
+
+        def changes(action: Callable[..., Session], notice: str = _FORGOTTEN) -> Callable[..., Updates]:
             """An action that changes the session at once, as a handler of an event."""
 
             def on_event(session: Session, *inputs: Any) -> Updates:
-                before = session.sentence
+                known = session.sentence
+                begun: Updates = {}
                 try:
+                    session, begun = begin(session, notice)
                     session = action(session, *inputs)
+                    shown = everything(session, known)
                 except Exception as error:  # whatever it is, the page says so and goes on
-                    return shown_message(_explained(error))
-                return {session_state: session, **everything(session, before), **shown_message("")}
+                    return {**begun, **shown_message(_explained(error))}
+                return {**shown_message(""), **begun, session_state: session, **shown}
 
             return on_event
 
@@ -101,6 +125,10 @@ def build_page(engine: Engine) -> gr.Blocks:
                 known = (session.sentence, *inputs)
                 yield shown_message("")
                 try:
+                    session, begun = begin(session)
+                    if begun:
+                        yield begun
+                        known = ()
                     for running in action(session, *inputs):
                         session = running
                         step = show_run(latest, session.latest)
@@ -110,10 +138,9 @@ def build_page(engine: Engine) -> gr.Blocks:
                             else {part: step[part] for part in (latest.image, latest.text)}
                         )
                         is_first = False
+                    yield {session_state: session, **everything(session, session.sentence)}
                 except Exception as error:  # whatever it is, the page says so and goes on
                     yield shown_message(_explained(error))
-                    return
-                yield {session_state: session, **everything(session, session.sentence)}
 
             return on_event
 
@@ -122,15 +149,8 @@ def build_page(engine: Engine) -> gr.Blocks:
             now = engine.status
             update: Updates = {start.status: now.text, start.timer: gr.update(active=not now.is_done)}
             if now.is_ready and session.checkpoint is None:
-                update |= changes(actions.open_checkpoint)(session, engine.default_checkpoint)
-                update[start.status] = f"Ready. The checkpoint is {engine.default_checkpoint}."
-            return update
-
-        def open_checkpoint(session: Session, name: str) -> Updates:
-            update = changes(actions.open_checkpoint)(session, name)
-            if session_state in update:
-                update[start.status] = f"Ready. The checkpoint is {name}."
-            return update
+                update |= changes(lambda opened: opened, notice="")(session)
+            return update | show_start(start, session)
 
         everywhere = [
             session_state,
@@ -164,7 +184,11 @@ def build_page(engine: Engine) -> gr.Blocks:
             demonstration.source,
         )
         on([instruction.use.input], changes(actions.choose_use), instruction.use)
-        on([instruction.load.click, instruction.source.submit], open_checkpoint, instruction.source)
+        on(
+            [instruction.load.click, instruction.source.submit],
+            changes(actions.open_checkpoint),
+            instruction.source,
+        )
         quiet = {"show_progress": "hidden"}
         on(
             [instruction.run.click, instruction.sentence.submit],
@@ -180,7 +204,7 @@ def build_page(engine: Engine) -> gr.Blocks:
         )
         on([instruction.swap_sentence.click], runs(actions.run_with_other_sentence), **quiet)
         on([demonstration.expert.click], runs(actions.run_expert), **quiet)
-    return page.queue()
+    return page.queue(max_size=MAX_WAITING)
 
 
 def _explained(error: Exception) -> str:

@@ -89,6 +89,12 @@ class Actions:
         self._engine = engine
         self._random = rng or random.Random()
 
+    def resumed(self, session: Session) -> Session:
+        """The session; one with the first checkpoint if it has none, since it is new or was forgotten."""
+        if session.checkpoint is None and self._engine.status.is_ready:
+            return self.open_checkpoint(session, self._engine.default_checkpoint)
+        return session
+
     def open_checkpoint(self, session: Session, name: str) -> Session:
         """Takes another checkpoint, its own demonstrations, and a first scene and demonstration for it."""
         name = name.strip()
@@ -132,11 +138,13 @@ class Actions:
         return session
 
     def choose_scene(self, session: Session, task_id: int, seed: Any) -> Session:
-        """Takes the scene of a task and a seed, and the task's own instruction."""
+        """Takes the scene of a task and a seed, and the task's own instruction, unless it is that already."""
         from lerobot_deltaco.play.episodes import checked_scene, view_scene
 
         checkpoint, _ = _opened(session)
         scene = checked_scene(task_id, seed)
+        if scene == session.scene:
+            return session
         view = self._engine.call(checkpoint, lambda _: view_scene(scene))
         return replace(session, scene=scene, view=view, sentence=TASKS[scene.task_id].instruction)
 

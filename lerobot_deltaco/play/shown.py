@@ -9,11 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lerobot_deltaco.play.layout import DEMO_SIZE, DemonstrationPart, InstructionPart, Panel, ScenePart
+from lerobot_deltaco.play.layout import (
+    DEMO_SIZE,
+    DemonstrationPart,
+    InstructionPart,
+    Panel,
+    ScenePart,
+    Start,
+)
 from lerobot_deltaco.play.session import Run, Session
 from lerobot_deltaco.play.videos import VideoFiles
 
 Updates = dict[Any, Any]
+
+
+def show_start(part: Start, session: Session) -> Updates:
+    """Which checkpoint is loaded."""
+    if session.checkpoint is None:
+        return {}
+    return {part.status: f"Ready. The checkpoint is {session.checkpoint}."}
 
 
 def show_scene(part: ScenePart, session: Session) -> Updates:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +16,10 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntry
 
 from lerobot_deltaco.play.errors import PlayError
 
+logger = logging.getLogger(__name__)
+
 MAX_HUB_BYTES = 1_000_000_000
+MIN_FREE_BYTES = 5_000_000_000  # that a download leaves on the disk
 
 
 class Kind(NamedTuple):
@@ -93,16 +98,18 @@ def _downloaded(repo_id: str, kind: Kind) -> Path:
 
     The host's token is not used: visitors are not to see what only the host may.
     """
+    revision = None
     try:
         if not constants.HF_HUB_OFFLINE:
             info = HfApi(token=False).repo_info(repo_id, repo_type=kind.repo_type, files_metadata=True)
-            n_bytes = sum(file.size or 0 for file in getattr(info, "siblings", None) or ())
-            if n_bytes > MAX_HUB_BYTES:
-                raise PlayError(
-                    f"{repo_id!r} has {n_bytes / 1e9:.1f} GB; at most {MAX_HUB_BYTES / 1e9:g} are loaded."
-                )
+            _check_size(sum(file.size or 0 for file in getattr(info, "siblings", None) or ()), repo_id)
+            revision = info.sha  # what was checked, even if the repository changes meanwhile
         folder = snapshot_download(
-            repo_id, repo_type=kind.repo_type, allow_patterns=list(kind.patterns), token=False
+            repo_id,
+            repo_type=kind.repo_type,
+            revision=revision,
+            allow_patterns=list(kind.patterns),
+            token=False,
         )
         return Path(folder)
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
@@ -111,7 +118,31 @@ def _downloaded(repo_id: str, kind: Kind) -> Path:
             f"The {kind.word} {repo_id!r} cannot be fetched from the Hugging Face Hub: {reason}"
         ) from error
     except (httpx.HTTPError, OSError) as error:
-        raise PlayError(f"The Hugging Face Hub cannot be reached to fetch {repo_id!r}: {error}") from error
+        # The details may name files of this machine. They are for the terminal.
+        logger.warning("The %s %r cannot be fetched.", kind.word, repo_id, exc_info=error)
+        raise PlayError(
+            f"The {kind.word} {repo_id!r} cannot be fetched: the Hugging Face Hub cannot be reached, or the "
+            "files cannot be written. The terminal of the page has the details."
+        ) from error
+
+
+def _check_size(n_bytes: int, repo_id: str) -> None:
+    """Checks that a repository is not too large.
+
+    Raises:
+        PlayError: It is, or the disk has too little space for it.
+    """
+    if n_bytes > MAX_HUB_BYTES:
+        raise PlayError(
+            f"{repo_id!r} has {n_bytes / 1e9:.1f} GB; at most {MAX_HUB_BYTES / 1e9:g} are loaded."
+        )
+    cache = Path(constants.HF_HUB_CACHE)
+    folder = next(folder for folder in (cache, *cache.parents) if folder.exists())
+    if shutil.disk_usage(folder).free - n_bytes < MIN_FREE_BYTES:
+        raise PlayError(
+            f"{repo_id!r} cannot be fetched: the disk of this page would be too full, with less than "
+            f"{MIN_FREE_BYTES / 1e9:g} GB free. Whoever serves the page has to make room."
+        )
 
 
 def _valid_names(kind: Kind, roots: Sequence[Path], is_hub_allowed: bool) -> str:

@@ -29,9 +29,9 @@ class VideoFiles:
         folder = Path(self._folder.name)
         self._forget(folder)
         path = folder / f"{hashlib.sha256(video).hexdigest()}.mp4"
-        if path.exists():
+        try:
             os.utime(path)
-        else:
+        except FileNotFoundError:  # it is new, or was forgotten
             number, part = tempfile.mkstemp(suffix=".part", dir=folder)
             with os.fdopen(number, "wb") as file:
                 file.write(video)

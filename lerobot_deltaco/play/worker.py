@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import queue
 import threading
+import weakref
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import closing
-from typing import TypeVar
+from typing import Any, TypeVar
 
 T = TypeVar("T")
+_Job = tuple[Future[Any], Callable[[], Any]]
 
 
 class _End:
@@ -24,15 +26,18 @@ class Worker:
 
     A policy keeps the task of a running episode by thread, and a generator of Gradio's may be resumed in
     another thread at every step. Here, an episode stays in one thread from its first step to its last, and no
-    other begins before it ends.
+    other begins before it ends. The end of the program does not wait for the thread.
     """
 
     def __init__(self) -> None:
-        self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="deltaco-play")
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        # The threads of a `ThreadPoolExecutor` would be waited for.
+        threading.Thread(target=_work, args=(self._jobs,), name="deltaco-play", daemon=True).start()
+        weakref.finalize(self, self._jobs.put, None)
 
     def call(self, function: Callable[[], T]) -> T:
         """The result of a function, once its turn has come."""
-        return self._executor.submit(function).result()
+        return self._submit(function).result()
 
     def stream(self, make: Callable[[], Generator[T]]) -> Iterator[T]:
         """Yields what a generator yields. If the caller stops early, the generator is closed."""
@@ -52,7 +57,7 @@ class Worker:
                 error = raised
             items.put(_End(error))
 
-        self._executor.submit(work)
+        self._submit(work)
         try:
             while not isinstance(item := items.get(), _End):
                 yield item
@@ -60,3 +65,23 @@ class Worker:
                 raise item.error
         finally:
             is_cancelled.set()
+
+    def _submit(self, function: Callable[[], T]) -> Future[T]:
+        future: Future[T] = Future()
+        self._jobs.put((future, function))
+        return future
+
+
+def _work(jobs: queue.SimpleQueue[_Job | None]) -> None:
+    """Runs one job after the other, until there is None."""
+    while (job := jobs.get()) is not None:
+        _run(*job)
+        del job  # or what it uses would be kept until the next one comes
+
+
+def _run[T](future: Future[T], function: Callable[[], T]) -> None:
+    try:
+        future.set_result(function())
+    except BaseException as error:  # it is raised again where the result is read
+        future.set_exception(error)
+        del future  # which the error refers to by its traceback, and which refers to the error
