@@ -3,6 +3,7 @@
 # No `from __future__ import annotations`: see `modeling_deltaco.py`.
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -16,6 +17,7 @@ from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
 from lerobot_deltaco.data.feature_names import ACTION_NAMES
 from lerobot_deltaco.lerobot_internals import log_refusals
 from lerobot_deltaco.policy.language.encoder_names import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
+from lerobot_deltaco.policy.optimization import CosineSchedulerConfig, FusedAdamWConfig
 from lerobot_deltaco.policy.options import (
     BACKBONES,
     CORRESPONDENCE,
@@ -23,6 +25,7 @@ from lerobot_deltaco.policy.options import (
     DEMO_ENCODERS,
     DTYPES,
     ENCODER_LOSSES,
+    ENCODERS_OF_OPTIONS,
     FRAMES_BETWEEN,
     GOAL_SOURCES,
     GRIPPER_CLOSED,
@@ -35,12 +38,19 @@ from lerobot_deltaco.policy.options import (
     SCHEDULERS,
     Conditioning,
 )
+from lerobot_deltaco.policy.upsampling import count_upsampled_tasks
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS, VISION_INPUTS
-from lerobot_deltaco.training.optimization import CosineSchedulerConfig, FusedAdamWConfig
-from lerobot_deltaco.training.task_batches import count_upsampled_tasks
 
 GOAL_DETAILS = (1, 2, 4, 8)  # by which `goal_image_size` may be larger than `image_size`
 MAX_LAYER_SIZE = 100_000  # of `language_head` and `demo_head`
+ACTION_TOLERANCE = 1e-3  # by which actions in -1..1 may be beyond
+# Valid modes of `normalization_mapping`; that of the state is free.
+NORMALIZATIONS = MappingProxyType(
+    {
+        "VISUAL": (NormalizationMode.IDENTITY,),
+        "ACTION": (NormalizationMode.MIN_MAX, NormalizationMode.IDENTITY),
+    }
+)
 # The least and the greatest valid value. Beyond them, memory would not do, or arithmetic would overflow.
 RANGES = MappingProxyType(
     {
@@ -337,6 +347,7 @@ class DeltacoConfig(PreTrainedConfig):
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
             raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
         check_ranges(self, RANGES)
+        self._check_normalization()
         for name in ("language_head", "demo_head"):
             sizes = getattr(self, name) or []
             if not all(1 <= size <= MAX_LAYER_SIZE for size in sizes):
@@ -364,6 +375,14 @@ class DeltacoConfig(PreTrainedConfig):
         self._check_conditioning()
         self._check_dropout()
         self._check_pretrained()
+
+    def _check_normalization(self) -> None:
+        """Images must stay in 0..1, and actions in -1..1: the networks are made for these."""
+        for kind, valid in NORMALIZATIONS.items():
+            mode = self.normalization_mapping.get(kind, NormalizationMode.IDENTITY)
+            if mode not in valid:
+                names = " or ".join(each.value for each in valid)
+                raise ValueError(f"`normalization_mapping` must be {names} for {kind}. Got {mode.value}.")
 
     def _check_upsampling(self) -> None:
         for name in ("upsampled_tasks", "color_blind_tasks"):
@@ -410,11 +429,6 @@ class DeltacoConfig(PreTrainedConfig):
             )
 
     def _check_pretrained(self) -> None:
-        if self.demo_head is not None and self.demo_encoder != "pretrained":
-            raise ValueError(
-                "`demo_head` are layers behind a pretrained encoder. Leave it out, or set `demo_encoder` to "
-                f"'pretrained'. Got {self.demo_encoder!r}."
-            )
         if self.demo_encoder == "pretrained" and self.demo_feature_dim is None:
             spec = VISION_ENCODERS.get(self.vision_encoder)
             self.demo_feature_dim = None if spec is None else spec.feature_dim
@@ -439,24 +453,11 @@ class DeltacoConfig(PreTrainedConfig):
         overridden = [name for name in ("film", "concat", "encoder_loss") if getattr(self, name) is not None]
         if overridden and self.method in ("one_hot", "mcil"):
             raise ValueError(f"`{overridden[0]}` cannot be changed in the method {self.method!r}.")
+        self._check_options_of_encoders()
         film, concat, encoder_loss = self.conditioning
         if self.locates_goals:
             self._check_correspondence(film, concat, encoder_loss)
             return
-        if self.goal_image_size is not None:
-            raise ValueError(
-                f"`goal_image_size` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that one."
-            )
-        if self.n_demonstrations > 1:
-            raise ValueError(
-                f"`n_demonstrations` is for policies with `demo_encoder={CORRESPONDENCE}`, which combine "
-                f"demonstrations; set it to 1. Got {self.n_demonstrations}."
-            )
-        if self.pretrained_matching:
-            raise ValueError(
-                f"`pretrained_matching` is for `demo_encoder={CORRESPONDENCE}`. Leave it out, or choose that "
-                "one."
-            )
         if film == concat == "none":
             raise ValueError("`film` and `concat` are both 'none': the policy would get no task.")
         if encoder_loss != "none" and not self.uses_demo:
@@ -464,6 +465,16 @@ class DeltacoConfig(PreTrainedConfig):
                 f"`encoder_loss` is {encoder_loss!r}, but no demonstration is used. Set it to 'none', or use "
                 "one in `film` or `concat`."
             )
+
+    def _check_options_of_encoders(self) -> None:
+        for name, encoders in ENCODERS_OF_OPTIONS.items():
+            value, default = getattr(self, name), getattr(type(self), name)
+            if value != default and self.demo_encoder not in encoders:
+                raise ValueError(
+                    f"`{name}` has no effect with `demo_encoder={self.demo_encoder}`: it is for "
+                    f"{' and '.join(f'`demo_encoder={encoder}`' for encoder in encoders)}. Leave it out (its "
+                    f"default is {default}), or choose another `demo_encoder`. Got {value!r}."
+                )
 
     def _check_correspondence(self, film: str, concat: str, encoder_loss: str) -> None:
         if self.demo_image_size not in (factor * self.image_size for factor in GOAL_DETAILS):
@@ -585,11 +596,20 @@ class DeltacoConfig(PreTrainedConfig):
         command = actions[:, self.gripper_index]
         return command if self.gripper_closed == "low" else -command
 
-    def resolve(self, dataset_features: dict[str, dict] | None) -> None:
+    def resolve(
+        self,
+        dataset_features: dict[str, dict] | None,
+        dataset_stats: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
         """Decides what the training dataset tells: which dimension is the gripper, how actions are scaled.
 
         Args:
             dataset_features: Features of the training dataset; None in evaluation, where all is known.
+            dataset_stats: Its statistics, if they are known.
+
+        Raises:
+            ValueError: The features are not those of a policy, or actions that are not scaled are not in
+                -1..1.
         """
         names = (dataset_features or {}).get("action", {}).get("names")
         if isinstance(names, dict):
@@ -597,10 +617,23 @@ class DeltacoConfig(PreTrainedConfig):
         if names and list(names) == ACTION_NAMES:
             # The benchmark's actions are in -1..1 already.
             self.normalization_mapping["ACTION"] = NormalizationMode.IDENTITY
+        elif dataset_features is not None:
+            self._check_scaled_actions((dataset_stats or {}).get("action", {}))
         if self.gripper == "auto":
             found = [index for index, name in enumerate(names or ()) if "gripper" in str(name).lower()]
             self.gripper = str(found[-1]) if found else "none"
         self.validate_features()
+
+    def _check_scaled_actions(self, stats: Mapping[str, Any]) -> None:
+        """Checks that actions are in -1..1, if they are not scaled to it."""
+        if self.normalization_mapping.get("ACTION", NormalizationMode.IDENTITY) == NormalizationMode.MIN_MAX:
+            return
+        ends = [float(number) for name in ("min", "max") for number in stats.get(name, ())]
+        if any(abs(number) > 1 + ACTION_TOLERANCE for number in ends):
+            raise ValueError(
+                f"The dataset's actions are in {min(ends):g}..{max(ends):g}, but the policy predicts them in "
+                "-1..1. Set `normalization_mapping` to MIN_MAX for ACTION."
+            )
 
     def validate_features(self) -> None:
         """Checks the inputs and outputs that were found in the dataset.

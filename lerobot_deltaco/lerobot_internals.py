@@ -18,7 +18,6 @@ supported.
 from __future__ import annotations
 
 import inspect
-import json
 import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -29,6 +28,9 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
+
+import yaml
+from draccus.utils import ParsingError
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -168,17 +170,33 @@ def single_frames(dataset: LeRobotDataset) -> Iterator[None]:
 def dataset_option(name: str) -> Any:
     """The value of `--dataset.<name>` for the running `lerobot-train`; None if it is not given.
 
-    It is taken from the command line, or else from the file of `--config_path`.
+    It is taken from the command line, or else from the file or the folder of `--config_path`, as YAML, which
+    JSON is as well.
+
+    Raises:
+        ValueError: `--config_path` is neither a file nor a folder.
     """
     from lerobot.configs import parser
+    from lerobot.configs.train import TRAIN_CONFIG_NAME
 
     text = parser.parse_arg(f"dataset.{name}")
     if text is not None:
-        return json.loads(text)
+        return yaml.safe_load(text)
     config_path = parser.parse_arg("config_path")
-    if config_path is None or not Path(config_path).is_file():
+    if config_path is None:
         return None
-    return json.loads(Path(config_path).read_text()).get("dataset", {}).get(name)
+    path = Path(config_path)
+    if not path.exists():
+        raise ValueError(
+            f"--config_path is {config_path}, which is neither a file nor a folder of this machine. So it is "
+            "not known which episodes are held back from the demonstrations. Download it and name its "
+            "folder, or train with `deltaco-train`, which takes the same arguments."
+        )
+    file = path / TRAIN_CONFIG_NAME if path.is_dir() else path
+    if not file.is_file():
+        return None
+    content = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+    return (content.get("dataset") or {}).get(name)
 
 
 # Processor steps
@@ -293,6 +311,16 @@ def log_refusals[**P](check: Callable[P, None]) -> Callable[P, None]:
             raise
 
     return logged
+
+
+def reason_of(error: BaseException) -> str:
+    """What is wrong, where LeRobot's parser says only which class cannot be made."""
+    cause: BaseException | None = error
+    while isinstance(cause, ParsingError):
+        if type(cause) is ParsingError and cause.__cause__ is not None:
+            return reason_of(cause.__cause__)
+        cause = cause.__cause__
+    return str(error)
 
 
 def _is_parsing() -> bool:

@@ -2,7 +2,7 @@
 
 # No `from __future__ import annotations`: LeRobot's tests expect the annotation of `config` to be a class.
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Self
@@ -46,6 +46,7 @@ from lerobot_deltaco.modeling.task_sources import (
     read_eval_demonstrations,
     read_sentences,
     read_training_demonstrations,
+    warn_of_plain_batches,
 )
 from lerobot_deltaco.policy.actions import join_action, policy_loss
 from lerobot_deltaco.policy.demo_encoders import ArrayEncoder
@@ -95,6 +96,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         instructions: Embeddings of instructions.
         eval_demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
         train_demonstrations: Demonstrations for training; None until the first training batch.
+        has_task_batches: Whether the training loop draws batches of tasks, as `deltaco-train` does.
     """
 
     config_class = DeltacoConfig
@@ -109,13 +111,15 @@ class DeltacoPolicy(PreTrainedPolicy):
         super().__init__(config)
         self.config: DeltacoConfig = config
         self._meta, self._stats = dataset_meta, dataset_stats
-        config.resolve(dataset_meta.features if dataset_meta else None)
+        config.resolve(dataset_meta.features if dataset_meta else None, dataset_stats)
         if dataset_meta is not None:
             config.check_episodes(dataset_meta.total_episodes)
         self.instructions = InstructionTable(config.language_encoder)
         if config.instruction_embeddings is not None:
             self.instructions.read(Path(config.instruction_embeddings))
         self.train_demonstrations: DemonstrationSet | None = None
+        self.has_task_batches = False
+        self._has_checked_batches = False
         self.goal_trainer: GoalTrainer | None = None
         paraphrases = read_sentences(config)
         self.eval_demonstrations: DemonstrationSet | None = read_eval_demonstrations(config)
@@ -169,9 +173,16 @@ class DeltacoPolicy(PreTrainedPolicy):
 
         Returns:
             The loss, () or (batch,), and the scalars to log.
+
+        Raises:
+            ValueError: An episode is not among the demonstrations, or a task is not known.
+            TrainingDivergedError: The loss of the last training step is not finite.
         """
         if self.training:
             self._finite_loss.check()
+            if not (self.has_task_batches or self._has_checked_batches):
+                warn_of_plain_batches(self.config)
+                self._has_checked_batches = True
             warn_if_emulated(self.config.dtype, batch[ACTION].device.type)
             if batch[ACTION].device.type == "cpu":
                 keep_freed_memory()
@@ -247,13 +258,18 @@ class DeltacoPolicy(PreTrainedPolicy):
             inputs = validation_goals(
                 self.goal_trainer,
                 samples,
-                lambda: self._find_goals(self.scenes(batch), tasks, [0] * len(tasks)),
+                lambda: self._find_goals(
+                    self.scenes(batch), tasks, [0] * len(tasks), self._choose_demonstrations
+                ),
             )
             return self._imitation_loss(batch, inputs.images, film, concat, inputs.places, inputs.depths)
         if not self._train_demonstrations_are_complete:
             demonstrations.check_episodes(episodes, rows)
-        inputs, locator_loss = learn_goals(self.config, self.goal_trainer, self._embedder, samples, generator)
+        inputs, known, locator_loss = learn_goals(
+            self.config, self.goal_trainer, self._embedder, samples, generator
+        )
         loss, logged = self._imitation_loss(batch, inputs.images, film, concat, inputs.places, inputs.depths)
+        loss = torch.where(known, loss, 0.0)
         return locator_loss.added_to(loss), logged | locator_loss.logged()
 
     def _imitation_loss(
@@ -309,15 +325,18 @@ class DeltacoPolicy(PreTrainedPolicy):
             tasks: Instruction of each sample.
             scenes: First images of the episodes, as `scenes` gives them, in which goals are found.
 
+        Returns:
+            The inputs of the network that specify the tasks, and the network that acts.
+
         Raises:
             ValueError: A task has no demonstration.
         """
         trials = self._episode_tasks.count_trials(tasks)
         demo = language = goals = None
         if self.goals is not None:
-            goals = self._find_goals(scenes, tasks, trials)
+            goals = self._find_goals(scenes, tasks, trials, self._demonstrate)
         elif self.config.uses_demo:
-            demonstrations, rows = self._choose_demonstrations(tasks, trials)
+            demonstrations, rows = self._demonstrate(tasks, trials)
             generator = torch.Generator().manual_seed(self.config.seed)
             demo = self._embedder.embed_demonstrations(demonstrations, rows, generator, self.training)
         if self.config.language_is_input:
@@ -378,13 +397,19 @@ class DeltacoPolicy(PreTrainedPolicy):
             robot_data: States and actions of the robot in them, for `demo_encoder=correspondence`.
         """
         self.train_demonstrations = demonstrations
-        # Each of several processes has its own copy, which PyTorch would otherwise send again at every step.
-        names = [name for name, _ in self.named_buffers() if name.startswith("train_demonstrations.")]
-        self._ddp_params_and_buffers_to_ignore = names
         self._train_demonstrations_are_complete = True
         if self.goals is not None:
             assert robot_data is not None
             self._fit_goals(robot_data)
+
+    @property
+    def _ddp_params_and_buffers_to_ignore(self) -> list[str]:
+        """Names of the buffers that PyTorch would otherwise send from process to process at every step.
+
+        Each of several processes has its own copy of the demonstrations.
+        """
+        sets = ("train_demonstrations.", "eval_demonstrations.")
+        return [name for name, _ in self.named_buffers() if name.startswith(sets)]
 
     def _training_demonstrations(self, device: torch.device) -> DemonstrationSet:
         if self.train_demonstrations is None:
@@ -402,15 +427,28 @@ class DeltacoPolicy(PreTrainedPolicy):
             self.config, self.goals, self.train_demonstrations, robot_data, self._stats
         )
 
-    def _find_goals(self, scenes: Tensor, tasks: Sequence[str], trials: Sequence[int]) -> FoundGoals:
+    def _find_goals(
+        self,
+        scenes: Tensor,
+        tasks: Sequence[str],
+        trials: Sequence[int],
+        choose: Callable[[Sequence[str], Sequence[int]], tuple[DemonstrationSet, Tensor]],
+    ) -> FoundGoals:
         """Finds the goals of tasks in scenes (batch, 3, H, W), by the demonstrations of these trials."""
         assert self.goals is not None
         n_each = self.config.n_demonstrations
 
-        def choose(number: int) -> tuple[DemonstrationSet, Tensor]:
-            return self._choose_demonstrations(tasks, [trial * n_each + number for trial in trials])
+        def choose_one(number: int) -> tuple[DemonstrationSet, Tensor]:
+            return choose(tasks, [trial * n_each + number for trial in trials])
 
-        return find_goals(self.config, self.goals, self._embedder, scenes, tasks, choose)
+        return find_goals(self.config, self.goals, self._embedder, scenes, tasks, choose_one)
+
+    def _demonstrate(self, tasks: Sequence[str], trials: Sequence[int]) -> tuple[DemonstrationSet, Tensor]:
+        """The demonstrations of an episode that begins: they are noted, for `demonstrated`."""
+        chosen, rows = self._choose_demonstrations(tasks, trials)
+        if not self.training:
+            self._episode_tasks.note_demonstrations(chosen.describe(rows))
+        return chosen, rows
 
     def _choose_demonstrations(
         self, tasks: Sequence[str], trials: Sequence[int]
@@ -421,12 +459,7 @@ class DeltacoPolicy(PreTrainedPolicy):
         names, replaced = (
             (tasks, self._episode_tasks.replaced) if turns is None else ([turn.task for turn in turns], {})
         )
-        chosen, rows = choose_demonstrations(
-            self.config, candidates, names, trials, replaced, self.paraphrases
-        )
-        if not self.training:
-            self._episode_tasks.note_demonstrations(chosen.describe(rows))
-        return chosen, rows
+        return choose_demonstrations(self.config, candidates, names, trials, replaced, self.paraphrases)
 
     @property
     def paraphrases(self) -> Paraphrases | None:
@@ -448,7 +481,11 @@ class DeltacoPolicy(PreTrainedPolicy):
         self._episode_tasks.begin_evaluation()
 
     def demonstrated(self, sample: int) -> list[Demonstrated]:
-        """The demonstrations of a sample in this thread's episode; none before its first action."""
+        """The demonstrations of a sample in this thread's episode; none before its first action.
+
+        Args:
+            sample: Number of the sample in the batch, from 0.
+        """
         return self._episode_tasks.demonstrated(sample)
 
     def demonstrated_as(self, tasks: Mapping[str, str]) -> AbstractContextManager[None]:

@@ -41,7 +41,7 @@ from lerobot_deltaco.data import collection, collection_plan, collection_workers
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import CollectionError, collect
 from lerobot_deltaco.data.collection_plan import DATA_SETS, CollectionPlan
-from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, STAGING, verify_dataset
+from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, STAGING, read_tasks, verify_dataset
 from lerobot_deltaco.data.integrity import DIGESTS_FILE, write_checked_json
 
 # Two tasks of different kinds, not in the benchmark's order, in files that end where no task does.
@@ -163,7 +163,7 @@ def test_tasks_come_in_the_order_of_the_selection(finished):
     frames = read_frames(finished)
     assert frames["benchmark.task_id"].tolist() == np.repeat([90, 4], 3 * EPISODE_STEPS).tolist()
     assert frames["task_index"].tolist() == np.repeat([0, 1], 3 * EPISODE_STEPS).tolist()
-    tasks = files.read_tasks(finished / files.TASKS_FILE)
+    tasks = read_tasks(finished, 2)
     assert tasks == [TASKS[90].instruction, TASKS[4].instruction]
 
 
@@ -332,7 +332,7 @@ def test_more_episodes_of_the_same_tasks_continue_their_seeds(finished, copy, tm
     assert frames["episode_index"].tolist() == np.repeat(range(10), EPISODE_STEPS).tolist()
     assert sorted(frames["benchmark.seed"]) == sorted(longer["benchmark.seed"])
     assert len(set(frames["benchmark.seed"])) == 10
-    assert len(files.read_tasks(copy / files.TASKS_FILE)) == 2
+    assert len(read_tasks(copy, 2)) == 2
     # Statistics are those of all episodes, in whatever order.
     stats, longer_stats = (
         json.loads((root / files.STATS_FILE).read_text()) for root in (copy, tmp_path / "longer")
@@ -353,7 +353,7 @@ def test_other_seeds_and_splits_begin_anew_when_they_are_added(copy, in_process)
 
 def test_more_tasks_go_to_the_end(copy, in_process):
     summary = collect(copy, CollectionPlan("32,4", 1), append=True)
-    assert files.read_tasks(copy / files.TASKS_FILE) == [TASKS[i].instruction for i in (90, 4, 32)]
+    assert read_tasks(copy, 3) == [TASKS[i].instruction for i in (90, 4, 32)]
     frames = read_frames(copy)
     assert frames["task_index"][-2 * EPISODE_STEPS :].tolist() == np.repeat([2, 1], EPISODE_STEPS).tolist()
     assert [entry["plan"]["tasks"] for entry in history(copy)] == ["90,4", "32,4"]
@@ -1069,6 +1069,16 @@ def test_a_plan_checks_its_arguments(change):
 def test_the_default_noise_is_that_of_the_expert(tmp_path, in_process):
     main(["--root", str(tmp_path / "x"), "--tasks", "4", "--episodes-per-task", "1"])
     assert history(tmp_path / "x")[0]["plan"]["noise"] == EXPERT_NOISE == CollectionPlan("4", 1).noise
+
+
+def test_a_summary_that_cannot_be_written_is_noticed_before_the_collection(tmp_path, capsys, in_process):
+    (tmp_path / "folder").mkdir()
+    for file, message in (("mistyped/s.json", "there is no folder"), ("folder", "which is a folder")):
+        with pytest.raises(SystemExit):
+            main(["--root", str(tmp_path / "dataset"), *ARGUMENTS, "--summary", str(tmp_path / file)])
+        assert message in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder"]
+    assert in_process == []
 
 
 def test_the_summary_has_what_was_done(tmp_path, capsys, in_process):

@@ -13,7 +13,7 @@ from lerobot_deltaco.configuration_deltaco import RANGES, DeltacoConfig
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
-from lerobot_deltaco.training.loop import reason_of
+from lerobot_deltaco.lerobot_internals import reason_of
 
 OWN_FIELDS = type_hints(DeltacoConfig)
 NUMBERS = {name: kind for name, kind in OWN_FIELDS.items() if name in RANGES}

@@ -77,7 +77,7 @@ def table_with(task, thing, other):
     return image_with((COLORS[task], thing), (other_color, other))
 
 
-def table_dataset(root, episodes, closed=-1, **cameras):
+def table_dataset(root, episodes, closed=-1, n_joints=3, **cameras):
     """Episodes of a thing that is moved on a table. The gripper's command is `closed`, or its opposite.
 
     Each camera is a function that draws an image of a task and the places of its thing and the other one.
@@ -92,7 +92,7 @@ def table_dataset(root, episodes, closed=-1, **cameras):
             }
             for name, draw in images.items()
         },
-        "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "c"]},
+        "observation.state": {"dtype": "float32", "shape": (n_joints,), "names": list("abcde")[:n_joints]},
         "action": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "gripper"]},
     }
     dataset = LeRobotDataset.create("test/table", 10, features, root=root, use_videos=False)
@@ -104,7 +104,7 @@ def table_dataset(root, episodes, closed=-1, **cameras):
             dataset.add_frame(
                 {
                     **{name: draw(task, thing, other) for name, draw in images.items()},
-                    "observation.state": state_of(place),
+                    "observation.state": np.resize(state_of(place), n_joints),
                     "action": np.array(
                         [*(place - home), closed * (-1, -1, 1, 1, 1, -1, -1)[step]], np.float32
                     ),
@@ -341,6 +341,56 @@ def test_goals_of_training_episodes_are_where_things_were_moved(policy, dataset,
     assert errors.median() < 1.5  # px
 
 
+def test_an_episode_without_a_grasp_teaches_nothing(policy, dataset):
+    batch = batch_of(dataset, [1, LENGTH + 1])
+
+    def losses():
+        policy.step.zero_()
+        policy.zero_grad()
+        loss, _ = policy.forward(batch, reduction="none")
+        loss[0].backward()
+        return loss.tolist(), [weight.grad for weight in policy.model.parameters() if weight.grad is not None]
+
+    known, gradients = losses()
+    assert any(gradient.any() for gradient in gradients)
+    # Nor does the locator learn to find its goals.
+    row = policy.train_demonstrations.episode_rows(batch["episode_index"])[0]
+    policy.goal_trainer.goals.found[row] = False
+    unknown, gradients = losses()
+    assert unknown == [0, known[1]]
+    assert not any(gradient.any() for gradient in gradients)
+
+
+def test_processes_do_not_send_each_other_what_belongs_to_demonstrations(dataset):
+    demos = {"demo_repo_id": "test/table", "demo_root": str(dataset.root)}
+    policy, _, _ = small_policy(dataset, **CORRESPONDENCE, **demos)
+    policy.forward(batch_of(dataset, [0, LENGTH]))
+    ignored = set(policy._ddp_params_and_buffers_to_ignore)
+    assert {f"{kind}_demonstrations.grasp_states" for kind in ("train", "eval")} <= ignored
+    sent = {name for name, _ in policy.named_buffers()} - ignored
+    assert "step" in sent
+    assert not any("demonstrations" in name for name in sent)
+
+
+def test_validation_losses_note_no_demonstration(policy, dataset):
+    policy.forward(batch_of(dataset, [0, LENGTH]))
+    policy.eval()
+    policy.goal_trainer.goals.found[:] = False  # as those that are held back
+    batch = batch_of(dataset, [0, LENGTH])
+    for _ in range(3):
+        policy.forward(batch)
+    assert policy.demonstrated(0) == []
+    policy.select_action({name: batch[name] for name in ("observation.image", "observation.state", "task")})
+    assert len(policy.demonstrated(0)) == 1
+
+
+def test_demonstrations_of_another_robot_are_refused_before_the_training(dataset, episodes, tmp_path):
+    written = table_dataset(tmp_path / "other", episodes[:2], image=table_with, n_joints=5)
+    demos = {"demo_repo_id": "test/table", "demo_root": str(written.root)}
+    with pytest.raises(ValueError, match=r"another robot.*'observation.state' of the shape \(3,\).*\(5,\)"):
+        small_policy(dataset, **CORRESPONDENCE, **demos)
+
+
 def test_frames_in_memory_give_the_same_goals(policy, dataset):
     policy.forward(batch_of(dataset, [0, LENGTH]))
     frames = FramesInMemory(dataset)
@@ -490,9 +540,8 @@ def test_it_learns_to_find_goals_in_one_of_two_cameras_of_256_px(tmp_path_factor
 def test_frames_in_memory_give_larger_demonstrations_than_they_are_held_in(large_dataset):
     frames = FramesInMemory(large_dataset, image_size=SIZE)
     root = large_dataset.root
-    episodes = [3, 1, 40]
-    held = frames.demonstrations("observation.image", 2 * SIZE, 2, episodes)
-    read = load_demonstrations("test/table", root, episodes, "observation.image", 2 * SIZE, 2)
+    held = frames.demonstrations("observation.image", 2 * SIZE, 2)
+    read = load_demonstrations("test/table", root, None, "observation.image", 2 * SIZE, 2)
     assert torch.equal(held.frames, read.frames)
     assert held.tasks == read.tasks
 
@@ -525,7 +574,7 @@ def test_only_the_grasp_depends_on_the_detail_of_larger_images():
     [
         ({"goal_image_size": 3 * SIZE}, "times 1, 2, 4, 8: one of .* Got 72"),
         ({"goal_image_size": SIZE // 2 + 8}, "times 1, 2, 4, 8"),
-        ({"demo_encoder": "attention", "goal_image_size": SIZE}, "is for `demo_encoder=correspondence`"),
+        ({"demo_encoder": "attention", "goal_image_size": SIZE}, "it is for `demo_encoder=correspondence`"),
     ],
 )
 def test_sizes_of_images_for_goals_are_checked(options, message):

@@ -25,6 +25,7 @@ from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection import collect
 from lerobot_deltaco.data.collection_plan import FPS, ROBOT_TYPE, CollectionPlan
 from lerobot_deltaco.data.dataset_statistics import STATISTICS, feature_statistics, merged_statistics
+from lerobot_deltaco.data.finished_dataset import read_tasks
 
 REPO_ID = "user/deltaco"
 TASK_IDS = (90, 4)  # not in the order of the benchmark
@@ -199,7 +200,7 @@ def test_images_have_the_names_and_pixels_that_lerobot_writes(root, reference):
 def test_tasks_are_what_lerobot_writes(root, reference):
     ours, theirs = (pd.read_parquet(folder / files.TASKS_FILE) for folder in (root, reference))
     pd.testing.assert_frame_equal(ours, theirs)
-    assert files.read_tasks(root / files.TASKS_FILE) == [TASKS[i].instruction for i in TASK_IDS]
+    assert read_tasks(root, len(TASK_IDS)) == [TASKS[i].instruction for i in TASK_IDS]
 
 
 def test_each_episode_is_a_row_group_in_the_file_that_its_metadata_name(root):

@@ -129,6 +129,34 @@ def test_unknown_rows_and_sections_are_refused(tmp_path):
         read_experiment(tmp_path, "one/config")
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("data: [", "config.yaml is no YAML"),
+        ("- data", "config.yaml must be a mapping of sections"),
+        ("data: 3", "The section 'data' of .*config.yaml must be a mapping of options. Got 3"),
+    ],
+)
+def test_files_that_say_nothing_are_named(tmp_path, text, message):
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "config.yaml").write_text(text)
+    with pytest.raises(ExperimentConfigError, match=message):
+        read_experiment(tmp_path, "one/config")
+
+
+def test_a_setting_that_is_no_yaml_is_named():
+    with pytest.raises(ExperimentConfigError, match=r"The setting 'training.steps=\[1' is no YAML"):
+        read_experiment(FOLDER, "scenario_a/bc_z", ["training.steps=[1"])
+
+
+def test_what_is_null_is_left_out(tmp_path):
+    (tmp_path / "one").mkdir()
+    (tmp_path / "shared.yaml").write_text("data: {tasks: '4', objects: all}\npolicy: {seed: 1}\n")
+    (tmp_path / "one" / "config.yaml").write_text("data: {objects: null}\npolicy:\n")
+    config = read_experiment(tmp_path, "one/config")
+    assert (config.data, config.policy, config.evaluation) == ({"tasks": "4"}, {"seed": 1}, {})
+
+
 def test_settings_come_before_the_files():
     config = read_experiment(
         FOLDER, "scenario_a/bc_z", ["training.steps=7", "policy.device=cuda", "data.tasks=4,14"]
@@ -148,6 +176,30 @@ def test_a_run_does_not_go_on_with_other_settings(tmp_path, monkeypatch):
         ExperimentRun(other, 0, tmp_path).run()
     ExperimentRun(other, 1, tmp_path).run()
     ExperimentRun(read_experiment(FOLDER, "scenario_a/deltaco"), 0, tmp_path).run()
+
+
+def test_a_first_start_that_fails_leaves_the_settings_free(tmp_path, monkeypatch):
+    name = "small_a/demo_only_finetuned_10"
+    with pytest.raises(ExperimentError, match="Run that experiment first"):
+        ExperimentRun(read_experiment(FOLDER, name), 0, tmp_path).train_and_evaluate(CommandRunner())
+
+    def fail(runner, command, arguments):
+        raise ExperimentError("unknown option")
+
+    monkeypatch.setattr(CommandRunner, "run", fail)
+    wrong = ExperimentRun(read_experiment(FOLDER, "small_a/deltaco", ["policy.sed=1"]), 0, tmp_path)
+    with pytest.raises(ExperimentError, match="unknown option"):
+        wrong.train_and_evaluate(CommandRunner())
+    assert list(tmp_path.rglob("*.json")) == []
+    # What has a folder has begun.
+    wrong.folder.mkdir(parents=True)
+    monkeypatch.setattr("lerobot_deltaco.experiments.run.shutil.rmtree", lambda *_, **__: None)
+    with pytest.raises(ExperimentError, match="unknown option"):
+        wrong.train_and_evaluate(CommandRunner())
+    (file,) = tmp_path.rglob("*.json")
+    file.write_text("{}")
+    with pytest.raises(ExperimentError, match="started with other settings: data was None"):
+        wrong.check_settings()
 
 
 def test_a_row_that_starts_from_another_needs_it(tmp_path, monkeypatch):

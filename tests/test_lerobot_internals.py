@@ -13,6 +13,7 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.lerobot_internals import (
     LOOP_FUNCTIONS,
     UnsupportedLeRobotError,
+    dataset_option,
     replaced_in_training_loop,
     shorten_logs,
     step_of_videos,
@@ -81,3 +82,25 @@ def test_logs_have_neither_pages_of_library_errors_nor_of_video_paths(monkeypatc
     decoder, *results = [record.getMessage() for record in caplog.records]
     assert decoder == "Videos are decoded by PyAV, since torchcodec finds no FFmpeg that it supports."
     assert results == ["{'pc_success': 50.0}", "{'name': {'pc_success': 50.0}}"]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [(".1", 0.1), ("0.25", 0.25), ("[0,1,]", [0, 1]), ("[3]", [3]), ("null", None)]
+)
+def test_options_of_the_dataset_are_read_as_lerobot_does(monkeypatch, tmp_path, text, value):
+    (tmp_path / "config.yaml").write_text(f"dataset:\n  option: {text}\n")
+    (tmp_path / "train_config.json").write_text(f'{{"dataset": {{"option": {text.replace(",]", "]")}}}}}')
+    for argument in (
+        f"--dataset.option={text}",
+        f"--config_path={tmp_path / 'config.yaml'}",
+        f"--config_path={tmp_path}",
+    ):
+        monkeypatch.setattr("sys.argv", ["lerobot-train", argument])
+        assert dataset_option("option") == value
+        assert dataset_option("another") is None
+
+
+def test_a_configuration_on_the_hub_says_that_it_cannot_be_read(monkeypatch, tmp_path):
+    monkeypatch.setattr("sys.argv", ["lerobot-train", "--config_path=user/policy"])
+    with pytest.raises(ValueError, match="--config_path is user/policy.*Download it"):
+        dataset_option("episodes")

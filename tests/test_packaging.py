@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from fresh_python import run_python
 
+from lerobot_deltaco.common import shipped
+
 ROOT = Path(__file__).parents[1]
 GYM_FILES = sorted((ROOT / "envs" / "gym_deltaco").rglob("*.py"))
 LEROBOT_FILES = [*sorted((ROOT / "lerobot_deltaco").rglob("*.py")), ROOT / "lerobot_policy_deltaco.py"]
@@ -23,7 +25,7 @@ import os, sys
 os.dup2(1, 2)  # errors stand among the output
 from lerobot.scripts import lerobot_eval, lerobot_train
 
-MISSING = "lerobot_deltaco.training.optimization"
+MISSING = "lerobot_deltaco.policy.optimization"
 
 for name, main, words, missing in (
     ("train --help", lerobot_train.main, ["--help"], None),
@@ -64,8 +66,16 @@ def test_lerobot_help_lists_the_environment(lerobot_outputs, command):
 def test_a_broken_import_ends_in_one_clear_sentence(lerobot_outputs):
     last_line = lerobot_outputs["eval without a module"].strip().splitlines()[-1]
     assert "LeRobot does not know the type 'deltaco'" in last_line
-    assert "lerobot_deltaco.training.optimization" in last_line
+    assert "lerobot_deltaco.policy.optimization" in last_line
     assert "README" in last_line
+
+
+def test_what_is_shipped_lies_in_the_package_or_beside_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(shipped, "__file__", str(tmp_path / "clone/package/common/shipped.py"))
+    assert shipped.shipped_folder("inside", "beside") == tmp_path / "clone/beside"
+    installed = tmp_path / "clone/package/inside"
+    installed.mkdir(parents=True)
+    assert shipped.shipped_folder("inside", "beside") == installed
 
 
 def imported_modules(path):
@@ -105,6 +115,7 @@ FORBIDDEN = {
         "torch",
         "lerobot_deltaco.modeling_deltaco",
         "lerobot_deltaco.policy.language.instruction_table",
+        "lerobot_deltaco.training",
     },
     "lerobot_deltaco/modeling": {"lerobot_deltaco.modeling_deltaco", "gym_deltaco", "pybullet"},
     "lerobot_deltaco/evaluation": {"lerobot_deltaco.reporting", "lerobot_deltaco.training"},

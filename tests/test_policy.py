@@ -22,6 +22,7 @@ from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.actions import join_action
 from lerobot_deltaco.policy.demonstrations import DemonstrationSet
+from lerobot_deltaco.policy.options import ENCODERS_OF_OPTIONS
 from lerobot_deltaco.policy.step_generator import step_generator
 from lerobot_deltaco.policy.task_file import TaskFileError
 from lerobot_deltaco.policy.training_episodes import training_episodes
@@ -73,7 +74,9 @@ def test_the_defaults_are_the_papers():
         ({"motion_modes": 0}, "`motion_modes` must be at least 1"),
         ({"demos_per_task": 1}, "`demos_per_task` cannot be 1"),
         ({"temperature": 0.0}, "`temperature` must be at least 0.001"),
-        ({"n_demonstrations": 5}, "`n_demonstrations` is for policies with `demo_encoder=correspondence`"),
+        ({"n_demonstrations": 5}, "it is for `demo_encoder=correspondence`"),
+        ({"normalization_mapping": {"VISUAL": NormalizationMode.MEAN_STD}}, "must be IDENTITY for VISUAL"),
+        ({"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}}, "MIN_MAX or IDENTITY for ACTION"),
         ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
         ({"film": "none", "concat": "none"}, "would get no task"),
         ({"method": "language_only", "encoder_loss": "contrastive"}, "no demonstration is used"),
@@ -83,6 +86,46 @@ def test_the_defaults_are_the_papers():
 def test_impossible_configurations_say_what_is_valid(options, message):
     with pytest.raises(ValueError, match=message):
         DeltacoConfig(device="cpu", **options)
+
+
+# For each option that has an effect with some encoders alone: a value, and another encoder.
+WITHOUT_EFFECT = {
+    "vision_encoder": ("dinov2-small", "attention"),
+    "vision_encoder_weights": ("r3m.pt", "cnn"),
+    "vision_image_size": (64, "cnn"),
+    "vision_input": ("authors", "cnn"),
+    "demo_variants": (2, "cnn"),
+    "demo_features_dir": ("features", "correspondence"),
+    "demo_head": ([8], "cnn"),
+    "demo_crop": ("frame", "attention"),
+    "demo_frames_between": ("any", "correspondence"),
+    "demos_per_task": (2, "correspondence"),
+    "n_demonstrations": (2, "attention"),
+    "goal_image_size": (96, "cnn"),
+    "pretrained_matching": (True, "cnn"),
+    "goal_noise": (0.1, "cnn"),
+    "grasp_depth": (False, "cnn"),
+    "depth_margin": (0.5, "cnn"),
+    "depth_noise": (0.2, "cnn"),
+    "locator_share": (0.5, "attention"),
+    "recolor_share": (0.5, "cnn"),
+    "color_blind_tasks": ("shaped", "cnn"),
+}
+
+
+@pytest.mark.parametrize("name", ENCODERS_OF_OPTIONS)
+def test_an_option_without_effect_is_refused(name):
+    value, encoder = WITHOUT_EFFECT[name]
+    with pytest.raises(ValueError, match=f"`{name}` has no effect with `demo_encoder={encoder}`"):
+        DeltacoConfig(device="cpu", demo_encoder=encoder, **{name: value})
+    # A configuration file names every field, so that defaults are no mistake.
+    DeltacoConfig(device="cpu", demo_encoder=encoder, **{name: getattr(DeltacoConfig, name)})
+
+
+@pytest.mark.parametrize("mapping", [{"ACTION": NormalizationMode.IDENTITY}, {}], ids=["named", "left out"])
+def test_actions_that_are_not_scaled_must_be_in_the_networks_range(make, mapping):
+    with pytest.raises(ValueError, match=r"actions are in .*1\d\d.*, but the policy predicts them in -1..1"):
+        make(normalization_mapping=mapping)
 
 
 @pytest.mark.parametrize(

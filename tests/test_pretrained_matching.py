@@ -488,6 +488,13 @@ def test_the_command_says_what_it_cannot_do(checkpoint, dataset, tmp_path, capsy
     assert code == 1
     assert "damaged" in text
     assert "Traceback" not in text
+    shutil.copy(checkpoint / "model.safetensors", damaged)
+    config = json.loads((checkpoint / "config.json").read_text())
+    (damaged / "config.json").write_text(json.dumps({**config, "flavor": "sweet"}))
+    code, text = said(damaged, *root, "--out", tmp_path / "new")
+    assert code == 1
+    assert f"The configuration of {damaged} is invalid" in text
+    assert "flavor" in text
     code, text = said(tmp_path / "nothing", *root, "--out", tmp_path / "new")
     assert code == 1
     assert "is no checkpoint" in text

@@ -6,7 +6,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from lerobot_deltaco.training.task_batches import TaskBatchSampler, count_upsampled_tasks
+from lerobot_deltaco.policy.upsampling import count_upsampled_tasks
+from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
 # 7 tasks of 10, 20, ... 70 frames.
 TASKS = np.repeat(np.arange(7), np.arange(10, 80, 10))

@@ -19,13 +19,14 @@ from torch import distributed
 from torch.nn.parallel import DistributedDataParallel
 
 from lerobot_deltaco.commands import train as train_command
+from lerobot_deltaco.modeling import task_sources
 from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policy.demonstrations import load_demonstrations
 from lerobot_deltaco.policy.finite_loss import TrainingDivergedError
 from lerobot_deltaco.policy.vision import VisionEncoderError, load_efficientnet_lite0
 from lerobot_deltaco.training import loop
 from lerobot_deltaco.training.frames import FramesInMemory, decoded, needed_bytes
-from lerobot_deltaco.training.loop import InMemoryTraining
+from lerobot_deltaco.training.loop import InMemoryTraining, TrainingSetupError
 
 EPISODES = [task for task in TASKS for _ in range(4)]
 
@@ -315,7 +316,7 @@ def test_larger_demonstrations_are_decoded_from_videos(tmp_path):
 
 def test_processes_do_not_send_each_other_demonstrations(dataset, tmp_path):
     frames = FramesInMemory(dataset)
-    policy, _, _ = small_policy(dataset)
+    policy, _, _ = small_policy(dataset, demo_repo_id=REPO_ID, demo_root=str(dataset.root))
     policy.set_train_demonstrations(frames.demonstrations("observation.images.top", 16, 2))
     store = distributed.FileStore(str(tmp_path / "store"), 1)
     distributed.init_process_group("gloo", store=store, rank=0, world_size=1)
@@ -324,7 +325,8 @@ def test_processes_do_not_send_each_other_demonstrations(dataset, tmp_path):
     finally:
         distributed.destroy_process_group()
     assert policy.step.data_ptr() in sent
-    assert not sent & {buffer.data_ptr() for buffer in policy.train_demonstrations.buffers()}
+    for demonstrations in (policy.train_demonstrations, policy.eval_demonstrations):
+        assert not sent & {buffer.data_ptr() for buffer in demonstrations.buffers()}
 
 
 def test_reward_models_are_sent_to_lerobots_command():
@@ -345,7 +347,7 @@ def test_too_many_frames_are_refused_before_they_are_read(dataset, monkeypatch):
 def test_a_mistyped_folder_is_named_and_not_made(train, tmp_path, option):
     missing = tmp_path / "mistyped" / "data"
     with pytest.raises(
-        FileNotFoundError, match=rf"--{option} is .*mistyped/data.* the folder does not exist"
+        TrainingSetupError, match=rf"--{option} is .*mistyped/data.* the folder does not exist"
     ):
         train("--policy.demo_repo_id=test/foreign", f"--{option}={missing}")
     assert not missing.parent.exists()
@@ -372,6 +374,55 @@ def test_without_a_gripper_there_is_no_release(train):
     options = ["--policy.gripper=none", "--policy.tasks_per_batch=2", "--policy.frames_after_release=1"]
     with pytest.raises(ValueError, match="`frames_after_release` needs a gripper"):
         train(*options)
+
+
+@pytest.mark.parametrize(
+    ("options", "in_memory", "message"),
+    [
+        (["--policy.method=language_only"], False, "`tasks_per_batch` has no effect"),
+        (
+            ["--policy.frames_after_release=1", "--steps=2"],
+            False,
+            "`tasks_per_batch` and `frames_after_release` have no effect",
+        ),
+        (["--policy.demo_episodes=[0,1,2,3,4,5,6,7,8,9,10,11]"], True, None),
+    ],
+)
+def test_options_of_batches_without_effect_are_named_once(train, monkeypatch, options, in_memory, message):
+    said = []
+    monkeypatch.setattr(task_sources.logger, "warning", lambda text, *values: said.append(text % values))
+    train("--policy.tasks_per_batch=2", "--steps=1", *options, in_memory=in_memory)
+    assert len(said) == (message is not None)
+    assert message is None or said[0].startswith(message)
+
+
+@pytest.mark.parametrize("error", [ValueError("wrong"), FileNotFoundError("wrong"), MemoryError("wrong")])
+@pytest.mark.parametrize("method", ["_make_datasets", "_make_policy"])
+def test_a_training_that_cannot_begin_ends_the_command_in_one_line(train, monkeypatch, method, error):
+    initialize = InMemoryTraining.__init__
+
+    def fail(*_, **__):
+        raise error
+
+    def failing(self):
+        initialize(self)
+        setattr(self, method, fail)
+
+    monkeypatch.setattr(InMemoryTraining, "__init__", failing)
+    monkeypatch.setattr(train_command, "train", train)
+    with pytest.raises(SystemExit, match="^deltaco-train: wrong$"):
+        train_command.main()
+
+
+def test_an_interrupt_ends_the_command_in_one_line(monkeypatch, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train_command, "train", interrupted)
+    with pytest.raises(SystemExit) as end:
+        train_command.main()
+    assert end.value.code == 130
+    assert capsys.readouterr().err.strip().startswith("deltaco-train: Interrupted. Go on from a saved")
 
 
 def test_missing_weights_end_the_command_in_one_line(train, monkeypatch):

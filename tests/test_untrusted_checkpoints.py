@@ -4,8 +4,10 @@ import functools
 import json
 import shutil
 
+import httpx
 import pytest
 import torch
+from huggingface_hub.errors import LocalEntryNotFoundError, RemoteEntryNotFoundError
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from small_policies import TASKS, batch_of, small_policy, use_fake_encoder, write_dataset
@@ -100,6 +102,27 @@ def test_a_processors_file_that_is_none_is_named(copy, text):
     (copy / "policy_preprocessor.json").write_text(text)
     with pytest.raises(ProcessorFileError, match="is no file of a processor"):
         load_policy(copy)
+
+
+def test_only_a_file_that_the_hub_does_not_have_is_passed_over(monkeypatch):
+    """LeRobot may find the network again a second later, and load what was not checked."""
+
+    def fetch(error):
+        def download(*_, **__):
+            raise error
+
+        monkeypatch.setattr("lerobot_deltaco.policy.processor_files.hf_hub_download", download)
+
+    offline = "lerobot_deltaco.policy.processor_files.is_offline_mode"
+    monkeypatch.setattr(offline, lambda: False)
+    fetch(RemoteEntryNotFoundError("none", response=httpx.Response(404, request=httpx.Request("GET", "x:"))))
+    check_processor_files("user/policy")
+    fetch(LocalEntryNotFoundError("no network"))
+    with pytest.raises(LocalEntryNotFoundError, match="no network"):
+        check_processor_files("user/policy")
+    check_processor_files("user/policy", local_files_only=True)
+    monkeypatch.setattr(offline, lambda: True)
+    check_processor_files("user/policy")
 
 
 # What the policy knows of tasks

@@ -395,7 +395,7 @@ def test_embeddings_of_other_sizes_are_not_compared(make):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"demo_head": [8]}, "layers behind a pretrained encoder"),
+        ({"demo_head": [8]}, "`demo_head` has no effect with `demo_encoder=cnn`"),
         ({"demo_encoder": "pretrained"}, "have 512 numbers, and the instructions' have 384"),
         ({"demo_encoder": "pretrained", "vision_input": "raw"}, "`vision_input` must be one of published"),
         ({"demo_encoder": "pretrained", "demo_variants": 0}, "`demo_variants` must be at least 1"),

@@ -36,7 +36,7 @@ from gym_deltaco.tasks import SCENARIOS, Task, get_task
 from lerobot_deltaco.cards.templates import env_options, render, scene_settings
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import CollectionPlan
-from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, read_history, read_info
+from lerobot_deltaco.data.finished_dataset import HISTORY_FILE, read_history, read_info, tries_by_kind
 from lerobot_deltaco.data.integrity import damaged
 
 CARD_FILE = Path("README.md")
@@ -162,7 +162,7 @@ def card_text(root: Path, repo_id: str | None = None) -> str:
         features=_features(info["features"]),
         has_seed="benchmark.seed" in info["features"],
         collections=list(_collections(history, plans)),
-        expert=_expert(history, plans),
+        expert=_expert(history),
         megabytes=_size(root) / 1e6,
         kilobytes_per_episode=_size(root) / 1e3 / info["total_episodes"],
         env_options=env_options(image),
@@ -243,18 +243,11 @@ def _collections(
         first += plan.n_episodes
 
 
-def _expert(history: Sequence[Mapping[str, Any]], plans: Sequence[CollectionPlan]) -> list[dict[str, Any]]:
+def _expert(history: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """For each kind of task, how often the expert was tried, and succeeded."""
-    attempts: Counter[str] = Counter()
-    successes: Counter[str] = Counter()
-    for entry, plan in zip(history, plans, strict=True):
-        for task_id, n_attempts in entry["attempts"].items():
-            kind = get_task(int(task_id)).kind
-            attempts[kind] += n_attempts
-            successes[kind] += plan.episodes_per_task
     return [
-        {"kind": kind, "attempts": n, "episodes": successes[kind], "rate": successes[kind] / n}
-        for kind, n in attempts.items()
+        {"kind": kind, "attempts": attempts, "episodes": successes, "rate": successes / attempts}
+        for kind, (attempts, successes) in tries_by_kind(history).items()
     ]
 
 

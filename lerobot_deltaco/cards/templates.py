@@ -7,16 +7,16 @@ from typing import Any
 
 import jinja2
 
+from lerobot_deltaco.common.shipped import shipped_folder
+
 TEMPLATES = "datasets_cards"
 # Settings of the environment that a dataset records; those of the objects only if they are not the paper's.
 SCENE_SETTINGS = ("ambiguity", "objects", "adversarial_probability", "adversarial_draw")
 
 
 def template_folder() -> Path:
-    """In the wheel, the templates are a folder of the package; in a clone, it lies beside the package."""
-    package = Path(__file__).parents[1]
-    inside = package / TEMPLATES
-    return inside if inside.is_dir() else package.parent / TEMPLATES
+    """Folder of the templates."""
+    return shipped_folder(TEMPLATES, TEMPLATES)
 
 
 def render(template: str, **values: Any) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gym_deltaco import EXPERT_NOISE, MIN_IMAGE_SIZE
+from gym_deltaco.atomic_files import write_json
 from gym_deltaco.layout import AMBIGUITIES
 from gym_deltaco.object_sets import ADVERSARIAL_DRAWS, ADVERSARIAL_PROBABILITY
 from lerobot_deltaco.commands.command_errors import exit_on_error
@@ -50,6 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
         )
     except ValueError as error:
         parser.error(str(error))
+    _check_summary(parser, options)
     if options.append and (options.join or options.shard):
         parser.error("--append adds to a finished dataset. It cannot be combined with --shard and --join.")
     if options.shard is not None:
@@ -64,9 +65,26 @@ def main(arguments: list[str] | None = None) -> None:
         else:
             summary = collect(options.root, plan, options.workers, options.append)
     sys.stdout.write(_text(summary, options.root))
-    if options.summary:
-        options.summary.write_text(json.dumps(asdict(summary), indent=2) + "\n")
+    _write_summary(parser, options.summary, asdict(summary))
     _share(parser, options)
+
+
+def _check_summary(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Ends the command before it collects, if it could not write the summary."""
+    file: Path | None = options.summary
+    if file is None:
+        return
+    if not file.parent.is_dir() and file.parent.resolve() != options.root.resolve():
+        parser.error(f"--summary is {file}, but there is no folder {file.parent}. Make it first.")
+    if file.is_dir():
+        parser.error(f"--summary is {file}, which is a folder. Name a file in it.")
+
+
+def _write_summary(parser: argparse.ArgumentParser, file: Path | None, contents: dict[str, Any]) -> None:
+    if file is None:
+        return
+    with exit_on_error(parser, OSError):
+        write_json(file, contents, indent=2)
 
 
 def _collect_shard(
@@ -89,9 +107,7 @@ def _collect_shard(
         f"{summary.folder}: {summary.episodes} of {summary.all_episodes} episodes; {speed}.\n"
         "When all shards are there, join them: the same command with --join instead of --shard.\n"
     )
-    if options.summary:
-        contents = {**asdict(summary), "folder": str(summary.folder)}
-        options.summary.write_text(json.dumps(contents, indent=2) + "\n")
+    _write_summary(parser, options.summary, {**asdict(summary), "folder": str(summary.folder)})
 
 
 def _check_sharing(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:

@@ -1,9 +1,9 @@
 """Collects a dataset in several processes, so that it can be interrupted at any moment and continued.
 
 Workers (`collection_workers.py`) store episodes and complete data files in the folder `.collecting`. The
-dataset's own files change only at the end: first all that
-shall be done is written down, then it is done, each step of which may be repeated. So whatever happens, the
-next run with the same arguments goes on, and the result is a function of the arguments alone.
+dataset's own files change only at the end: all changes are first written down, then made; each may be
+repeated. So whatever happens, the next run with the same arguments goes on, and the result is a function of
+the arguments alone.
 
 All files of that folder are written with their checksums, and read only if they still have them.
 """
@@ -58,6 +58,7 @@ from lerobot_deltaco.data.finished_dataset import (
     read_json,
     read_statistics,
     read_tasks,
+    tries_by_kind,
 )
 from lerobot_deltaco.data.integrity import (
     DatasetError,
@@ -421,20 +422,14 @@ def _commit(root: Path) -> None:
 def _summary(root: Path, episodes_per_s: float | None) -> Summary:
     info = json.loads((root / files.INFO_FILE).read_text())
     last = json.loads((root / HISTORY_FILE).read_text())[-1]
-    per_task = last["plan"]["episodes_per_task"]
-    attempts: Counter[str] = Counter()
-    successes: Counter[str] = Counter()
-    for task_id, n_attempts in last["attempts"].items():
-        kind = get_task(int(task_id)).kind
-        attempts[kind] += n_attempts
-        successes[kind] += per_task
+    tries = tries_by_kind([last])
     files_of_it = (path for folder in ("data", "meta") for path in (root / folder).rglob("*"))
     size = sum(path.stat().st_size for path in files_of_it if path.is_file())
     return Summary(
         episodes=info["total_episodes"],
-        new_episodes=successes.total(),
-        attempts=attempts.total(),
-        success_rates={kind: successes[kind] / attempts[kind] for kind in attempts},
+        new_episodes=sum(each.successes for each in tries.values()),
+        attempts=sum(each.attempts for each in tries.values()),
+        success_rates={kind: each.successes / each.attempts for kind, each in tries.items()},
         episodes_per_s=episodes_per_s,
         bytes_per_episode=size / info["total_episodes"],
     )

@@ -173,11 +173,6 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
         frame.to_parquet(temporary)
 
 
-def read_tasks(path: Path) -> list[str]:
-    """The tasks in the order of their index."""
-    return pd.read_parquet(path).sort_values("task_index").index.tolist()
-
-
 def dataset_info(
     features: Features, fps: int, robot_type: str, n_episodes: int, n_frames: int, n_tasks: int
 ) -> dict[str, Any]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from PIL import Image
 from tqdm import tqdm
 
-from gym_deltaco.tasks import N_TASKS, is_task
+from gym_deltaco.tasks import N_TASKS, get_task, is_task
 from lerobot_deltaco.common.typed_fields import in_words, is_a
 from lerobot_deltaco.data import dataset_files as files
 from lerobot_deltaco.data.collection_plan import CollectionPlan
@@ -123,6 +123,28 @@ def read_history(root: Path) -> list[dict[str, Any]]:
             reason = f"{where}attempts must be at least {plan.episodes_per_task} for each task"
             raise damaged(path, reason, _REMEDY)
     return history
+
+
+class Tries(NamedTuple):
+    """How often the expert tried tasks, and succeeded."""
+
+    attempts: int
+    successes: int
+
+
+def tries_by_kind(history: Iterable[Mapping[str, Any]]) -> dict[str, Tries]:
+    """How often the expert tried each kind of task in collections.
+
+    Args:
+        history: Their entries in the history of a dataset.
+    """
+    found: dict[str, Tries] = {}
+    for entry in history:
+        for task_id, n_attempts in entry["attempts"].items():
+            kind = get_task(int(task_id)).kind
+            attempts, successes = found.get(kind, (0, 0))
+            found[kind] = Tries(attempts + n_attempts, successes + entry["plan"]["episodes_per_task"])
+    return found
 
 
 def read_statistics(root: Path, features: Mapping[str, Any]) -> dict[str, Statistics]:

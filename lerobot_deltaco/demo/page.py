@@ -12,6 +12,7 @@ import jinja2
 import numpy as np
 from lerobot.datasets import LeRobotDataset
 
+from gym_deltaco.atomic_files import write_json, write_text
 from gym_deltaco.sheets import across, enlarged, framed, grid, save_gif, save_png, to_image
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.common.run_folder import checkpoints
@@ -96,8 +97,8 @@ def write_page(demo: Demo) -> Path:
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=True, trim_blocks=True)
     page = demo.folder / "index.html"
-    page.write_text(environment.from_string(template).render(**values), encoding="utf-8")
-    (demo.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    write_text(page, environment.from_string(template).render(**values))
+    write_json(demo.folder / "summary.json", summary, indent=2)
     return page
 
 

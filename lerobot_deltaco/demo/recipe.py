@@ -13,7 +13,6 @@ TRAINED_TASKS = tuple(
     for row in COLORS.values()
     if (task := 50 * column + row) not in NEW_COMBINATIONS
 )
-ALL_TASKS = (*TRAINED_TASKS, *NEW_COMBINATIONS)
 
 EPISODES_PER_TASK = 200
 # A demonstration of each task, new combinations included, for the evaluation.

@@ -12,6 +12,8 @@ from typing import Any
 
 import yaml
 
+from lerobot_deltaco.common.shipped import shipped_folder
+
 SHARED = "shared.yaml"
 EXTENDS = "extends"
 SAME_SEED, BEST_SEED = "same", "best"
@@ -49,10 +51,8 @@ class ExperimentConfig:
 
 
 def default_folder() -> Path:
-    """Folder of the project's experiments: in an installed wheel within the package, else in the clone."""
-    package = Path(__file__).parents[1]
-    installed = package / "experiment_files"
-    return installed if installed.is_dir() else package.parent / "experiments"
+    """Folder of the project's experiments."""
+    return shipped_folder("experiment_files", "experiments")
 
 
 def experiment_names(folder: Path) -> list[str]:
@@ -73,7 +73,8 @@ def read_experiment(folder: Path, name: str, settings: Sequence[str] = ()) -> Ex
         settings: Settings that override the files: "training.steps=2000", "policy.device=cuda".
 
     Raises:
-        ExperimentConfigError: The experiment does not exist, or a file or a setting has an unknown section.
+        ExperimentConfigError: The experiment does not exist, or a file or a setting is no YAML or has an
+            unknown section.
     """
     file = folder / f"{name}.yaml"
     if name not in experiment_names(folder):
@@ -87,6 +88,9 @@ def read_experiment(folder: Path, name: str, settings: Sequence[str] = ()) -> Ex
     for setting in settings:
         merged = _merged(merged, _parsed(setting))
     sections = {section: merged.get(section, {}) for section in _SECTIONS}
+    for section in set(_SECTIONS) - {"policy"}:
+        # A null takes back what a shared file has set. The policy's are left out later.
+        sections[section] = {key: value for key, value in sections[section].items() if value is not None}
     start_from_seed = merged.get("start_from_seed", SAME_SEED)
     if start_from_seed not in (SAME_SEED, BEST_SEED):
         raise ExperimentConfigError(
@@ -118,7 +122,19 @@ def _shared_files(folder: Path, room: Path) -> list[Path]:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    content = _loaded(path.read_text(encoding="utf-8"), str(path)) or {}
+    if not isinstance(content, dict):
+        raise ExperimentConfigError(f"{path} must be a mapping of sections. Got {content!r}.")
+    # A section without options is a null.
+    return {key: {} if value is None and key in _SECTIONS else value for key, value in content.items()}
+
+
+def _loaded(text: str, where: str) -> Any:
+    """What a text in YAML says."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ExperimentConfigError(f"{where} is no YAML: {error}") from None
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -131,6 +147,11 @@ def _read(path: Path) -> dict[str, Any]:
             f"{path} has the unknown section {sorted(unknown)[0]!r}. Valid are {', '.join(_SECTIONS)} and "
             "start_from and start_from_seed."
         )
+    for section in _SECTIONS:
+        if not isinstance(content.get(section, {}), dict):
+            raise ExperimentConfigError(
+                f"The section {section!r} of {path} must be a mapping of options. Got {content[section]!r}."
+            )
     return content
 
 
@@ -143,7 +164,7 @@ def _parsed(setting: str) -> dict[str, dict[str, Any]]:
             f"A setting is SECTION.NAME=VALUE, such as training.steps=2000. The sections are "
             f"{', '.join(_SECTIONS)}. Got {setting!r}."
         )
-    return {section: {name: yaml.safe_load(value)}}
+    return {section: {name: _loaded(value, f"The setting {setting!r}")}}
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

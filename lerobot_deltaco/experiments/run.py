@@ -71,9 +71,9 @@ class ExperimentRun:
         file, settings = self._settings_file(), self._settings()
         found = json.loads(file.read_text(encoding="utf-8")) if file.exists() else settings
         for section, values in settings.items():
-            if found[section] != values:
+            if found.get(section) != values:
                 raise ExperimentError(
-                    f"{self.folder} was started with other settings: {section} was {found[section]}, now "
+                    f"{self.folder} was started with other settings: {section} was {found.get(section)}, now "
                     f"{values}. Use the same settings or another --out, or move the run and {file.name} away."
                 )
 
@@ -145,15 +145,23 @@ class ExperimentRun:
         return any((self.folder / RECORDS_FOLDER).glob("*.json"))
 
     def _train(self, runner: CommandRunner) -> None:
-        write_json(self._settings_file(), self._settings())
         train = self._train_command()
+        begins = train is not None and not last_train_config(self.folder).exists()
+        if begins:
+            self._check_start()
+        write_json(self._settings_file(), self._settings())
         if train is None:
             return
-        if not last_train_config(self.folder).exists():
-            self._check_start()
+        if begins:
             # An interrupted training may have left a folder without any checkpoint.
             shutil.rmtree(self.folder, ignore_errors=True)
-        runner.run(*train)
+        try:
+            runner.run(*train)
+        except BaseException:
+            if not self.folder.exists():
+                # Nothing has begun, so that the settings may still be corrected.
+                self._settings_file().unlink(missing_ok=True)
+            raise
 
     def _settings_file(self) -> Path:
         return self.folder.with_name(f"{self.folder.name}.json")

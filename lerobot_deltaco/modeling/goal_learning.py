@@ -137,7 +137,7 @@ def learn_goals(
     embedder: TaskEmbedder,
     samples: GoalSamples,
     generator: torch.Generator,
-) -> tuple[GoalInputs, LocatorLoss]:
+) -> tuple[GoalInputs, Tensor, LocatorLoss]:
     """Prepares a training batch with goals.
 
     The policy's network gets the goals of each sample's own episode, with noise. The locator learns to find
@@ -151,14 +151,15 @@ def learn_goals(
         generator: Source of the draws, on the CPU.
 
     Returns:
-        Inputs of the policy's network, and the locator's loss on a share of the samples.
+        Inputs of the policy's network; whether each sample's goals are known, (batch,) bool, since it learns
+        nothing from other samples; and the locator's loss on a share of the samples.
 
     Raises:
         ValueError: A one-hot policy does not know a task.
     """
     recolorings = random_recolorings(len(samples.rows), config.recolor_share, generator)
     loss = _locator_loss(config, trainer, embedder, samples, recolorings, generator)
-    places, depths, _ = trainer.goals_of(samples.rows)
+    places, depths, known = trainer.goals_of(samples.rows)
     inputs = trainer.vary(
         GoalInputs(samples.images, places, depths),
         recolorings,
@@ -167,7 +168,7 @@ def learn_goals(
         config.crop_padding,
         generator,
     )
-    return inputs, loss
+    return inputs, known, loss
 
 
 def _locator_loss(

@@ -7,12 +7,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.data.paraphrases import read_paraphrases
+from lerobot_deltaco.policy.dataset_folders import check_dataset_folder
 from lerobot_deltaco.policy.demonstrations import (
     DemonstrationSet,
     RobotData,
+    check_robot_features,
     load_demonstrations,
     load_robot_data,
 )
@@ -50,6 +53,23 @@ def read_demonstrations(
     )
 
 
+def warn_of_plain_batches(config: DeltacoConfig) -> None:
+    """Warns of options that have no effect, since the training loop draws samples of any tasks.
+
+    Args:
+        config: Configuration of the policy.
+    """
+    options = ["`tasks_per_batch`"] if config.tasks_per_batch else []
+    if config.frames_after_release is not None:
+        options.append("`frames_after_release`")
+    if options:
+        logger.warning(
+            "%s no effect: this training loop draws any frames of any tasks. Train with `deltaco-train`, "
+            "which takes the same arguments.",
+            f"{' and '.join(options)} {'has' if len(options) == 1 else 'have'}",
+        )
+
+
 def read_training_demonstrations(
     config: DeltacoConfig, meta: LeRobotDatasetMetadata | None
 ) -> tuple[DemonstrationSet, RobotData | None]:
@@ -67,11 +87,6 @@ def read_training_demonstrations(
     """
     if meta is None:
         raise ValueError("A policy is trained with the metadata of its dataset. Pass them as `dataset_meta`.")
-    if config.tasks_per_batch:
-        logger.warning(
-            "`tasks_per_batch` has no effect: this training loop draws samples of any tasks. Train "
-            "with `deltaco-train`, which takes the same arguments."
-        )
     chosen = config.demo_episodes or training_episodes(meta)
     demonstrations = read_demonstrations(config, meta.repo_id, meta.root, chosen)
     data = load_robot_data(meta.repo_id, meta.root, chosen) if config.locates_goals else None
@@ -92,13 +107,18 @@ def read_eval_demonstrations(
 
     Raises:
         FileNotFoundError: There is no network, and no dataset in the folder.
-        ValueError: The dataset does not have the camera.
+        ValueError: The dataset does not have the camera, or is of another robot.
     """
     repo_id, root = config.demo_repo_id, config.demo_root
     if repo_id is None:
         return None
+    finds_grasps = config.locates_goals and config.grasp_depth and config.gripper_index is not None
+    if finds_grasps:
+        check_dataset_folder("--policy.demo_root", root)
+        shapes = {OBS_STATE: config.robot_state_feature.shape, ACTION: config.action_feature.shape}
+        check_robot_features(repo_id, LeRobotDatasetMetadata(repo_id, root=root).features, shapes)
     demonstrations = read_demonstrations(config, repo_id, root, episodes)
-    if config.locates_goals and config.grasp_depth and config.gripper_index is not None:
+    if finds_grasps:
         data = load_robot_data(repo_id, root, demonstrations.episodes.tolist())
         keyframes = find_keyframes(data.states, config.gripper_opening(data.actions), data.spans)
         demonstrations.grasp_states = keyframes.grasp_states

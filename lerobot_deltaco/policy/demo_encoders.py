@@ -17,6 +17,12 @@ from lerobot_deltaco.policy.networks import (
     spatial_weights,
 )
 
+# Of `AttentionEncoder`: channels of its convolutions, of which the first two halve the maps; places that are
+# attended to; size of the hidden fully connected layer.
+ATTENTION_CHANNELS = (32, 32, 64, 64)
+ATTENTION_PLACES = 8
+ATTENTION_HIDDEN_DIM = 512
+
 
 class ArrayEncoder(nn.Module):
     """The paper's encoder (figure 7): a convolutional network on an array of frames, as if it were one image.
@@ -80,20 +86,11 @@ class AttentionEncoder(nn.Module):
     Args:
         n_frames: Number of frames of a demonstration.
         embedding_dim: Size of the embedding: the language encoder's.
-        channels: Numbers of channels of the convolutions, of which the first two halve the maps.
-        n_heads: Number of places that are attended to.
-        hidden_dim: Size of the hidden fully connected layer.
     """
 
-    def __init__(
-        self,
-        n_frames: int,
-        embedding_dim: int,
-        channels: Sequence[int] = (32, 32, 64, 64),
-        n_heads: int = 8,
-        hidden_dim: int = 512,
-    ) -> None:
+    def __init__(self, n_frames: int, embedding_dim: int) -> None:
         super().__init__()
+        channels = ATTENTION_CHANNELS
         layers: list[nn.Module] = []
         for n, (in_dim, out_dim) in enumerate(zip([3 * n_frames, *channels[:-1]], channels, strict=True)):
             size, stride = (5, 2) if n == 0 else (3, 2) if n == 1 else (3, 1)
@@ -103,8 +100,9 @@ class AttentionEncoder(nn.Module):
                 nn.ReLU(inplace=True),
             ]
         self.convolutions = nn.Sequential(*layers)
-        self.attention = nn.Conv2d(channels[-1], n_heads, 1)
-        self.layers = multilayer_perceptron([n_heads * (channels[-1] + 2), hidden_dim, embedding_dim])
+        self.attention = nn.Conv2d(channels[-1], ATTENTION_PLACES, 1)
+        flat_dim = ATTENTION_PLACES * (channels[-1] + 2)
+        self.layers = multilayer_perceptron([flat_dim, ATTENTION_HIDDEN_DIM, embedding_dim])
 
     def forward(self, frames: Tensor) -> Tensor:
         """From (batch, n_frames, 3, height, width) in 0..1 to unit vectors (batch, embedding_dim)."""
@@ -116,10 +114,14 @@ class AttentionEncoder(nn.Module):
 
 
 def attend(logits: Tensor, maps: Tensor) -> tuple[Tensor, Tensor]:
-    """Attention: the softmax of (batch, heads, h, w) over places, and the means of maps under it.
+    """Attention: a softmax over places, and the means of maps under it.
+
+    Args:
+        logits: How much each place matters, (batch, heads, h, w).
+        maps: What is averaged, (batch, channels, h, w).
 
     Returns:
-        Weights, (batch, heads, h, w), and means, (batch, heads, channels) for (batch, channels, h, w).
+        Weights, (batch, heads, h, w), and means, (batch, heads, channels).
     """
     weights = spatial_weights(logits)
     return weights, torch.einsum("bkhw,bchw->bkc", weights.to(maps.dtype), maps)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -322,6 +322,29 @@ class RobotData(NamedTuple):
     states: Tensor
     actions: Tensor
     spans: list[tuple[int, int]]
+
+
+def check_robot_features(
+    repo_id: str, features: Mapping[str, Mapping[str, Any]], expected: Mapping[str, Sequence[int]]
+) -> None:
+    """Checks that a dataset is of a robot such as the policy's.
+
+    Args:
+        repo_id: Repository id of the dataset.
+        features: Its features, as in LeRobot's info.json.
+        expected: Shape of each feature that is needed, by name.
+
+    Raises:
+        ValueError: It lacks one, or has another shape.
+    """
+    for name, shape in expected.items():
+        found = tuple(features[name]["shape"]) if name in features else None
+        if found != tuple(shape):
+            got = "have none" if found is None else f"have the shape {found}"
+            raise ValueError(
+                f"The demonstrations in {repo_id} are of another robot: the policy knows {name!r} of the "
+                f"shape {tuple(shape)}, and they {got}. Name a dataset of the policy's robot."
+            )
 
 
 def load_robot_data(repo_id: str, root: str | Path | None, episodes: Sequence[int]) -> RobotData:

@@ -63,7 +63,7 @@ class FiniteLoss:
         value = loss.float().mean().item()
         raise TrainingDivergedError(
             f"The loss of training step {int(self._step)} is not finite ({value}). {cause} "
-            "The last checkpoint is from before that: go on from it with --resume=true."
+            "A checkpoint that was saved is from before that: go on from it with --resume=true."
         )
 
 

@@ -66,7 +66,6 @@ class ConditionedPolicy(nn.Module):
         stem_stride: Stride of the first convolution.
         hidden_dims: Sizes of the hidden fully connected layers.
         gripper_hidden_dim: Size of the gripper's hidden layer.
-        spatial_softmax_temperature: Temperature of the spatial softmax, which divides the activations.
         motion_modes: Number of Gaussians of the motion's distribution.
         n_goals: Number of places in the first camera's image that the policy is given as goals.
     """
@@ -82,14 +81,13 @@ class ConditionedPolicy(nn.Module):
         stem_stride: int = 1,
         hidden_dims: Sequence[int] = (1024, 512, 256),
         gripper_hidden_dim: int = 32,
-        spatial_softmax_temperature: float = 1.0,
         motion_modes: int = 1,
         n_goals: int = 0,
     ) -> None:
         super().__init__()
         self.n_goals = n_goals
         self.backbone = FilmResNet(film_dim, channels, stem_stride, in_channels=3 + n_goals)
-        self.spatial_softmax = SpatialSoftmax(spatial_softmax_temperature)
+        self.spatial_softmax = SpatialSoftmax()
         # Of each goal: its place, and what the maps are there.
         feature_dim = n_cameras * 2 * channels[-1] + concat_dim + n_goals * (2 + channels[-1])
         self.motion_dim, self.motion_modes = motion_dim, motion_modes
@@ -229,13 +227,9 @@ class Film(nn.Module):
 class SpatialSoftmax(nn.Module):
     """Where each channel is active: the mean position under a softmax over the map, -1..1 in x and y."""
 
-    def __init__(self, temperature: float = 1.0) -> None:
-        super().__init__()
-        self.temperature = temperature
-
     def forward(self, maps: Tensor) -> Tensor:
         """From (batch, channels, h, w) to (batch, 2 channels): all x (to the right), then all y (down)."""
-        return torch.cat(mean_position(spatial_weights(maps / self.temperature)), dim=-1)
+        return torch.cat(mean_position(spatial_weights(maps)), dim=-1)
 
 
 def spatial_weights(maps: Tensor) -> Tensor:
@@ -324,6 +318,8 @@ def random_crop(images: Tensor, padding: int, generator: torch.Generator | None 
 
 def random_shifts(n_samples: int, padding: int, generator: torch.Generator | None = None) -> Tensor:
     """Draws shifts to the right and down, -padding..padding px, (n_samples, 2), on the CPU."""
+    # The draws are the top and left edges of crops of padded images, all tops first: `flip` puts x first, and
+    # an edge further to the right shifts the image to the left. Another order would change every training.
     return padding - torch.randint(0, 2 * padding + 1, (2, n_samples), generator=generator).flip(0).T
 
 

@@ -55,6 +55,32 @@ BACKBONES = MappingProxyType(
 )
 CORRESPONDENCE = "correspondence"
 DEMO_ENCODERS = ("cnn", "attention", CORRESPONDENCE, "pretrained")
+_EMBEDDINGS = ("cnn", "attention", "pretrained")
+# Options that have an effect with some encoders of demonstrations alone.
+ENCODERS_OF_OPTIONS = MappingProxyType(
+    {
+        "vision_encoder": ("pretrained",),
+        "vision_encoder_weights": ("pretrained",),
+        "vision_image_size": ("pretrained",),
+        "vision_input": ("pretrained",),
+        "demo_variants": ("pretrained",),
+        "demo_features_dir": ("pretrained",),
+        "demo_head": ("pretrained",),
+        "demo_crop": ("cnn", "pretrained"),
+        "demo_frames_between": _EMBEDDINGS,
+        "demos_per_task": _EMBEDDINGS,
+        "n_demonstrations": (CORRESPONDENCE,),
+        "goal_image_size": (CORRESPONDENCE,),
+        "pretrained_matching": (CORRESPONDENCE,),
+        "goal_noise": (CORRESPONDENCE,),
+        "grasp_depth": (CORRESPONDENCE,),
+        "depth_margin": (CORRESPONDENCE,),
+        "depth_noise": (CORRESPONDENCE,),
+        "locator_share": (CORRESPONDENCE,),
+        "recolor_share": (CORRESPONDENCE,),
+        "color_blind_tasks": (CORRESPONDENCE,),
+    }
+)
 GRIPPER_LOSSES = MappingProxyType({"squared_error": 30.0, "cross_entropy": 3.0})  # and their usual weights
 GRIPPER_CLOSED = ("low", "high")
 MODALITIES = ("demo", "instruction")

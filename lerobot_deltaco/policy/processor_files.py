@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from huggingface_hub import hf_hub_download
-from huggingface_hub.errors import EntryNotFoundError
+from huggingface_hub.constants import is_offline_mode
+from huggingface_hub.errors import LocalEntryNotFoundError, RemoteEntryNotFoundError
 from lerobot.processor import ProcessorStepRegistry
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 
@@ -31,14 +32,21 @@ def check_processor_files(pretrained: str | Path, **hub_options: Any) -> None:
 
     Raises:
         ProcessorFileError: A file is not that of a processor, or names a class of its own.
+        LocalEntryNotFoundError: The Hub could not be asked for a file.
     """
     for name in PROCESSOR_FILES:
         path = Path(pretrained) / name
         if not Path(pretrained).is_dir():
             try:
                 path = Path(hf_hub_download(str(pretrained), name, **hub_options))
-            except EntryNotFoundError:
+            except RemoteEntryNotFoundError:
                 continue
+            except LocalEntryNotFoundError:
+                # Without a network, LeRobot finds no file either. But one that fails may be back when LeRobot
+                # asks, which would then load what was never checked.
+                if is_offline_mode() or hub_options.get("local_files_only"):
+                    continue
+                raise
         if path.exists():
             _check_file(path)
 

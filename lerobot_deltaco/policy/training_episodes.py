@@ -16,8 +16,12 @@ def training_episodes(meta: LeRobotDatasetMetadata) -> list[int]:
 
     They are those of `--dataset.episodes`, less the last share of each task that `--dataset.eval_split` holds
     back; all of them if neither is given, or outside of that command.
+
+    Raises:
+        ValueError: The command's configuration is not on this machine.
     """
-    return kept_episodes(meta, dataset_option("episodes"), dataset_option("eval_split") or 0.0)
+    # As numbers, since YAML takes "1e-1" for a text.
+    return kept_episodes(meta, dataset_option("episodes"), float(dataset_option("eval_split") or 0))
 
 
 def kept_episodes(

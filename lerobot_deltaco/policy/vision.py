@@ -15,9 +15,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from lerobot_deltaco.policy.goals.efficientnet_lite import IMAGENET_MEAN, IMAGENET_STD
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS, VISION_INPUTS, VisionEncoderSpec
 
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 BATCH_SIZE = 64
 
 _R3M_URL = "https://pytorch.s3.amazonaws.com/models/rl/r3m/r3m_{}.pt"

@@ -9,12 +9,14 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from draccus.utils import ParsingError
 from lerobot.datasets import LeRobotDatasetMetadata
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from lerobot_deltaco.common.run_folder import TRAIN_CONFIG, WEIGHTS
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.lerobot_internals import reason_of
 from lerobot_deltaco.modeling.checkpoint_files import MATCHING_PREFIX
 from lerobot_deltaco.modeling.goal_learning import fit_pretrained_matching
 from lerobot_deltaco.modeling.task_sources import read_eval_demonstrations
@@ -47,7 +49,8 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
 
     Raises:
         FileNotFoundError: There is no such checkpoint or dataset.
-        ValueError: The policy finds no goals by demonstrations and depths, or does not fit the dataset.
+        ValueError: The policy finds no goals by demonstrations and depths, does not fit the dataset, or has
+            an invalid configuration.
         VisionEncoderError: The weights of EfficientNet-Lite0 are missing.
     """
     if out.resolve().is_relative_to(checkpoint.resolve()):
@@ -55,7 +58,10 @@ def add_matching(checkpoint: Path, repo_id: str, root: Path | None, out: Path, s
     if not (checkpoint / "config.json").is_file():
         raise FileNotFoundError(f"{checkpoint} is no checkpoint: it has no config.json.")
     with tempfile.TemporaryDirectory() as folder:
-        policy = DeltacoPolicy.from_pretrained(_without_matching(checkpoint, Path(folder)))
+        try:
+            policy = DeltacoPolicy.from_pretrained(_without_matching(checkpoint, Path(folder)))
+        except ParsingError as error:
+            raise ValueError(f"The configuration of {checkpoint} is invalid: {reason_of(error)}") from error
     goals, config = policy.goals, policy.config
     if goals is None or not config.uses_demo or not config.grasp_depth:
         raise ValueError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -21,6 +20,7 @@ from torch import Tensor
 from torchvision.io import ImageReadMode, decode_image
 from tqdm import tqdm
 
+from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.lerobot_internals import single_frames
 from lerobot_deltaco.policy.demonstrations import (
     DemonstrationSet,
@@ -41,14 +41,14 @@ GREATEST_SHARE = {"cuda": 0.6, "cpu": 0.8}
 class FramesInMemory:
     """All frames that a dataset has selected, by their place in it.
 
+    A batch has the windows of frames that the dataset's `delta_timestamps` ask for, as LeRobot's has.
+
     Args:
         dataset: The dataset; its `episodes` are those that are held.
         device: Device of the batches, and of the frames if they fit.
         image_size: Height and width to which images are scaled, None for their own.
         may_use_gpu: Whether frames may be held on a GPU, next to a policy that needs little of its memory.
         reserved_bytes: Memory that is left free beside the frames, for larger demonstrations.
-
-    A batch has the windows of frames that the dataset's `delta_timestamps` ask for, as LeRobot's has.
 
     Raises:
         MemoryError: The frames do not fit into the memory of this machine.
@@ -136,18 +136,15 @@ class FramesInMemory:
         found["task"] = [self.task_names[self._task_of[place]] for place in places]
         return found
 
-    def demonstrations(
-        self, camera: str, image_size: int, n_demo_frames: int, episodes: Sequence[int] | None = None
-    ) -> DemonstrationSet:
-        """The demonstrations among the frames.
+    def demonstrations(self, camera: str, image_size: int, n_demo_frames: int) -> DemonstrationSet:
+        """All episodes as demonstrations.
 
         Args:
             camera: Key of the images.
             image_size: Height and width to which they are scaled.
             n_demo_frames: Frames of a demonstration.
-            episodes: Indices of the episodes; all by default.
         """
-        episodes = list(self.spans) if episodes is None else list(episodes)
+        episodes = list(self.spans)
         rows = torch.stack([kept_frame_indices(*self.spans[episode], n_demo_frames) for episode in episodes])
         images = self.columns[camera]
         stored_side = shorter_side(self._dataset.meta.features[camera]["shape"])
@@ -258,7 +255,7 @@ def _camera_images(
     n_frames = len(wanted)
     images: Tensor | None = None
     with (
-        ThreadPoolExecutor(os.cpu_count()) as threads,
+        ThreadPoolExecutor(available_cores()) as threads,
         tqdm(total=n_frames, desc=f"Decoding {what}{camera}", unit="frame") as progress,
     ):
         for start in range(0, n_frames, CHUNK):

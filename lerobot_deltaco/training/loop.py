@@ -13,13 +13,13 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from itertools import chain, cycle, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from draccus.utils import ParsingError
 from huggingface_hub import HfApi
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
@@ -50,6 +50,23 @@ from lerobot_deltaco.training.remote_job import check_remote_job
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
 logger = logging.getLogger(__name__)
+
+
+class TrainingSetupError(ValueError):
+    """A training cannot begin; the message says why."""
+
+
+def _names_what_is_wrong[**P, R](set_up: Callable[P, R]) -> Callable[P, R]:
+    """Tells errors of a training that cannot begin from those of one that runs, which are bugs."""
+
+    @wraps(set_up)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return set_up(*args, **kwargs)
+        except (ValueError, OSError, MemoryError) as error:
+            raise TrainingSetupError(str(error) or repr(error)) from error
+
+    return checked
 
 
 class FrameIndexDataset(torch.utils.data.Dataset):
@@ -132,13 +149,13 @@ class InMemoryTraining:
         with replaced_in_training_loop(functions):
             yield
 
+    @_names_what_is_wrong
     def make_datasets(self, config: TrainPipelineConfig) -> tuple[FrameIndexDataset, LeRobotDataset | None]:
         """LeRobot's datasets, the first of them read into memory.
 
         Raises:
-            ValueError: No policy is trained, or the data cannot be held in memory.
-            FileNotFoundError: There is no network, and no dataset in a folder.
-            MemoryError: The frames do not fit.
+            TrainingSetupError: No policy is trained, there is no such dataset, or the data cannot be held in
+                memory.
             VisionEncoderError: The weights that pretrained matching needs are missing.
         """
         policy = config.policy
@@ -180,8 +197,13 @@ class InMemoryTraining:
         )
         return FrameIndexDataset(train), evaluation
 
+    @_names_what_is_wrong
     def make_policy(self, **arguments: Any) -> PreTrainedPolicy:
-        """LeRobot's policy; ours draws its demonstrations from the frames in memory."""
+        """LeRobot's policy; ours draws its demonstrations from the frames in memory.
+
+        Raises:
+            TrainingSetupError: The policy's options do not fit each other, the dataset or the environment.
+        """
         policy = self._make_policy(**arguments)
         config, frames = policy.config, self._frames
         assert self._config is not None
@@ -194,6 +216,7 @@ class InMemoryTraining:
             raise ValueError(
                 "`deltaco-train` does not train adapters (PEFT) of this policy. Use `lerobot-train`."
             )
+        policy.has_task_batches = True
         assert frames is not None
         if (config.uses_demo or config.locates_goals) and config.demo_episodes is None:
             policy.set_train_demonstrations(
@@ -202,8 +225,13 @@ class InMemoryTraining:
             )
         return policy
 
+    @_names_what_is_wrong
     def make_sampler(self, from_indices: Any, to_indices: Any, **options: Any) -> Any:
-        """Batches of tasks if they are wanted, else LeRobot's sampler."""
+        """Batches of tasks if they are wanted, else LeRobot's sampler.
+
+        Raises:
+            TrainingSetupError: There are no such batches.
+        """
         assert self._config is not None
         n_processes = _n_processes()
         stock = ResumableSampler(
@@ -344,13 +372,3 @@ def train() -> None:
     """Trains as the command line says: `lerobot-train`, over frames in memory."""
     with InMemoryTraining().active():
         run_training_loop()
-
-
-def reason_of(error: BaseException) -> str:
-    """What is wrong, where LeRobot's parser says only which class cannot be made."""
-    cause: BaseException | None = error
-    while isinstance(cause, ParsingError):
-        if type(cause) is ParsingError and cause.__cause__ is not None:
-            return reason_of(cause.__cause__)
-        cause = cause.__cause__
-    return str(error)

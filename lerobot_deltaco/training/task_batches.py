@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-_SHARE_TOLERANCE = 1e-3  # in tasks: a third may be written as 0.3333
+from lerobot_deltaco.policy.upsampling import count_upsampled_tasks
 
 
 class TaskBatchSampler:
@@ -133,24 +133,3 @@ def _rounds(
         turns.append(np.concatenate([turn[first], np.delete(turn, first)]))
         n_drawn += len(members)
     return np.concatenate(turns)[:n_chosen].reshape(n_batches, per_batch)
-
-
-def count_upsampled_tasks(share: float, tasks_per_batch: int) -> int:
-    """Number of the upsampled tasks in a batch.
-
-    Args:
-        share: Share of the batch for them.
-        tasks_per_batch: Number of tasks in a batch.
-
-    Raises:
-        ValueError: It is not a whole number, or no other task is left.
-    """
-    n_upsampled = round(share * tasks_per_batch)
-    if abs(n_upsampled - share * tasks_per_batch) > _SHARE_TOLERANCE or not 0 < n_upsampled < tasks_per_batch:
-        nearest = min(max(n_upsampled, 1), tasks_per_batch - 1)
-        raise ValueError(
-            f"`upsampled_share` must be the share of a whole number of tasks, 1 to {tasks_per_batch - 1} of "
-            f"the {tasks_per_batch} in a batch, such as {nearest / tasks_per_batch:g} for {nearest}. Got "
-            f"{share}, which is {share * tasks_per_batch:g} tasks."
-        )
-    return n_upsampled

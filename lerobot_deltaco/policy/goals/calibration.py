@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from lerobot_deltaco.policy.networks import cell_centers
+
 EPISODES_PER_CLUSTER = 60
 MIN_CLUSTERS, MAX_CLUSTERS = 12, 200
 MIN_EPISODES = 2 * MIN_CLUSTERS
@@ -121,8 +123,7 @@ def _blurred(maps: Tensor) -> Tensor:
 def _grid(maps: Tensor) -> Tensor:
     """Places of the pixels of (n, H, W) maps, (H * W, 2)."""
     height, width = maps.shape[-2:]
-    y = (torch.arange(height, device=maps.device) + 0.5) * 2 / height - 1
-    x = (torch.arange(width, device=maps.device) + 0.5) * 2 / width - 1
+    y, x = cell_centers(height, maps.device), cell_centers(width, maps.device)
     return torch.stack([x.repeat(height), y.repeat_interleave(width)], dim=1)
 
 
@@ -132,7 +133,11 @@ def _peaks(maps: Tensor) -> Tensor:
 
 
 def _peaks_near(maps: Tensor, places: Tensor) -> Tensor:
-    """The same within `_REACH` of places (n, 2)."""
+    """The same within `_REACH` of places (n, 2).
+
+    For the few places farther than that outside of the image, it is the top left corner. The fit counts it
+    little, as an outlier.
+    """
     grid = _grid(maps)
     peaks = []
     for some, around in zip(maps.split(512), places.split(512), strict=True):

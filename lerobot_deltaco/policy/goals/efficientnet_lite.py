@@ -16,8 +16,7 @@ from torch import Tensor, nn
 FINE_CHANNELS, COARSE_CHANNELS = 40, 80
 FINE_STRIDE, COARSE_STRIDE = 8, 16
 # The mean and the standard deviation of ImageNet, by which the weights expect images to be normalized.
-_MEAN = (0.485, 0.456, 0.406)
-_STD = (0.229, 0.224, 0.225)
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _BATCH_NORM_EPS = 1e-3
 _STEM_CHANNELS = 32
 
@@ -52,8 +51,8 @@ class EfficientNetLite(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None], persistent=False)
-        self.register_buffer("std", torch.tensor(_STD)[:, None, None], persistent=False)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
         self.stem = _ConvNorm(3, _STEM_CHANNELS, 3, 2)
         channels, stages = _STEM_CHANNELS, []
         for blocks in (_FINE_BLOCKS, _COARSE_BLOCKS):

@@ -30,10 +30,6 @@ class TrainingGoals(NamedTuple):
     approach: Tensor
     found: Tensor
 
-    def to(self, device: torch.device | str) -> TrainingGoals:
-        """The same on a device."""
-        return TrainingGoals(*(tensor.to(device) for tensor in self))
-
 
 def find_training_goals(
     to_image: StateToImage,
@@ -60,7 +56,7 @@ def find_training_goals(
     found = keyframes.found
     if not found.all():
         logger.warning(
-            "The gripper does not close and open again in %d of %d episodes; their goals are not learned.",
+            "The gripper does not close and open again in %d of %d episodes; they are not trained on.",
             int((~found).sum()),
             len(found),
         )
