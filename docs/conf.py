@@ -27,7 +27,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "generated"]  # of which the second is an earlier version's
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 # Names that several modules have are not linked.

@@ -31,6 +31,13 @@ from unittest.mock import patch
 
 import yaml
 from draccus.utils import ParsingError
+from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import (
+    HfHubHTTPError,
+    HFValidationError,
+    LocalEntryNotFoundError,
+    RemoteEntryNotFoundError,
+)
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -170,11 +177,11 @@ def single_frames(dataset: LeRobotDataset) -> Iterator[None]:
 def dataset_option(name: str) -> Any:
     """The value of `--dataset.<name>` for the running `lerobot-train`; None if it is not given.
 
-    It is taken from the command line, or else from the file or the folder of `--config_path`, as YAML, which
-    JSON is as well.
+    It is taken from the command line, or else from the file of `--config_path`, as YAML, which JSON is as
+    well. `--config_path` may also be a folder, or the id of a repository on the Hub.
 
     Raises:
-        ValueError: `--config_path` is neither a file nor a folder.
+        ValueError: `--config_path` is none of these, or the Hub cannot be reached.
     """
     from lerobot.configs import parser
     from lerobot.configs.train import TRAIN_CONFIG_NAME
@@ -186,17 +193,36 @@ def dataset_option(name: str) -> Any:
     if config_path is None:
         return None
     path = Path(config_path)
-    if not path.exists():
-        raise ValueError(
-            f"--config_path is {config_path}, which is neither a file nor a folder of this machine. So it is "
-            "not known which episodes are held back from the demonstrations. Download it and name its "
-            "folder, or train with `deltaco-train`, which takes the same arguments."
-        )
     file = path / TRAIN_CONFIG_NAME if path.is_dir() else path
+    if not path.exists():
+        try:
+            file = _config_on_hub(config_path)
+        except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
+            raise ValueError(
+                f"--config_path is {config_path}, whose {TRAIN_CONFIG_NAME} cannot be read: {error}. So it "
+                "is not known which episodes are held back from the demonstrations. Download it and name its "
+                "folder."
+            ) from error
     if not file.is_file():
         return None
     content = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
     return (content.get("dataset") or {}).get(name)
+
+
+def _config_on_hub(repo_id: str) -> Path:
+    """The configuration file of a repository: at its root, or else of its last checkpoint.
+
+    LeRobot has just read it, so that it is in the cache.
+    """
+    from lerobot.configs.train import PRETRAINED_MODEL_DIR, TRAIN_CONFIG_NAME, find_latest_hub_checkpoint
+
+    try:
+        return Path(hf_hub_download(repo_id, TRAIN_CONFIG_NAME))
+    except RemoteEntryNotFoundError:
+        latest = find_latest_hub_checkpoint(repo_id)
+        if latest is None:
+            raise
+        return Path(hf_hub_download(repo_id, f"{latest}/{PRETRAINED_MODEL_DIR}/{TRAIN_CONFIG_NAME}"))
 
 
 # Processor steps

@@ -241,6 +241,8 @@ def _run(command: Sequence[str], folder: Path) -> str:
             command, cwd=folder, env=environment, capture_output=True, text=True, check=False
         )
     except FileNotFoundError as error:
+        if error.filename != command[0]:
+            raise
         raise ReleaseError(f"`{command[0]}` is missing. Install it.") from error
     if result.returncode != 0:
         raise ReleaseError(f"`{' '.join(command)[:200]}` failed:\n{(result.stdout + result.stderr)[-3000:]}")

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.tasks import get_task
-from lerobot_deltaco.evaluation.record import EpisodeResult
+from lerobot_deltaco.evaluation.record import EpisodeResult, RecordError
 from lerobot_deltaco.reporting.series import ReportError, find_records, make_report
 from lerobot_deltaco.reporting.statistics import KINDS
 from lerobot_deltaco.reporting.task_bootstrap import Estimate, mean_rate, task_rates
@@ -43,7 +43,7 @@ def main() -> None:
     """Writes the image."""
     try:
         found = curves()
-    except ReportError as error:
+    except (RecordError, ReportError) as error:
         sys.exit(str(error))
     if not found:
         sys.exit(f"{RECORDS} has no records of the experiments objects_N, which are drawn.")

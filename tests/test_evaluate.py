@@ -286,6 +286,13 @@ def test_a_record_with_other_demonstrations_is_another_evaluation(run, tmp_path,
     with pytest.raises(SystemExit):
         evaluate_command.main(arguments)
     assert "'demonstrations': 'test/others'" in capsys.readouterr().err
+    # Others of the same name are others.
+    shutil.copytree(run.parent / "data" / "meta", tmp_path / "renamed" / "meta")
+    stats = tmp_path / "renamed" / "meta" / "stats.json"
+    stats.write_text(stats.read_text() + " ")
+    with pytest.raises(SystemExit):
+        evaluate_command.main([*arguments, *demos[:-1], str(tmp_path / "renamed")])
+    assert "SHA-256 of the demonstrations' metadata" in capsys.readouterr().err
 
 
 def test_other_tasks_are_evaluated_with_other_demonstrations_into_another_folder(run, tmp_path, capsys):

@@ -216,6 +216,27 @@ def test_a_stream_stays_in_one_thread_and_raises_its_errors():
         next(stream)
 
 
+def test_a_closed_worker_ends_at_the_next_step_of_a_stream():
+    worker, is_closed = Worker(), threading.Event()
+
+    def generate():
+        try:
+            while True:
+                time.sleep(0.01)
+                yield 1
+        finally:
+            is_closed.set()
+
+    stream = worker.stream(generate)
+    next(stream)
+    assert worker.close(30)
+    assert is_closed.is_set()
+    busy = Worker()
+    stream = busy.stream(lambda: (time.sleep(0.01 if n < 1 else 600) for n in range(2)))
+    next(stream)
+    assert not busy.close(0.1)
+
+
 def test_a_stream_that_is_left_is_closed_and_the_next_one_runs():
     worker, is_closed = Worker(), threading.Event()
 
@@ -648,15 +669,20 @@ class Repository:
 
     def __init__(self, *sizes):
         self.sha = "0123abc"
-        self.siblings = [SimpleNamespace(size=size) for size in sizes]
+        self.siblings = [
+            SimpleNamespace(rfilename=f"{n}.safetensors", size=size) for n, size in enumerate(sizes)
+        ]
+        # None of what is fetched.
+        self.siblings.append(SimpleNamespace(rfilename="training.pt", size=10**12))
 
 
 def serve(monkeypatch, repository, n_free):
     """Lets the Hub answer, and the disk have that many bytes free. Returns the revisions that are fetched."""
     fetched = []
 
-    def fetch(repo_id, revision, **_):
-        fetched.append(revision)
+    def fetch(repo_id, revision, local_files_only=False, **_):
+        if not local_files_only:
+            fetched.append(revision)
         raise LocalEntryNotFoundError("enough")
 
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
@@ -685,6 +711,16 @@ def test_what_is_too_large_is_not_fetched(monkeypatch, n_bytes, n_free, message)
     with pytest.raises(PlayError, match=message):
         find_checkpoint("USER/NAME", [], True)
     assert not fetched
+
+
+def test_what_is_there_needs_no_space_and_is_found_again_without_the_hub(checkpoints, tmp_path, monkeypatch):
+    folder = tmp_path / "models--USER--NAME" / "snapshots" / "0123abc"
+    shutil.copytree(checkpoints / "goals", folder)
+    (folder / "0.safetensors").touch()
+    serve(monkeypatch, Repository(10**8), 0)
+    monkeypatch.setattr(sources, "snapshot_download", lambda *args, **kwargs: str(folder))
+    assert find_checkpoint("USER/NAME", [], True) == folder
+    assert (folder.parents[1] / "refs" / "main").read_text() == "0123abc"
 
 
 def test_a_disk_that_fails_is_not_shown(monkeypatch, caplog):
@@ -719,7 +755,7 @@ def test_of_a_repository_only_data_are_fetched(checkpoints, monkeypatch):
     ("options", "message"),
     [
         ({"camera": "observation.images.top"}, "no camera 'observation.image'.*observation.images.top"),
-        ({"n_states": 7}, r"wrong features: .*'observation.state' of the shape \(10,\).*\(7,\)"),
+        ({"n_states": 7}, r"another robot: .*'observation.state' of the shape \(10,\).*\(7,\)"),
     ],
 )
 def test_a_dataset_that_does_not_fit_is_refused(actions, checkpoints, session, tmp_path, options, message):

@@ -487,6 +487,7 @@ def test_a_record_of_the_first_format_says_what_was_so_then(tmp_path):
         ("scene_set", None),
         ("weights", None),
         ("demonstrations", None),
+        ("demonstrations_digest", None),
     ],
 )
 def test_the_first_records_of_the_second_format_say_what_was_so_then(tmp_path, name, value):

@@ -99,6 +99,15 @@ def test_other_scenes_are_rejected(folders, tmp_path, changes, message):
     assert not (tmp_path / "out").exists()
 
 
+def test_wordings_are_compared_in_the_same_set_of_scenes(tmp_path):
+    templates = write(tmp_path / "a", record(step=10))
+    other = write(tmp_path / "b", record(step=20, wording="go"))
+    with pytest.raises(ReportError, match="different sets of scenes"):
+        write_wordings_report([templates, other], tmp_path / "out")
+    same = write(tmp_path / "c", record(step=20, wording="go", scene_set=10))
+    assert len(write_wordings_report([templates, same], tmp_path / "out")) == 2
+
+
 def test_the_command_prints_the_rates(folders, tmp_path, capsys):
     report_command.main([*map(str, folders), "--by-wording", "--out", str(tmp_path / "out")])
     output = capsys.readouterr().out

@@ -194,6 +194,7 @@ def _evaluate(
                 processes=options.processes or default_processes(str(loaded.policy.config.device)),
                 weights=weights_digest(checkpoint.folder),
                 demonstrations=options.demo_repo_id,
+                demonstrations_digest=_demonstrations_digest(options),
             )
             remark = f"{record.seconds:.0f} s"
     sys.stdout.write(_text(run, record, remark))
@@ -231,6 +232,10 @@ def _check_same_evaluation(
     )
     if record.weights is not None:  # else, the record does not tell
         made_for["demonstrations"], asked_for["demonstrations"] = record.demonstrations, options.demo_repo_id
+        digest = _demonstrations_digest(options)
+        if None not in (digest, record.demonstrations_digest):
+            name = "SHA-256 of the demonstrations' metadata"
+            made_for[name], asked_for[name] = record.demonstrations_digest, digest
     if options.n_demonstrations is not None:
         made_for["n_demonstrations"] = record.policy.get("n_demonstrations", 1)
         asked_for["n_demonstrations"] = options.n_demonstrations
@@ -241,6 +246,13 @@ def _check_same_evaluation(
             f"{path} belongs to another evaluation: {made_for}. Expected {asked_for}. Use the same "
             "arguments, or name another folder for the records with --out."
         )
+
+
+def _demonstrations_digest(options: argparse.Namespace) -> str | None:
+    """Digest of the dataset of demonstrations that is given; None if none is, or it is not here yet."""
+    from lerobot_deltaco.policy.dataset_folders import metadata_digest
+
+    return None if options.demo_repo_id is None else metadata_digest(options.demo_repo_id, options.demo_root)
 
 
 def _text(run: Path, record: EvaluationRecord, remark: str) -> str:

@@ -51,17 +51,22 @@ def main(arguments: list[str] | None = None) -> None:
         page = build_page(engine)
         try:
             page.launch(
-                server_name=options.host,
+                server_name=f"[{options.host.strip('[]')}]" if ":" in options.host else options.host,
                 server_port=options.port,
                 inbrowser=options.open,
                 prevent_thread_lock=True,
                 **launch_options(),
             )
         except OSError as error:
-            raise _port_taken(options.port) from error
+            _check_address(options.host, options.port)
+            raise PlayError(f"The page cannot be served: {error}") from error
         engine.start()
         page.block_thread()
     sys.stdout.write("\nThe page has stopped.\n")
+    if not engine.close():
+        # The end of the interpreter would abort native code that still runs in the engine's thread.
+        sys.stdout.flush()
+        os._exit(0)
 
 
 def allowed_folders(host: str, allowed: Sequence[Path], checkpoint: str) -> list[Path]:

@@ -37,6 +37,7 @@ _ADDED_TO_FORMAT_2 = MappingProxyType(
         "scene_set": None,
         "weights": None,
         "demonstrations": None,
+        "demonstrations_digest": None,
     }
 )
 
@@ -123,6 +124,8 @@ class EvaluationRecord:
             earlier versions.
         demonstrations: Name of the dataset of demonstrations that was given for the evaluation; None if they
             were the checkpoint's own, or if `weights` is None.
+        demonstrations_digest: SHA-256 of that dataset's metadata; None if there was none, or if it is not
+            known.
     """
 
     experiment: str
@@ -148,6 +151,7 @@ class EvaluationRecord:
     scene_set: int | None = None
     weights: str | None = None
     demonstrations: str | None = None
+    demonstrations_digest: str | None = None
 
     @property
     def success_rate(self) -> float:

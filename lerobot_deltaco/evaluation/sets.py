@@ -33,6 +33,7 @@ def run_set(
     processes: int = 1,
     weights: str | None = None,
     demonstrations: str | None = None,
+    demonstrations_digest: str | None = None,
 ) -> EvaluationRecord:
     """Runs an evaluation set, and writes its record, and beside it the results in LeRobot's form.
 
@@ -50,6 +51,7 @@ def run_set(
         processes: Number of processes that share the episodes.
         weights: SHA-256 of the checkpoint's weights, for the record; None if there is no checkpoint.
         demonstrations: Name of the dataset of demonstrations, for the record; None for the checkpoint's own.
+        demonstrations_digest: SHA-256 of its metadata, for the record.
 
     Returns:
         The record.
@@ -86,6 +88,7 @@ def run_set(
         scene_set=plan.scene_set,
         weights=weights,
         demonstrations=demonstrations,
+        demonstrations_digest=demonstrations_digest,
     )
     write_lerobot_info(outcomes, record.seconds, extras_folder(folder, step, plan.counterfactual))
     write_record(record, record_path(folder, step, plan.counterfactual))

@@ -207,6 +207,12 @@ class ExperimentRun:
             "output_dir": self.folder,
         }
         if self.config.training.get("env_eval_freq"):
+            own = [name for name in ("scene_set", "seed") if self.config.evaluation.get(name)]
+            if own:
+                raise ExperimentError(
+                    f"{self.config.name} sets `evaluation.{own[0]}`, which evaluations in training do not "
+                    "have. Set `training.env_eval_freq` to 0: checkpoints are evaluated afterwards."
+                )
             options |= {
                 "env.type": "deltaco",
                 "env.task": self.config.evaluation["tasks"],

@@ -16,6 +16,7 @@ from lerobot_deltaco.policy.finite_loss import non_finite_weight
 from lerobot_deltaco.policy.frozen_features import FrozenFeatures
 from lerobot_deltaco.policy.language.instruction_table import InstructionTable
 from lerobot_deltaco.policy.language.paraphrases import Paraphrases
+from lerobot_deltaco.policy.options import FILE_OPTIONS
 from lerobot_deltaco.policy.task_file import (
     StoredDemonstrations,
     TaskFile,
@@ -28,16 +29,8 @@ from lerobot_deltaco.policy.task_file import (
 OLD_MODEL_PREFIX = "policy."
 # Prefix of the names of the weights of matching by pretrained features.
 MATCHING_PREFIX = "goals.matching."
-# Options that name files whose contents a checkpoint holds, and the one that is a choice of each evaluation.
-_SOURCES = (
-    "leave_out",
-    "demo_repo_id",
-    "demo_root",
-    "instruction_embeddings",
-    "instructions",
-    "vision_encoder_weights",
-    "demo_features_dir",
-)
+# What a checkpoint does not say: where its contents are from, and what is a choice of each evaluation.
+_SOURCES = ("leave_out", *FILE_OPTIONS)
 
 
 @contextmanager

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from lerobot_deltaco.common.shipped import shipped_folder
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.play.sources import CHECKPOINT, find_folder, read_json
-from lerobot_deltaco.policy.options import PATHS
+from lerobot_deltaco.policy.options import FILE_OPTIONS
 from lerobot_deltaco.policy.vision_encoders import VISION_ENCODERS
 
 DEFAULT_NAME = "pick_place"
@@ -29,9 +30,6 @@ _STEPS = {
     "normalizer_processor",
     "unnormalizer_processor",
 }
-# Options that name files or a dataset, which a checkpoint does not need: it brings its own. Files of this
-# machine would be read, shown in a message or written.
-_FILE_OPTIONS = (*(option for option in PATHS if option != "vision_encoder"), "demo_repo_id")
 # Image encoders that come as Python packages. The others would be downloaded, whatever their size.
 _PACKAGED_ENCODERS = tuple(
     name for name, spec in VISION_ENCODERS.items() if spec.kind == "efficientnet_lite0"
@@ -39,10 +37,8 @@ _PACKAGED_ENCODERS = tuple(
 
 
 def checkpoints_folder() -> Path:
-    """Folder of the checkpoints that come with the project: in the package, or beside it in a clone."""
-    package = Path(__file__).parents[1]
-    inside = package / "checkpoints"
-    return inside if inside.is_dir() else package.parent / "checkpoints"
+    """Folder of the checkpoints that come with the project."""
+    return shipped_folder("checkpoints", "checkpoints")
 
 
 def find_checkpoint(name: str, roots: Sequence[Path], is_hub_allowed: bool) -> Path:
@@ -80,7 +76,8 @@ def check_files(folder: Path, name: str) -> None:
     config = read_json(folder / _CONFIG, name)
     if config.get("type") != "deltaco":
         raise PlayError(f"{name!r} holds a policy of the type {config.get('type')!r}, not 'deltaco'.")
-    named = [option for option in _FILE_OPTIONS if config.get(option) is not None]
+    # A checkpoint brings its own. Files of this machine would be read, shown in a message or written.
+    named = [option for option in FILE_OPTIONS if config.get(option) is not None]
     if named:
         raise PlayError(f"{name!r} names files of another place in `{named[0]}`. Save the policy again.")
     _check_image_encoder(config, name)

@@ -30,7 +30,7 @@ from lerobot_deltaco.play.demonstrations import Demonstration, check_number, dem
 from lerobot_deltaco.play.errors import PlayError
 from lerobot_deltaco.play.sources import DATASET, find_folder, read_json
 from lerobot_deltaco.policy.dataset_folders import INFO_FILE
-from lerobot_deltaco.policy.demonstrations import shorter_side, to_uint8
+from lerobot_deltaco.policy.demonstrations import check_robot_features, shorter_side, to_uint8
 
 logger = logging.getLogger(__name__)
 
@@ -109,15 +109,12 @@ class EpisodeDataset:
             )
         if not _needs_robot(config):
             return
-        for key, feature in ((OBS_STATE, config.robot_state_feature), (ACTION, config.action_feature)):
-            expected = None if feature is None else tuple(feature.shape)
-            found = tuple(meta.features[key]["shape"]) if key in meta.features else None
-            if expected is not None and found != expected:
-                got = "none" if found is None else f"the shape {found}"
-                raise PlayError(
-                    f"The dataset {self._name!r} has the wrong features: the checkpoint expects {key!r} of "
-                    f"the shape {expected}, and the dataset has {got}."
-                )
+        features = {OBS_STATE: config.robot_state_feature, ACTION: config.action_feature}
+        expected = {name: feature.shape for name, feature in features.items() if feature is not None}
+        try:
+            check_robot_features(self._name, meta.features, expected)
+        except ValueError as error:
+            raise PlayError(str(error)) from None
 
     def demonstration(self, task: str, number: int, config: DeltacoConfig) -> Demonstration:
         """An episode as a demonstration for a policy.

@@ -64,6 +64,17 @@ class Engine:
         """Begins to load LeRobot and the first checkpoint, and returns at once."""
         threading.Thread(target=self._start, name="deltaco-play-start", daemon=True).start()
 
+    def close(self, seconds: float = 5) -> bool:
+        """Ends what runs, at its next step.
+
+        Args:
+            seconds: How long to wait for it.
+
+        Returns:
+            Whether it has ended.
+        """
+        return self._worker.close(seconds)
+
     def _start(self) -> None:
         try:
             self._status = Status("Loading LeRobot and PyTorch, which takes 10 seconds or more.")

@@ -38,15 +38,23 @@ _HOUR = 3600  # s
 # Events that wait for their turn. More are refused, and their users are told that the page is busy.
 MAX_WAITING = 32
 _FORGOTTEN = (
-    "The page forgets what you chose after an hour without a click. It has begun anew, with its first "
-    "checkpoint and a random scene."
+    "The page has begun anew, with its first checkpoint and a random scene: it forgets what you chose after "
+    "an hour without a click."
 )
 _ONE_AT_A_TIME = {"concurrency_id": "simulator", "concurrency_limit": 1, "api_visibility": "private"}
 
 
 def launch_options() -> dict[str, Any]:
     """Options of `Blocks.launch` that belong to the page: its look, and what it serves."""
-    return {"theme": THEME, "css": CSS, "footer_links": [], "show_error": False, "max_file_size": 0}
+    return {
+        "theme": THEME,
+        "css": CSS,
+        "footer_links": [],
+        "show_error": False,
+        "max_file_size": 0,
+        # Else, Gradio opens a public tunnel on some services by itself.
+        "share": False,
+    }
 
 
 def build_page(engine: Engine) -> gr.Blocks:

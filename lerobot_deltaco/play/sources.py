@@ -6,14 +6,16 @@ import json
 import logging
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import httpx
 from huggingface_hub import HfApi, constants, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+from huggingface_hub.utils import filter_repo_objects
 
+from gym_deltaco.atomic_files import write_text
 from lerobot_deltaco.play.errors import PlayError
 
 logger = logging.getLogger(__name__)
@@ -102,8 +104,15 @@ def _downloaded(repo_id: str, kind: Kind) -> Path:
     try:
         if not constants.HF_HUB_OFFLINE:
             info = HfApi(token=False).repo_info(repo_id, repo_type=kind.repo_type, files_metadata=True)
-            _check_size(sum(file.size or 0 for file in getattr(info, "siblings", None) or ()), repo_id)
-            revision = info.sha  # what was checked, even if the repository changes meanwhile
+            revision = info.sha  # what is checked, even if the repository changes meanwhile
+            files = filter_repo_objects(
+                getattr(info, "siblings", None) or (),
+                allow_patterns=list(kind.patterns),
+                key=lambda file: file.rfilename,
+            )
+            sizes = {file.rfilename: file.size or 0 for file in files}
+            if not _is_cached(repo_id, kind, revision, sizes):
+                _check_size(sum(sizes.values()), repo_id)
         folder = snapshot_download(
             repo_id,
             repo_type=kind.repo_type,
@@ -111,6 +120,9 @@ def _downloaded(repo_id: str, kind: Kind) -> Path:
             allow_patterns=list(kind.patterns),
             token=False,
         )
+        if revision is not None:
+            # As the head of the branch, so that it is found again without the Hub.
+            write_text(Path(folder).parents[1] / "refs" / constants.DEFAULT_REVISION, revision)
         return Path(folder)
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
         reason = " ".join(str(error).split())[:200]
@@ -124,6 +136,17 @@ def _downloaded(repo_id: str, kind: Kind) -> Path:
             f"The {kind.word} {repo_id!r} cannot be fetched: the Hugging Face Hub cannot be reached, or the "
             "files cannot be written. The terminal of the page has the details."
         ) from error
+
+
+def _is_cached(repo_id: str, kind: Kind, revision: str | None, files: Iterable[str]) -> bool:
+    """Whether files of a repository need not be downloaded."""
+    try:
+        folder = snapshot_download(
+            repo_id, repo_type=kind.repo_type, revision=revision, local_files_only=True, token=False
+        )
+    except LocalEntryNotFoundError:
+        return False
+    return all((Path(folder) / name).exists() for name in files)
 
 
 def _check_size(n_bytes: int, repo_id: str) -> None:

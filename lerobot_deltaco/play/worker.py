@@ -31,9 +31,25 @@ class Worker:
 
     def __init__(self) -> None:
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._is_closing = threading.Event()
         # The threads of a `ThreadPoolExecutor` would be waited for.
-        threading.Thread(target=_work, args=(self._jobs,), name="deltaco-play", daemon=True).start()
+        self._thread = threading.Thread(target=_work, args=(self._jobs,), name="deltaco-play", daemon=True)
+        self._thread.start()
         weakref.finalize(self, self._jobs.put, None)
+
+    def close(self, seconds: float) -> bool:
+        """Ends the thread after the present function, or the present step of a generator.
+
+        Args:
+            seconds: How long to wait for it.
+
+        Returns:
+            Whether it has ended.
+        """
+        self._is_closing.set()
+        self._jobs.put(None)
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
 
     def call(self, function: Callable[[], T]) -> T:
         """The result of a function, once its turn has come."""
@@ -42,7 +58,7 @@ class Worker:
     def stream(self, make: Callable[[], Generator[T]]) -> Iterator[T]:
         """Yields what a generator yields. If the caller stops early, the generator is closed."""
         items: queue.SimpleQueue[T | _End] = queue.SimpleQueue()
-        is_cancelled = threading.Event()
+        is_cancelled, is_closing = threading.Event(), self._is_closing
 
         def work() -> None:
             error = None
@@ -51,7 +67,7 @@ class Worker:
                     with closing(make()) as generator:
                         for item in generator:
                             items.put(item)
-                            if is_cancelled.is_set():
+                            if is_cancelled.is_set() or is_closing.is_set():
                                 break
             except BaseException as raised:  # it is raised again where the items are read
                 error = raised

@@ -1,4 +1,4 @@
-"""Finds missing dataset folders before LeRobot makes them.
+"""The folders of datasets: missing ones are found before LeRobot makes them, and others are told apart.
 
 Given a folder without a dataset, LeRobot makes the folder and downloads the dataset into it. Without a
 network, a mistyped folder ends in a network error and an empty folder of that name.
@@ -6,9 +6,11 @@ network, a mistyped folder ends in a network error and an empty folder of that n
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from huggingface_hub import constants
+from lerobot.utils.constants import HF_LEROBOT_HOME
 
 INFO_FILE = Path("meta/info.json")
 
@@ -30,3 +32,23 @@ def check_dataset_folder(option: str, root: str | Path | None) -> None:
         f"{option} is {root}, but there is no dataset: {reason}. Check the spelling. (HF_HUB_OFFLINE is set, "
         "so that nothing can be downloaded into it.)"
     )
+
+
+def metadata_digest(repo_id: str, root: str | Path | None) -> str | None:
+    """SHA-256 of a dataset's metadata, which hold the statistics of all its frames, in hexadecimal.
+
+    Args:
+        repo_id: Id of the dataset.
+        root: Folder of the dataset; None is LeRobot's cache.
+
+    Returns:
+        The digest; None if the dataset has not been downloaded yet.
+    """
+    folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+    if not (folder / INFO_FILE).is_file():
+        return None
+    digest = hashlib.sha256()
+    for path in sorted(path for path in (folder / INFO_FILE.parent).rglob("*") if path.is_file()):
+        digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

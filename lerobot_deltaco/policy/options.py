@@ -98,3 +98,5 @@ PATHS = (
     "vision_encoder_weights",
     "demo_features_dir",
 )
+# Options that name files or a dataset whose contents a checkpoint holds.
+FILE_OPTIONS = (*(name for name in PATHS if name != "vision_encoder"), "demo_repo_id")

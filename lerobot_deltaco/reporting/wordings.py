@@ -12,7 +12,13 @@ from lerobot_deltaco.evaluation.record import TEMPLATES, read_record
 from lerobot_deltaco.reporting.curves import DOTS_PER_INCH
 from lerobot_deltaco.reporting.paper_results import CHANCE, in_order, label_of
 from lerobot_deltaco.reporting.report_files import csv_bytes, markdown_table, write_files
-from lerobot_deltaco.reporting.series import Series, check_same_scenes, find_records, make_report
+from lerobot_deltaco.reporting.series import (
+    ReportError,
+    Series,
+    check_same_scenes,
+    find_records,
+    make_report,
+)
 from lerobot_deltaco.reporting.task_bootstrap import Estimate, estimate_text, mean_rate, paired_difference
 
 if TYPE_CHECKING:
@@ -99,6 +105,14 @@ def wording_results(paths: Sequence[Path]) -> list[WordingResult]:
         for series in make_report(group).regular
     }
     check_same_scenes("records", list(measured.values()))
+    for (experiment, tasks, wording), series in measured.items():
+        template = measured.get((experiment, tasks, TEMPLATES), series)
+        if series.last_scene_sets != template.last_scene_sets:
+            raise ReportError(
+                f"The records of {experiment!r} on {tasks!r}, with templates and with "
+                f"{wording_label(wording)}, are of different sets of scenes, but wordings are compared scene "
+                "by scene. Evaluate one of them again with `deltaco-evaluate --scene-set`."
+            )
     results = [
         _result(series, tasks, wording, measured.get((experiment, tasks, TEMPLATES)))
         for (experiment, tasks, wording), series in measured.items()

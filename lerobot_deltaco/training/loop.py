@@ -11,6 +11,7 @@ import logging
 import re
 import shlex
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -64,6 +65,10 @@ def _names_what_is_wrong[**P, R](set_up: Callable[P, R]) -> Callable[P, R]:
         try:
             return set_up(*args, **kwargs)
         except (ValueError, OSError, MemoryError) as error:
+            *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+            module = frame.f_globals.get("__name__", "")
+            if isinstance(error, ValueError) and not module.startswith(("lerobot", "gym_deltaco")):
+                raise  # by another library: a bug, of which the traceback is needed
             raise TrainingSetupError(str(error) or repr(error)) from error
 
     return checked
