@@ -174,7 +174,7 @@ def test_several_demonstrations_need_a_policy_that_combines_them(tmp_path, capsy
         evaluate_command.main(
             [str(copy), "--tasks", "24", "--n-demonstrations", "3", "--out", str(tmp_path / "out")]
         )
-    assert "`n_demonstrations` is for policies with `demo_encoder=correspondence`" in capsys.readouterr().err
+    assert "`n_demonstrations` has no effect with `demo_encoder=attention`" in capsys.readouterr().err
 
 
 def test_the_demonstration_or_the_instruction_is_left_out(tmp_path, capsys):

@@ -32,6 +32,8 @@ RECORDS = sorted(ROOT.glob("results/*/records"))
 # What an experiment is about, besides the options that its own file sets. All else is the recipe, which those
 # that are compared share.
 SUBJECT = {"method", "film", "concat", "encoder_loss", "language_encoder", "demo_feature_dim", "seed"}
+# Options whose default follows from another option.
+FOLLOWING = {"gripper_loss": "gripper_weight", "backbone": "initial_weights"}
 
 
 def test_there_are_results():
@@ -55,7 +57,8 @@ def own_options(experiment):
     path = EXPERIMENTS / f"{experiment}.yaml"
     content = yaml.safe_load(path.read_text()) if path.is_file() else {}
     start = {"pretrained_path"} if "start_from" in content else set()
-    return start | set(content.get("policy", {}))
+    own = set(content.get("policy", {}))
+    return start | own | {FOLLOWING[name] for name in own & FOLLOWING.keys()}
 
 
 def with_defaults(policy):

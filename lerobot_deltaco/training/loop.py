@@ -11,7 +11,6 @@ import logging
 import re
 import shlex
 import sys
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -65,10 +64,7 @@ def _names_what_is_wrong[**P, R](set_up: Callable[P, R]) -> Callable[P, R]:
         try:
             return set_up(*args, **kwargs)
         except (ValueError, OSError, MemoryError) as error:
-            *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-            module = frame.f_globals.get("__name__", "")
-            if isinstance(error, ValueError) and not module.startswith(("lerobot", "gym_deltaco")):
-                raise  # by another library: a bug, of which the traceback is needed
+            logger.debug("The training cannot begin.", exc_info=error)
             raise TrainingSetupError(str(error) or repr(error)) from error
 
     return checked
