@@ -10,11 +10,9 @@ which is printed too; compare figures of one run.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -23,6 +21,8 @@ import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
+
+from small_trainings import median_step
 
 from lerobot_deltaco.common.cores import available_cores
 
@@ -162,11 +162,7 @@ def _measure_training(
     """A training: its seconds on the clock and of the processor, and lines on its steps."""
     script = str(Path(__file__).with_name("step_times.py"))
     clock, processor, _ = _run(script, str(times), *arguments, OMP_NUM_THREADS=str(n_threads))
-    ends = json.loads(times.read_text())[WARM_UP - 1 :]
-    step, step_cpu = (
-        statistics.median(later[which] - earlier[which] for earlier, later in itertools.pairwise(ends))
-        for which in (0, 1)
-    )
+    step, step_cpu = median_step(times, WARM_UP)
     threads = f"{n_threads} thread{'s' if n_threads > 1 else ''}"
     lines = [
         Line(f"    a step of {BATCH_SIZE} samples, {threads}", step, step_cpu, "s"),

@@ -9,29 +9,17 @@ cores are at most so much faster. Times are of one machine and its load; compare
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import statistics
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gym_deltaco.tasks import get_task
-from lerobot_deltaco.common.cores import available_cores
-from lerobot_deltaco.data.collection import collect
-from lerobot_deltaco.data.collection_plan import CollectionPlan
+from small_trainings import SmallTrainings
 
-# What takes long to import is imported where it is used: the workers of the collection import this file.
-PLAN = CollectionPlan("0-15", episodes_per_task=4)
 ENCODERS = ("attention", "correspondence")
-LANGUAGE_ENCODER = "all-MiniLM-L6-v2"
-# The training of which the steps are timed.
-STEP_TIMES = Path(__file__).with_name("step_times.py")
-# Steps before those that are measured: they warm up.
-WARM_UP = 5
 
 
 class Rate(NamedTuple):
@@ -56,15 +44,12 @@ def main(arguments: list[str] | None = None) -> None:
 
     results: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder) / "dataset"
-        collect(root, PLAN, available_cores())
-        embeddings = _write_embeddings(Path(folder))
+        trainings = SmallTrainings(Path(folder))
         for encoder in options.encoders:
             rates: dict[int, list[Rate]] = {1: [], options.processes: []}
-            for number in range(options.rounds):
+            for _ in range(options.rounds):
                 for n_processes, found in rates.items():
-                    output = Path(folder) / f"{encoder}_{n_processes}_{number}"
-                    found.append(_measure(root, embeddings, output, encoder, n_processes, options))
+                    found.append(_measure(trainings, encoder, n_processes, options))
                     sys.stdout.write(
                         f"{encoder}, {n_processes} process(es): {found[-1].clock:.1f} samples/s, "
                         f"{found[-1].processor:.1f} per processor second; load {os.getloadavg()[0]:.1f}\n"
@@ -89,59 +74,11 @@ def main(arguments: list[str] | None = None) -> None:
         options.json.write_text(json.dumps(results, indent=2) + "\n")
 
 
-def _write_embeddings(folder: Path) -> Path:
-    """Embeddings of the instructions, so that no language model is needed."""
-    import torch
-
-    from lerobot_deltaco.policy.language.instruction_table import InstructionTable
-    from lerobot_deltaco.policy.task_file import write_task_file
-
-    table = InstructionTable(LANGUAGE_ENCODER)
-    instructions = [get_task(task_id).instruction for task_id in PLAN.task_ids]
-    table.put(instructions, torch.eye(len(instructions), 384))
-    path = folder / "embeddings.safetensors"
-    write_task_file(path, table.contents())
-    return path
-
-
-def _measure(
-    root: Path, embeddings: Path, output: Path, encoder: str, n_processes: int, options: argparse.Namespace
-) -> Rate:
+def _measure(trainings: SmallTrainings, encoder: str, n_processes: int, options: argparse.Namespace) -> Rate:
     """Samples per second of all processes together, after the first steps."""
-    arguments = {
-        "policy.type": "deltaco",
-        "policy.device": "cpu",
-        "policy.backbone": "strided",
-        "policy.demo_encoder": encoder,
-        "policy.motion_modes": 5 if encoder != "cnn" else 1,
-        "policy.language_encoder": LANGUAGE_ENCODER,
-        "policy.instruction_embeddings": embeddings,
-        "policy.tasks_per_batch": len(PLAN.task_ids),
-        "dataset.repo_id": "benchmark/processes",
-        "dataset.root": root,
-        "batch_size": options.batch_size,
-        "steps": WARM_UP + options.steps,
-        "log_freq": 1,
-        "save_checkpoint": "false",
-        "output_dir": output,
-    }
     launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={n_processes}"]
-    times = output.with_suffix(".json")
-    command = [sys.executable, *launcher, str(STEP_TIMES), str(times)]
-    settings = {"OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo", "HF_HUB_OFFLINE": "1"}
-    result = subprocess.run(
-        [*command, *(f"--{name}={value}" for name, value in arguments.items())],
-        env={**os.environ, **settings},
-        capture_output=True,
-        text=True,
-    )
-    if result.returncode != 0:
-        sys.exit(f"The training failed:\n{result.stderr[-3000:]}")
-    ends = json.loads(times.read_text())[WARM_UP - 1 :]
-    clock, processor = (
-        statistics.median(later[which] - earlier[which] for earlier, later in itertools.pairwise(ends))
-        for which in (0, 1)
-    )
+    policy = {"demo_encoder": encoder, "motion_modes": 5 if encoder != "cnn" else 1}
+    clock, processor = trainings.run(policy, options.batch_size, options.steps, launcher)
     return Rate(n_processes * options.batch_size / clock, options.batch_size / processor)
 
 

@@ -1,9 +1,9 @@
 """Times of the steps of a training: `python benchmarks/step_times.py FILE --policy.type=deltaco ...`.
 
 It trains as `deltaco-train` does with the same arguments, and writes to the JSON file, for each step, when it
-ended and the processor seconds of the process until then. `minute.py` and `processes.py` start it, the latter
-by `torchrun`; of several processes, the first writes the file. It is a script of its own because its
-`--steps` would be taken for that of `processes.py`.
+ended and the processor seconds of the process until then. `minute.py` and `small_trainings.py` start it, the
+latter also by `torchrun`; of several processes, the first writes the file. It is a script of its own because
+its `--steps` would be taken for that of `processes.py`.
 """
 
 from __future__ import annotations

@@ -27,6 +27,18 @@ def test_the_times_of_exactly_the_steps_of_a_training_are_noted(tmp_path):
 
 
 @pytest.mark.slow
+def test_steps_are_timed_for_every_conditioning(tmp_path):
+    found = tmp_path / "found.json"
+    result = run("conditionings.py", "--steps=2", "--rounds=1", f"--json={found}")
+    assert result.returncode == 0, result.stderr
+    steps = json.loads(found.read_text())["steps"]
+    assert {"attention", "correspondence", "language only"} <= set(steps)
+    assert all(step["clock"] > 0 and step["processor"] > 0 for step in steps.values())
+    for name in steps:
+        assert name in result.stdout
+
+
+@pytest.mark.slow
 def test_where_a_minute_goes_is_measured(tmp_path):
     found = tmp_path / "found.json"
     result = run("minute.py", "--only", "training", "--encoder=attention", f"--json={found}")
