@@ -205,7 +205,7 @@ def test_a_wrong_row_is_explained(tmp_path, rows, message):
 
 def test_records_of_other_tasks_are_no_row(tmp_path):
     copy = tmp_path / "results" / "small_a"
-    shutil.copytree(ROOT / "results/small_a/records/one_hot", copy / "records/one_hot")
+    shutil.copytree(ROOT / "results/small_a/records/one_hot/seed_0", copy / "records/one_hot/seed_0")
     rest = "    training: t\n    commit: c\n    records: small_a/records/one_hot\n"
     (tmp_path / ROWS_FILE).write_text(f"tasks: all\nrows:\n  - {ROW}\n{rest}")
     with pytest.raises(
