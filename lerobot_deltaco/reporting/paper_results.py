@@ -120,6 +120,7 @@ _OWN_LABELS: Mapping[str, str] = MappingProxyType(
         "deltaco_paraphrases": "DeL-TaCo, trained on paraphrases",
         "deltaco_paraphrases_templates": "DeL-TaCo, trained on paraphrases and templates",
         "deltaco_matching": "DeL-TaCo, pretrained matching",
+        "deltaco_attention": "DeL-TaCo, attention encoder",
         "language_only_paraphrases": "language only, trained on paraphrases",
         "minilm_l3": "DeL-TaCo, MiniLM-L3",
         "minilm_l3_language_only": "language only, MiniLM-L3",
