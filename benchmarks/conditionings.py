@@ -1,8 +1,9 @@
 """Time of a training step by conditioning: `python benchmarks/conditionings.py [--json FILE]` prints a table.
 
-Each training has one process with one thread, and the settings of the small experiments (`small_a`,
-`small_a_correspondence`). They take turns, so that what else the machine does meets all of them. Processor
-seconds depend less on that than those on the clock. Compare figures of one run.
+Each training has one process with one thread, and those settings of the small experiments (`small_a`,
+`small_a_correspondence`) that change the time of a step. In each round, all of them are trained in turn, so
+that what else the machine does meets all. Processor seconds depend less on that than those on the clock.
+Compare figures of one run.
 """
 
 from __future__ import annotations
@@ -27,19 +28,21 @@ _SHARED = MappingProxyType(
         "crop_padding": 0,
     }
 )
-_CORRESPONDENCE = {
-    "demo_encoder": "correspondence",
-    "recolor_share": 0.7,
-    "color_blind_tasks": "shaped object",
-    "frames_after_release": 2,
-}
+_CORRESPONDENCE = MappingProxyType(
+    {
+        "demo_encoder": "correspondence",
+        "recolor_share": 0.7,
+        "color_blind_tasks": "shaped object",
+        "frames_after_release": 2,
+    }
+)
 REFERENCE = "attention"  # the others are compared with it
 CONDITIONINGS: MappingProxyType[str, dict[str, Any]] = MappingProxyType(
     {
         "language only": {"method": "language_only"},
         "cnn, the paper's encoder": {"demo_encoder": "cnn"},
         REFERENCE: {"demo_encoder": "attention"},
-        "correspondence": _CORRESPONDENCE,
+        "correspondence": {**_CORRESPONDENCE},
         "correspondence, locator_share=0.125": {**_CORRESPONDENCE, "locator_share": 0.125},
     }
 )
@@ -63,6 +66,8 @@ def main(arguments: list[str] | None = None) -> None:
             for name, policy in CONDITIONINGS.items():
                 step = trainings.run({**_SHARED, **policy}, options.batch_size, options.steps)
                 found[name].append(step)
+                load = os.getloadavg()[0]
+                sys.stderr.write(f"{name}: {1000 * step.processor:.1f} ms; load {load:.1f}\n")
     steps = {
         name: StepTime(*(statistics.median(figures) for figures in zip(*times, strict=True)))
         for name, times in found.items()
@@ -73,7 +78,8 @@ def main(arguments: list[str] | None = None) -> None:
         ratio = processor / steps[REFERENCE].processor
         sys.stdout.write(f"{name:{width}}  {1000 * clock:12.1f}  {1000 * processor:9.1f}  {ratio:15.2f}\n")
     load = os.getloadavg()
-    sys.stdout.write(f"Batches of {options.batch_size}; load averages over 1, 5 and 15 minutes: {load}\n")
+    averages = ", ".join(f"{average:.1f}" for average in load)
+    sys.stdout.write(f"Batches of {options.batch_size}; load averages over 1, 5 and 15 minutes: {averages}\n")
     if options.json:
         contents = {"steps": {name: step._asdict() for name, step in steps.items()}, "load": load}
         options.json.write_text(json.dumps(contents, indent=2) + "\n")

@@ -17,7 +17,7 @@ from lerobot_deltaco.common.cores import available_cores
 from lerobot_deltaco.data.collection import collect
 from lerobot_deltaco.data.collection_plan import CollectionPlan
 
-# What takes long to import is imported where it is used: the workers of the collection import this file.
+# What takes long to import is imported where it is used: the workers of the collection import it, too.
 PLAN = CollectionPlan("0-15", episodes_per_task=4)
 LANGUAGE_ENCODER = "all-MiniLM-L6-v2"
 STEP_TIMES = Path(__file__).with_name("step_times.py")
@@ -56,7 +56,7 @@ class SmallTrainings:
 
         Args:
             policy: Options of the policy, beside those that all of these trainings have.
-            batch_size: Samples in each step of a process.
+            batch_size: Samples in each step of a process, a multiple of 16.
             steps: Number of measured steps.
             launcher: Arguments of Python that start the processes; none for one process.
         """
