@@ -1,0 +1,78 @@
+"""The settings that scenes are drawn and observed with, as one value."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from gym_deltaco import EPISODE_STEPS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE
+from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, select_objects
+from gym_deltaco.tasks import get_task
+
+AMBIGUITIES = ("container", "object")
+ADVERSARIAL_DRAWS = ("each", "scene")
+MAX_EPISODE_LENGTH = 100_000
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Settings of the benchmark's scenes; the defaults are the benchmark's.
+
+    Args:
+        ambiguity: "container", the paper's scheme (i): the instruction is clear, and a demonstration alone
+            leaves open which container is meant. "object", scheme (ii): the target has an identical twin, and
+            only a demonstration tells which of the two is meant.
+        objects: Objects that scenes are made of: "all", the paper's 32; "scenario_a_train", without the 8
+            test objects; or "random:N", the 24 training objects and N - 24 random ones.
+        adversarial_probability: Probability that a distractor shares the target's color or shape, 0..1. It is
+            0.6 in the paper's data; with 0, distractors are uniform.
+        adversarial_draw: Scope of a draw with that probability: "each" distractor; or "scene", both
+            distractors of a scene, as in the authors' code.
+        image_size: Height and width of the policy's image, px.
+        episode_length: Number of steps of an episode.
+
+    Raises:
+        ValueError: A setting is invalid; the message says what is valid.
+    """
+
+    ambiguity: str = "container"
+    objects: str = "all"
+    adversarial_probability: float = ADVERSARIAL_PROBABILITY
+    adversarial_draw: str = "each"
+    image_size: int = 48
+    episode_length: int = EPISODE_STEPS
+
+    def __post_init__(self) -> None:
+        for name, valid in (("ambiguity", AMBIGUITIES), ("adversarial_draw", ADVERSARIAL_DRAWS)):
+            if getattr(self, name) not in valid:
+                raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
+        select_objects(self.objects)
+        probability = self.adversarial_probability
+        if (
+            isinstance(probability, bool)
+            or not isinstance(probability, (int, float))
+            or not 0 <= probability <= 1
+        ):
+            raise ValueError(f"`adversarial_probability` must be between 0 and 1. Got {probability!r}.")
+        ranges = {"image_size": (MIN_IMAGE_SIZE, MAX_IMAGE_SIZE), "episode_length": (1, MAX_EPISODE_LENGTH)}
+        for name, (low, high) in ranges.items():
+            number = getattr(self, name)
+            if type(number) is not int or not low <= number <= high:
+                raise ValueError(f"`{name}` must be an integer from {low} to {high}. Got {number!r}.")
+
+    def check_tasks(self, task_ids: Iterable[int]) -> None:
+        """Checks that the objects include one that each task asks for.
+
+        Args:
+            task_ids: Indices of tasks.
+
+        Raises:
+            ValueError: A task does not exist, or asks for none of the objects.
+        """
+        labels = select_objects(self.objects)
+        for task in {task.row: task for task in map(get_task, task_ids)}.values():
+            if not any(task.describes(label) for label in labels):
+                raise ValueError(
+                    f"Task {task.index} asks for a {task.object_phrase}, of which the objects "
+                    f"{self.objects!r} have none. Choose other tasks, or other `objects`."
+                )
