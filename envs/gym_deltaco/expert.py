@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco import EPISODE_STEPS, EXPERT_NOISE
+from gym_deltaco import EXPERT_NOISE
 from gym_deltaco.arm import FINGERTIP_OFFSET
 from gym_deltaco.env import ACTION_SCALE, Observation, PickPlaceEnv
 from gym_deltaco.workspace import CONTAINER_FLOOR, CONTAINER_HALF_EXTENTS, TRAY_FLOOR
@@ -72,7 +72,7 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EX
     observation, _ = env.reset(seed=seed, options={"task_id": task_id})
     # A stream of its own: the expert's draws must not repeat those of the scene.
     expert = Expert(env, np.random.default_rng((seed, 1)), noise)
-    for _ in range(EPISODE_STEPS):
+    for _ in range(env.scene_config.episode_length):
         action = expert.act()
         next_observation, reward, _, _, info = env.step(action)
         yield Step(observation, action, reward, info, expert.stage)

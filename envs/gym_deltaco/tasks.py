@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from types import MappingProxyType
 from typing import Literal
 
@@ -305,30 +306,25 @@ TASK_SETS = MappingProxyType(
 
 
 def is_task(index: int) -> bool:
-    """Whether there is a task of an index."""
+    """Returns whether a task of an index exists."""
     return 0 <= index < N_TASKS or index in _PAIR_TASKS
 
 
 def get_task(index: int) -> Task:
-    """The task of an index.
+    """Returns the task of an index.
 
     Args:
-        index: 0..299 for the paper's tasks, 1000..1479 for those by color and shape.
+        index: 0..299 for the paper's tasks, 1000..1479 for tasks by color and shape.
 
     Raises:
-        ValueError: There is no task of that index.
+        ValueError: The index is not an integer, or out of range.
     """
-    try:
-        number = int(index)
-        is_valid = number == index and is_task(number)
-    except (TypeError, ValueError, OverflowError):
-        is_valid = False
-    if not is_valid:
+    if isinstance(index, bool) or not isinstance(index, Integral) or not is_task(int(index)):
         raise ValueError(
-            f"`task_id` must be an integer from 0 to {N_TASKS - 1}. Got {index!r}. Tasks by color and shape "
-            f"are {_PAIR_TASKS.start} to {_PAIR_TASKS.stop - 1}."
+            f"`task_id` must be an integer from 0 to {N_TASKS - 1}, or from {_PAIR_TASKS.start} to "
+            f"{_PAIR_TASKS.stop - 1} for tasks by color and shape. Got {index!r}."
         )
-    return TASKS[number] if number < N_TASKS else Task(number)
+    return TASKS[int(index)] if index < N_TASKS else Task(int(index))
 
 
 def select_tasks(selection: str) -> tuple[int, ...]:
