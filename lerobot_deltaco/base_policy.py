@@ -173,8 +173,12 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     def _prepare_training(self) -> None:
         """Reads the training episodes, unless they are there."""
-        if self.training_bank is not None:
-            return
+        if self.training_bank is None:
+            # The loop's mixed precision is not for what is fitted to them.
+            with torch.autocast(self.step.device.type, enabled=False):
+                self._read_training_data()
+
+    def _read_training_data(self) -> None:
         if self._meta is None:
             raise ValueError("A policy is trained with its dataset's metadata. Pass them as `dataset_meta`.")
         frames = getattr(self._meta, "frames_in_memory", None)

@@ -245,6 +245,23 @@ class RobotData(NamedTuple):
     spans: list[tuple[int, int]]
 
 
+def check_dataset_folder(option: str, root: str | Path | None) -> None:
+    """Checks that a folder holds a dataset, if the Hub is off. (LeRobot would make the folder.)
+
+    Args:
+        option: Command-line option that names the folder, for the error.
+        root: The folder; None for LeRobot's cache.
+
+    Raises:
+        FileNotFoundError: It holds none.
+    """
+    if root is not None and constants.HF_HUB_OFFLINE and not (Path(root) / "meta/info.json").exists():
+        raise FileNotFoundError(
+            f"{option} is {root}, but there is no dataset: meta/info.json is missing. Check the spelling. "
+            "(HF_HUB_OFFLINE is set, so nothing can be downloaded into it.)"
+        )
+
+
 def open_dataset(option: str, repo_id: str, root: str | Path | None) -> LeRobotDataset:
     """Opens a dataset of demonstrations.
 
@@ -254,13 +271,9 @@ def open_dataset(option: str, repo_id: str, root: str | Path | None) -> LeRobotD
         root: Folder of the dataset; None for LeRobot's cache.
 
     Raises:
-        FileNotFoundError: The folder holds no dataset, and the Hub is off. (LeRobot would make the folder.)
+        FileNotFoundError: The folder holds no dataset, and the Hub is off.
     """
-    if root is not None and constants.HF_HUB_OFFLINE and not (Path(root) / "meta/info.json").exists():
-        raise FileNotFoundError(
-            f"{option} is {root}, but there is no dataset: meta/info.json is missing. Check the spelling. "
-            "(HF_HUB_OFFLINE is set, so nothing can be downloaded into it.)"
-        )
+    check_dataset_folder(option, root)
     return LeRobotDataset(repo_id, root=root, return_uint8=True)
 
 

@@ -110,7 +110,9 @@ def read_task_bank(
             name not in _DTYPES
             or (tensor.dtype, tensor.ndim) != (_DTYPES[name], _DIMS[name])
         ):  # fmt: skip
-            raise _error(path, f"it has the tensor `{name}` of {tensor.dtype} and shape {tuple(tensor.shape)}")
+            raise _error(
+                path, f"it has the tensor `{name}` of {tensor.dtype} and shape {tuple(tensor.shape)}"
+            )
     names, embeddings = texts.get("instructions"), tensors.get("embeddings")
     if known.get("language_encoder") != instructions.encoder_name:
         raise _error(
@@ -139,9 +141,7 @@ def _demonstrations(
 ) -> DemonstrationBank:
     frames, tasks, objects = tensors["frames"], texts.get("tasks"), texts.get("target_objects")
     if tuple(frames.shape[1:]) != frames_shape:
-        raise _error(
-            path, f"its demonstrations have the shape {tuple(frames.shape[1:])}, not {frames_shape}"
-        )
+        raise _error(path, f"its demonstrations have the shape {tuple(frames.shape[1:])}, not {frames_shape}")
     rows = {name: len(tensor) for name, tensor in tensors.items() if name != "embeddings"}
     if not _are_strings(tasks) or not tasks or set(rows.values()) != {len(tasks)} or "episodes" not in rows:
         raise _error(path, f"its demonstrations differ in number: {rows}")
@@ -151,7 +151,9 @@ def _demonstrations(
     states = tensors.get("pick_states")
     if states is not None:
         if states.shape[1] != state_dim or bool(states.isinf().any()):
-            raise _error(path, f"its grasps have {states.shape[1]} numbers, and the robot's state {state_dim}")
+            raise _error(
+                path, f"its grasps have {states.shape[1]} numbers, and the robot's state {state_dim}"
+            )
         bank.pick_states = states
     if "features" in tensors:
         if not bool(tensors["features"].isfinite().all()):
@@ -165,4 +167,6 @@ def _are_strings(value: Any) -> bool:
 
 
 def _error(path: Path, reason: str) -> TaskBankError:
-    return TaskBankError(f"The task bank {path} cannot be used: {reason}. Save or fetch the checkpoint again.")
+    return TaskBankError(
+        f"The task bank {path} cannot be used: {reason}. Save or fetch the checkpoint again."
+    )

@@ -241,5 +241,3 @@ class DeltacoConfig(TaskConditionedConfig):
     def get_scheduler_preset(self) -> CosineSchedulerConfig | None:
         """Returns the schedule of the learning rate; None is a constant."""
         return None if self.scheduler_name == "constant" else super().get_scheduler_preset()
-
-

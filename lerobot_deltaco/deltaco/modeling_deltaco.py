@@ -136,7 +136,9 @@ class DeltacoPolicy(TaskConditionedPolicy):
             demo = self._embed_training_demonstrations(batch["episode_index"], tasks, generator)
         if config.uses_language:
             # With paraphrases, one is drawn for each task, and one for each sample.
-            known = self._embed_instructions(self._draw_instructions(list(distinct), generator), images.device)
+            known = self._embed_instructions(
+                self._draw_instructions(list(distinct), generator), images.device
+            )
             language = known[column]
             if self.paraphrases is not None:
                 language = self._embed_instructions(self._draw_instructions(tasks, generator), images.device)
@@ -260,7 +262,9 @@ class DeltacoPolicy(TaskConditionedPolicy):
             frames = torch.stack([shown.frames for shown in present]).to(device)
             embedded = self.demo_encoder(sample_frames(frames, self.config.n_demo_frames, generator))
         found = iter(embedded)
-        return torch.stack([torch.zeros_like(embedded[0]) if shown is None else next(found) for shown in first])
+        return torch.stack(
+            [torch.zeros_like(embedded[0]) if shown is None else next(found) for shown in first]
+        )
 
     def _embed_training_demonstrations(
         self, episodes: Tensor, tasks: Sequence[str], generator: torch.Generator

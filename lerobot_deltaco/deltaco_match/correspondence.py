@@ -94,7 +94,10 @@ class CorrespondenceNetwork(nn.Module):
         self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
         if picks_by_demonstration or places_by_demonstration:
             self.attend = nn.Sequential(
-                conv_norm_relu(6, 32, 5, 2), conv_norm_relu(32, 32), conv_norm_relu(32, 32), nn.Conv2d(32, 2, 1)
+                conv_norm_relu(6, 32, 5, 2),
+                conv_norm_relu(32, 32),
+                conv_norm_relu(32, 32),
+                nn.Conv2d(32, 2, 1),
             )
         self.weigh: nn.Module | None = None
         if not picks_by_demonstration or takes_either:

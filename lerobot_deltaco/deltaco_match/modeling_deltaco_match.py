@@ -285,9 +285,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         losses = [location_loss(maps, locations), height_losses[:, None], attention_losses[:, None]]
         return torch.where(found[:, None], torch.cat(losses, dim=1), 0.0)
 
-    def _validation_loss(
-        self, batch: dict[str, Any], tasks: list[str]
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def _validation_loss(self, batch: dict[str, Any], tasks: list[str]) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the imitation loss; locations of episodes that are held back are found in the image."""
         known = self.training_locations
         assert known is not None
@@ -472,16 +470,12 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         offsets = self.robot_states(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
 
-    def _draw_given(
-        self, n_samples: int, generator: torch.Generator, device: torch.device
-    ) -> Given | None:
+    def _draw_given(self, n_samples: int, generator: torch.Generator, device: torch.device) -> Given | None:
         """Draws which inputs training samples have; None for all that the policy takes."""
         if not self.config.takes_either:
             return None
         draws = torch.rand(n_samples, generator=generator).to(device)
-        return Given(
-            draws >= self.config.p_drop_demonstration, draws < 1 - self.config.p_drop_instruction
-        )
+        return Given(draws >= self.config.p_drop_demonstration, draws < 1 - self.config.p_drop_instruction)
 
     # Training data
 
@@ -508,9 +502,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         zero_and_one = torch.stack([torch.zeros(states.shape[1]), torch.ones(states.shape[1])])
         shift, end = self._normalized(zero_and_one).to(device)
         is_arm = ~follows_gripper(states, gripper, robot_data.spans)
-        known = self.robot_states.fit(
-            keyframes, frames[:, 0], frames[:, -1], end - shift, shift, is_arm
-        )
+        known = self.robot_states.fit(keyframes, frames[:, 0], frames[:, -1], end - shift, shift, is_arm)
         self.training_locations = known
         self.training_bank.pick_states = keyframes.pick_states
         matching = self.feature_matching
