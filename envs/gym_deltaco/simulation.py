@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from gym_deltaco.camera import Camera
-from gym_deltaco.quiet_pybullet import pybullet
+from gym_deltaco.pybullet_import import pybullet
 from gym_deltaco.solids import Mesh
 
 TIME_STEP = 1 / 240  # s
