@@ -22,8 +22,6 @@ OBJECT_SETS = MappingProxyType(
     }
 )
 MAX_OBJECTS = 10_000
-# Number of valid object indices, random objects included
-N_INDICES = FIRST_INDEX + MAX_OBJECTS - len(OBJECT_SETS["scenario_a_train"])
 # Default objects of task sets whose scenes are not drawn from all objects
 _OBJECTS_OF_TASK_SETS = MappingProxyType({"scenario_a_clean_train": "scenario_a_train"})
 
