@@ -82,12 +82,14 @@ class Outcome(NamedTuple):
     Attributes:
         episode: The episode.
         info: Info of the environment after the last step.
-        demonstrations: The demonstrations that the policy received.
+        demonstration_episodes: Episodes of the demonstrations that the policy received, in their dataset.
+        demonstrated_objects: Indices of the objects that they move.
     """
 
     episode: Episode
     info: Mapping[str, Any]
-    demonstrations: Sequence[Demonstration]
+    demonstration_episodes: list[int]
+    demonstrated_objects: list[int]
 
 
 # Called after the reset and after each step with the environments of a batch and their observations.
@@ -156,7 +158,16 @@ class Evaluation:
         demonstrations = [self._demonstrations(episode) for episode in batch]
         with self._computing(batch):
             infos = run_episodes(self.loaded, self.simulators, batch, demonstrations, callback)
-        return [Outcome(*parts) for parts in zip(batch, infos, demonstrations, strict=True)]
+        # Without the demonstrations' tensors, which are not to pass from process to process.
+        return [
+            Outcome(
+                episode,
+                info,
+                [each.episode for each in given if each.episode is not None],
+                [each.target_object for each in given if each.target_object is not None],
+            )
+            for episode, info, given in zip(batch, infos, demonstrations, strict=True)
+        ]
 
     def _demonstrations(self, episode: Episode) -> list[Demonstration]:
         """Returns the demonstrations of an episode: the trials of a task use those of the task in turn."""
@@ -352,16 +363,14 @@ def evaluate(
 def _row(outcome: Outcome) -> dict[str, Any]:
     episode, info = outcome.episode, outcome.info
     template = get_task(episode.task_id).instruction
-    objects = [each.target_object for each in outcome.demonstrations if each.target_object is not None]
-    episodes = [each.episode for each in outcome.demonstrations if each.episode is not None]
     return {
         "task_id": episode.task_id,
         "trial": episode.trial,
         "success": bool(info["is_success"]),
         "instruction": None if episode.instruction == template else episode.instruction,
         "demonstration_task": episode.demonstration_task,
-        "demonstration_episodes": episodes,
-        "demonstrated_objects": objects,
+        "demonstration_episodes": outcome.demonstration_episodes,
+        "demonstrated_objects": outcome.demonstrated_objects,
         "grasped_object": int(info["grasped_object"]),
         "object_containers": info["object_containers"].tolist(),
         "right_object": bool(info["right_object"]),
