@@ -14,7 +14,7 @@ from huggingface_hub import ModelCard, ModelCardData
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_deltaco.cards.templates import env_options, render
+from lerobot_deltaco.card_templates import env_options, render
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.policy.language.encoder_names import LANGUAGE_ENCODERS
 from lerobot_deltaco.policy.options import Conditioning
