@@ -176,7 +176,7 @@ class Summary:
         )
 
 
-def collect(root: Path, plan: CollectionPlan, workers: int) -> Summary:
+def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
     """Collects a dataset, or continues an interrupted collection of the same plan.
 
     Args:
@@ -215,8 +215,8 @@ def collect(root: Path, plan: CollectionPlan, workers: int) -> Summary:
         ) from None
     except OSError as error:
         raise CollectionError(
-            f"Cannot write to {root}: {error.strerror or error}. Finished shards are kept: run the same command "
-            "again when the folder can be written to."
+            f"Cannot write to {root}: {error.strerror or error}. Finished shards are kept: run the same "
+            "command again when there is space and the folder can be written to."
         ) from None
     return _summary(root, speed)
 
@@ -309,17 +309,17 @@ def _summary(root: Path, episodes_per_s: float | None) -> Summary:
 
 def _check_folder(root: Path, plan: CollectionPlan) -> None:
     if not (root / DESCRIPTION_FILE).exists():
-        others = sorted(path.name for path in root.iterdir()) if root.exists() else []
-        if others:
-            raise CollectionError(f"{root} is not empty ({', '.join(others[:3])}). Name a new folder.")
+        found = next((path for path in root.rglob("*") if path.is_file()), None)
+        if found is not None:
+            raise CollectionError(f"{root} is not empty: it holds {found.name}. Name a new folder.")
         return
-    found, wanted = (_flat(description) for description in (read_description(root), _description(plan)))
+    begun, wanted = (_flat(description) for description in (read_description(root), _description(plan)))
     # A finished dataset stays what it is when packages are updated.
     ignored = ("benchmark", "renderer") if is_finished(root) else ()
     differences = [
-        f"{name}: {found.get(name)} there, {value} now"
+        f"{name}: {begun.get(name)} there, {value} now"
         for name, value in wanted.items()
-        if found.get(name) != value and name not in ignored
+        if begun.get(name) != value and name not in ignored
     ]
     if differences:
         raise CollectionError(
@@ -457,6 +457,7 @@ def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, numbe
         if not info["is_success"]:
             continue
         n_steps = len(steps)
+        assert n_steps == plan.scene.episode_length  # on which the indices of all frames depend
         privileged = (task_id, info["objects"][info["target_object"]], info["target_container"], seed)
         return {
             "observation.image": np.stack([step.observation["pixels"] for step in steps]),

@@ -12,9 +12,9 @@ from typing import Any
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
 from gym_deltaco.instructions import INSTRUCTION_SPLITS
+from lerobot_deltaco.collect import ACTION_NAMES
 from lerobot_deltaco.common.checks import check_choices
 from lerobot_deltaco.common.typed_fields import check_field_types, check_ranges
-from lerobot_deltaco.collect import ACTION_NAMES
 from lerobot_deltaco.lerobot_internals import log_refusals
 from lerobot_deltaco.policy.language.encoder_names import DEFAULT_LANGUAGE_ENCODER, LANGUAGE_ENCODERS
 from lerobot_deltaco.policy.optimization import CosineSchedulerConfig, FusedAdamWConfig

@@ -1,9 +1,9 @@
 """Writes the files of a LeRobotDataset v3, one shard at a time.
 
 LeRobot's own writer takes 60 to 120 ms for an episode and cannot be shared by processes. Here, a shard is one
-data file and one file of episode metadata with the same number. Shards are independent of each other, so that
-processes can write them side by side; `write_metadata` then completes the dataset. This module imports neither
-LeRobot nor torch, which would take every worker process 10 s; the tests compare the result with LeRobot's.
+data file and one file of episode metadata with the same number. Processes write shards side by side, and
+`write_metadata` then completes the dataset. This module imports neither torch nor LeRobot, which would take
+every worker process 10 s; the tests compare the result with LeRobot's.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
-from lerobot_deltaco.policy_card import policy_card
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.modeling.checkpoint_files import (
     check_loaded_weights,
@@ -76,6 +75,7 @@ from lerobot_deltaco.policy.task_file import (
     read_task_file,
     write_task_file,
 )
+from lerobot_deltaco.policy_card import policy_card
 
 
 class DeltacoPolicy(PreTrainedPolicy):

@@ -1,0 +1,237 @@
+"""A dataset's card, and the way to the Hub and back, with real clients and a fake Hub."""
+
+import json
+import re
+import shlex
+import shutil
+from itertools import batched
+
+import pytest
+from fake_hub import USER, WITHOUT_CARD_CHECK, FakeHub, Repo
+from fresh_python import run_python
+from huggingface_hub import DatasetCard
+from PIL import Image
+
+from gym_deltaco.env import ACTION_SCALE
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.tasks import OBJECTS, SCENARIOS, TASKS
+from lerobot_deltaco import hub as hub_module
+from lerobot_deltaco.cards import CARD_FILE, TASKS_IMAGE, dataset_card, write_dataset_card
+from lerobot_deltaco.collect import CollectionPlan, collect
+from lerobot_deltaco.dataset_writer import INFO_FILE
+from lerobot_deltaco.hub import HubError, check_push, push
+
+REPO_ID = f"{USER}/three.tasks"
+KEY = "dataset", REPO_ID
+PLAN = CollectionPlan("4,32,90", 4)
+
+PUSH = """
+import sys
+from pathlib import Path
+from lerobot_deltaco.hub import HubError, push
+try:
+    print(push(Path(sys.argv[1]), sys.argv[2], private=sys.argv[3] == "private", branch=sys.argv[4] or None))
+except HubError as error:
+    sys.exit(str(error))
+"""
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """A dataset of one task of each kind."""
+    root = tmp_path_factory.mktemp("dataset")
+    collect(root, PLAN)
+    return root
+
+
+@pytest.fixture
+def copy(dataset, tmp_path):
+    return shutil.copytree(dataset, tmp_path / "copy")
+
+
+@pytest.fixture(scope="module")
+def hub():
+    with FakeHub() as hub:
+        yield hub
+
+
+def run_push(hub, home, root, private="", branch=""):
+    # The card's check goes to a fixed address of the real Hub.
+    program, environment = WITHOUT_CARD_CHECK + PUSH, hub.environment(home)
+    return run_python(program, root, REPO_ID, private, branch, env=environment)
+
+
+# The card
+
+
+def test_metadata_are_what_the_hub_searches(dataset):
+    text = dataset_card(dataset)
+    assert text.startswith("---\n")
+    card = DatasetCard(text)
+    assert card.data.license == "apache-2.0"
+    assert card.data.task_categories == ["robotics"]
+    assert {"LeRobot", "deltaco", "gym_deltaco"} <= set(card.data.tags)
+    assert "4,32,90" in card.data.pretty_name
+    (config,) = card.data.configs
+    assert set(dataset.glob(config["data_files"])) == set((dataset / "data").rglob("*.parquet"))
+
+
+def test_card_describes_every_column(dataset):
+    features = json.loads((dataset / INFO_FILE).read_text())["features"]
+    rows = dict(re.findall(r"^\| `([\w.]+)` \|(.+)$", dataset_card(dataset), re.MULTILINE))
+    assert list(rows) == list(features)
+    for name, feature in features.items():
+        dtype, shape, what, *_ = (cell.strip() for cell in rows[name].split("|"))
+        assert dtype == feature["dtype"]
+        assert re.findall(r"\d+", shape) == [str(size) for size in feature["shape"]]
+        assert what
+        assert all(f"`{dimension}`" in what for dimension in feature["names"] or [])
+    assert f"in units of {ACTION_SCALE} m" in rows["action"]
+
+
+def test_card_counts_tasks_and_successes(dataset):
+    card = dataset_card(dataset)
+    counts = dict(re.findall(r"^\| (\w+) \| (\d+) \| Put ", card, re.MULTILINE))
+    assert counts == {"name": "1", "color": "1", "shape": "1"}
+    for task_id in PLAN.task_ids:
+        assert TASKS[task_id].instruction in card
+    assert "| A | 2 of 198 | 1 of 102 |" in card
+    rates = re.findall(r"^\| (\w+) \| (\d+) \| (\d+) \| ([\d.]+)% \|$", card, re.MULTILINE)
+    assert {kind: int(kept) for kind, _, kept, _ in rates} == {"name": 4, "color": 4, "shape": 4}
+    for _, attempts, kept, rate in rates:
+        assert float(rate) == pytest.approx(100 * int(kept) / int(attempts), abs=0.05)
+
+
+def test_command_in_the_card_makes_the_same_plan(dataset):
+    command = re.search(r"^deltaco collect --root DIR (.+)$", dataset_card(dataset), re.MULTILINE)[1]
+    words = batched(shlex.split(command), 2)
+    options = {name.removeprefix("--").replace("-", "_"): value for name, value in words}
+    scene = {n.removeprefix("scene."): options.pop(n) for n in [*options] if n.startswith("scene.")}
+
+    def typed(cls, values):
+        return {name: type(getattr(cls, name, ""))(value) for name, value in values.items()}
+
+    options = typed(PLAN, options)
+    assert CollectionPlan(**options, scene=SceneConfig(**typed(PLAN.scene, scene))) == PLAN
+
+
+def test_remarks_on_test_objects_are_true(dataset):
+    assert [label.index for label in OBJECTS if label.color == "yellow"] == [29]
+    train = [TASKS[task].targets for task in SCENARIOS["a"].train_tasks]
+    assert sum(targets == (29,) for targets in train) == 6
+    assert {target for targets in train for target in targets} == {*range(24), 29}
+    assert len([task for task in SCENARIOS["a"].test_tasks if TASKS[task].row == 29]) == 6
+    card = " ".join(dataset_card(dataset).split())
+    assert "Object 29, the two layered lampshade, is the only yellow one" in card
+    assert "target of the six yellow training tasks" in card
+    assert "every split draws its scenes from all 32 objects" in card
+    assert "A frame in which the gripper opens or closes lasts 75 physics steps" in card
+
+
+def test_card_of_other_scenes_says_so(dataset, copy):
+    usual = dataset_card(dataset)
+    for absent in ("--env.image_size", "--env.ambiguity", "--env.objects", "One draw decides", "identical"):
+        assert absent not in usual
+    path = copy / "meta/deltaco.json"
+    origin = json.loads(path.read_text())
+    origin["plan"]["scene"] |= {
+        **{"ambiguity": "object", "objects": "scenario_a_train", "adversarial_probability": 0.2},
+        **{"adversarial_draw": "scene", "image_size": 64},
+    }
+    path.write_text(json.dumps(origin))
+    card = " ".join(dataset_card(copy).split())
+    assert "two of the objects are identical" in card
+    assert "Scenes are made of the objects `scenario_a_train`" in card
+    assert "Test objects are visible" not in card
+    assert "with probability 0.2** instead of the paper's 0.6" in card
+    assert "One draw decides for both distractors" in card
+    assert (
+        "--env.task=4 --env.image_size=64 --env.ambiguity=object --env.objects=scenario_a_train "
+        "--env.adversarial_probability=0.2 --env.adversarial_draw=scene --eval.n_episodes" in card
+    )
+
+
+def test_card_shows_the_tasks(copy):
+    write_dataset_card(copy)
+    assert re.findall(r"!\[.+\]\((.+)\)", (copy / CARD_FILE).read_text()) == [TASKS_IMAGE]
+    with Image.open(copy / TASKS_IMAGE) as image:
+        assert image.width > 3 * 256
+
+
+# The Hub
+
+
+def test_pushed_dataset_is_fetched_by_its_name(hub, copy, tmp_path):
+    # An earlier, larger dataset in the same repository.
+    earlier = hub.repos[KEY] = Repo("public")
+    earlier.commit("main", {"data/chunk-000/file-009.parquet": b"", "meta/notes.json": b"", "notes": b""})
+    earlier.tags["v3.0"] = earlier.branches["main"]
+    result = run_push(hub, tmp_path / "a", copy)
+    assert result.returncode == 0, result.stderr
+    assert f"{hub.url}/datasets/{REPO_ID}" in result.stdout
+
+    stored = hub.repos[KEY].files("v3.0")
+    local = {str(path.relative_to(copy)) for path in copy.rglob("*") if path.is_file()}
+    assert set(stored) - {".gitattributes"} == {*local, "notes"}
+    assert TASKS_IMAGE in stored
+    assert all(stored[name] == (copy / name).read_bytes() for name in local - {CARD_FILE})
+    assert stored[CARD_FILE].decode().strip() == dataset_card(copy, REPO_ID).strip()
+    assert f"visualize_dataset?path={REPO_ID}" in stored[CARD_FILE].decode()
+    assert hub.repos[KEY].tags["v3.0"] == hub.repos[KEY].branches["main"]
+
+    example = re.search(r"```python\n(.+?)```", dataset_card(copy, REPO_ID), re.DOTALL)[1]
+    compare = f"""{example}
+import sys, torch
+local = LeRobotDataset("any/name", root=sys.argv[1])
+assert len(dataset) == len(local) == 360
+for fetched, kept in zip(dataset, local, strict=True):
+    assert fetched.keys() == kept.keys()
+    for name, value in kept.items():
+        assert torch.equal(fetched[name], value) if torch.is_tensor(value) else fetched[name] == value, name
+"""
+    result = run_python(compare, copy, env=hub.environment(tmp_path / "b"))
+    assert result.returncode == 0, result.stderr
+    assert TASKS[4].instruction in result.stdout
+
+
+def test_private_repository_and_branch(copy, tmp_path):
+    with FakeHub() as hub:
+        result = run_push(hub, tmp_path, copy, "private", "draft")
+        assert result.returncode == 0, result.stderr
+        repo = hub.repos[KEY]
+    assert repo.visibility == "private"
+    assert not repo.tags
+    assert not repo.files("main")
+    assert {CARD_FILE, INFO_FILE} <= set(repo.files("draft"))
+
+
+def test_push_that_the_hub_refuses_is_one_line(copy, tmp_path):
+    with FakeHub() as hub:
+        hub.refused = "POST /api/datasets/.*/commit/"
+        result = run_push(hub, tmp_path, copy)
+    assert result.returncode == 1
+    *_, last = result.stderr.splitlines()
+    assert last.startswith(f"Cannot push to {REPO_ID}: ")
+    assert last.endswith("A push can be repeated.")
+
+
+def test_invalid_repository_id_is_refused(monkeypatch):
+    monkeypatch.setattr(hub_module, "get_token", lambda: "token")
+    for repo_id in ("", "name", "a/b/c", "user/", "us er/name", "u/na--me", "u/" + 97 * "n"):
+        with pytest.raises(HubError, match=r"must be USER/NAME. Got ") as info:
+            check_push(repo_id)
+        assert repr(repo_id) in str(info.value)
+        assert "\n" not in str(info.value)
+    for repo_id in ("user/name", "a-b/c_d.E1"):
+        check_push(repo_id)
+
+
+def test_push_needs_a_token_and_a_finished_dataset(copy, monkeypatch, tmp_path):
+    monkeypatch.setattr(hub_module, "get_token", lambda: None)
+    with pytest.raises(HubError, match="Set HF_TOKEN to a token with write access"):
+        push(copy, REPO_ID)
+    monkeypatch.setattr(hub_module, "get_token", lambda: "token")
+    (copy / INFO_FILE).unlink()
+    for root in (copy, tmp_path / "missing"):
+        with pytest.raises(HubError, match=f"{root} holds no finished dataset of `deltaco collect`"):
+            push(root, REPO_ID)
