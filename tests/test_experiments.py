@@ -152,9 +152,9 @@ def test_layers_add_up():
     assert read_recipe("ambiguity_object/deltaco").evaluation.scene.ambiguity == "object"
     own = read_recipe(
         "random_objects/deltaco_match",
-        settings=["data.scene.objects=random:50", "policy.optimizer_lr=1e-4", "policy.demo_episodes=[1, 2]"],
+        settings=["data.scene.objects=random:200", "policy.optimizer_lr=1e-4", "policy.demo_episodes=[1, 2]"],
     )
-    assert (own.data.scene.objects, own.data.tasks) == ("random:50", "random_train")
+    assert (own.data.scene.objects, own.data.tasks) == ("random:200", "random_train")
     assert own.policy == {
         "type": "deltaco_match",
         "device": "cpu",
