@@ -4,13 +4,13 @@ import atexit
 import sys
 
 try:
-    # These register `--env.type=deltaco` and `--policy.type=deltaco`, and the steps of its processors.
-    import lerobot_deltaco.configuration_deltaco
-    import lerobot_deltaco.envs.configuration_env
-    import lerobot_deltaco.processor_deltaco  # noqa: F401
+    # These register `--env.type=deltaco`, and both policies with the steps of their processors.
+    import lerobot_deltaco.deltaco.configuration_deltaco
+    import lerobot_deltaco.deltaco_match.configuration_deltaco_match
+    import lerobot_deltaco.lerobot_env  # noqa: F401
 except Exception as error:
     problem = (
-        "lerobot_policy_deltaco could not be imported, so LeRobot does not know the type 'deltaco' "
+        "lerobot_policy_deltaco could not be imported, so LeRobot does not know its types "
         f"({type(error).__name__}: {error}). Install the project again, as its README says."
     )
     # LeRobot only logs the error, before hundreds of lines of usage. Let it also be the last thing to read.

@@ -1,1 +1,1 @@
-"""DeL-TaCo (Yu & Mooney, ICLR 2023) for LeRobot: what connects the benchmark `gym_deltaco` with LeRobot."""
+"""DeL-TaCo for LeRobot: the policies, and what collects, trains, evaluates and reports."""

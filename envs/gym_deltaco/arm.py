@@ -1,4 +1,4 @@
-"""The WidowX 250 in the simulation: what it looks like, what it touches with, and how it follows commands."""
+"""The WidowX 250 in the simulation: its links, collision boxes and motors."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from gym_deltaco import kinematics as kin
 from gym_deltaco.arm_meshes import BASE_MESH, LINK_MESHES
 from gym_deltaco.simulation import Box, Contact, Link, Simulation
 
-POSITION_LOW = np.array([0.4, -0.2, -0.34])  # m, limits of the end effector
+# Limits of the end effector's position
+POSITION_LOW = np.array([0.4, -0.2, -0.34])  # m
 POSITION_HIGH = np.array([0.8, 0.4, -0.1])  # m
-FINGER_OPEN = 0.037  # m, of each fingertip from the middle
+FINGER_OPEN = 0.037  # m, distance of each finger from the middle
 FINGER_CLOSED = 0.002  # m
-FINGERTIP_OFFSET = 0.05  # m, of the tips beyond the end effector
+FINGERTIP_OFFSET = 0.05  # m, from the end effector to the fingertips
 FINGER_THICKNESS = 0.007  # m
 FINGER_WIDTH = 0.024  # m
 
 MOVE_STEPS = 10  # physics steps of a control step
 GRIP_STEPS = 75  # physics steps of a control step in which the gripper opens or closes
-# Physics steps at the start of a control step, over which the joints' targets are interpolated
-_RAMP_STEPS = 10
+_RAMP_STEPS = 10  # physics steps over which the joints' targets are interpolated
 
 _ARM_JOINTS = list(range(6))
 _FINGER_JOINTS = [6, 7]
@@ -33,7 +33,7 @@ _SURFACE = Contact(lateral_friction=2.0, spinning_friction=0.02)
 
 
 def _finger(name: str, side: int) -> Link:
-    # The box lies outside its pad, which is at the joint's position.
+    # The box lies on the outer side of the pad, which is at the joint's position.
     middle = (FINGERTIP_OFFSET / 2, side * FINGER_THICKNESS / 2, 0.0)
     half_extents = (FINGERTIP_OFFSET / 2, FINGER_THICKNESS / 2, FINGER_WIDTH / 2)
     return Link(
@@ -77,7 +77,13 @@ _LINKS = (
 class Arm:
     """The arm in one scene of a simulation, with its gripper pointing down.
 
-    Only the gripper touches things: the links above it stay clear of the table in every pose that it takes.
+    Only the gripper has collision boxes: the links above it stay clear of the table in every pose.
+
+    Attributes:
+        body: Id of its body in the simulation.
+        joints: Angles of its six joints, (6,), rad.
+        position: Position of its end effector, (3,), m.
+        is_open: State of its gripper, as commanded.
     """
 
     finger_links = (6, 7)
@@ -94,11 +100,11 @@ class Arm:
         self._read()
 
     def command(self, position: ArrayLike, is_open: bool) -> None:
-        """Moves the end effector, and opens or closes the gripper; runs the physics of one control step.
+        """Runs one control step: moves the end effector, and opens or closes the gripper.
 
         Args:
-            position: Position to move to, (3,), m; clipped to the limits.
-            is_open: The gripper's state to reach or keep.
+            position: Target of the end effector, (3,), m; clipped to its limits.
+            is_open: Target state of the gripper.
         """
         goal = kin.inverse(np.clip(position, POSITION_LOW, POSITION_HIGH), near=self._joint_targets)
         start, self._joint_targets = self._joint_targets, goal
@@ -114,7 +120,7 @@ class Arm:
         self._read()
 
     def _read(self) -> None:
-        """Reads where the arm is: the angles of its six joints, (6,), rad, and its end effector, (3,), m."""
+        """Updates `joints` and `position` from the simulation."""
         self.joints = self._simulation.joint_positions(self.body, _ARM_JOINTS)
         self.position = kin.forward(self.joints)[0]
 
@@ -128,9 +134,12 @@ class Arm:
         )
 
 
-def _ramp(share: float) -> float:
-    """From 0 to 1, at rest at both ends, with the least acceleration: what is held shall not slip."""
-    return 2 * share**2 if share < 0.5 else 1 - 2 * (1 - share) ** 2
+def _ramp(time: float) -> float:
+    """Returns the fraction of a motion covered after a fraction of its time.
+
+    The motion starts and ends at rest, with the least acceleration, so that a held object does not slip.
+    """
+    return 2 * time**2 if time < 0.5 else 1 - 2 * (1 - time) ** 2
 
 
 _RAMP = np.array([_ramp(step / _RAMP_STEPS) for step in range(1, _RAMP_STEPS + 1)])

@@ -1,4 +1,4 @@
-"""What the WidowX 250 looks like: a low-poly sketch of its links, black and matte, each in its own frame."""
+"""Meshes of the WidowX 250: low-poly sketches of its links, matte black, each in the frame of its link."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gym_deltaco.solids import Color, Loft, Mesh, Row, merged, polygon
 _BLACK: Color = (0.13, 0.13, 0.14)
 _DARK: Color = (0.20, 0.20, 0.22)
 _GRAY: Color = (0.33, 0.33, 0.35)
-# A square with its corners cut off.
+# A square with its corners cut off
 _BEAM = np.array([(1, -0.6), (1, 0.6), (0.6, 1), (-0.6, 1), (-1, 0.6), (-1, -0.6), (-0.6, -1), (0.6, -1)])
 _ROUND = polygon(8)
 
@@ -17,23 +17,23 @@ _ROUND = polygon(8)
 def _beam(
     half_y: float, half_z: float, start: float, end: float, color: Color, outline: np.ndarray = _BEAM
 ) -> Mesh:
-    """A bar along x, from `start` to `end` (m)."""
+    """Returns a bar along x, from `start` to `end` (m)."""
     rows: list[Row] = [((half_z, half_y), start, color), ((half_z, half_y), end)]
     return Loft(outline, rows, tilt=90).mesh()
 
 
 def _column(half_x: float, half_y: float, bottom: float, top: float, color: Color, x: float = 0.0) -> Mesh:
-    """A bar along z, from `bottom` to `top` (m)."""
+    """Returns a bar along z, from `bottom` to `top` (m)."""
     return Loft(_BEAM, [((half_x, half_y), (x, 0, bottom), color), ((half_x, half_y), (x, 0, top))]).mesh()
 
 
 def _axle(radius: float, half_length: float, color: Color) -> Mesh:
-    """A motor's cylinder along y, about the joint."""
+    """Returns the cylinder of a motor, along y, about its joint."""
     return Loft(_ROUND, [(radius, -half_length, color), (radius, half_length)], tilt=90, turn=90).mesh()
 
 
 def _finger(side: int) -> Mesh:
-    """A finger whose pad is at y = 0, slimmer towards its tip at x = 0.05 m."""
+    """Returns a finger with its pad at y = 0, which narrows towards its tip at x = 0.05 m."""
     thick, thin = 0.0045, 0.003
     return Loft(
         np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]),

@@ -1,4 +1,4 @@
-"""Cameras, described without the simulator that renders what they see."""
+"""Cameras, independent of the simulator."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera that looks at a point; the image is square.
+    """A pinhole camera with a square image.
 
     Attributes:
-        target: The point in the center of the image, (x, y, z), m.
+        target: Point in the center of the image, (x, y, z), m.
         distance: Distance from the target, m.
-        yaw: Angle about the vertical axis, degrees; 0 looks along +y.
-        pitch: Angle above the horizon, degrees; negative looks down.
+        yaw: Angle about the vertical axis, degrees; at 0, the camera looks along +y.
+        pitch: Angle above the horizon, degrees; negative when the camera looks down.
         fov: Vertical field of view, degrees.
         near: Distance of the near plane, m.
         far: Distance of the far plane, m.

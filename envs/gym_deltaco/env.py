@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping, Sequence
-from typing import Any, get_args
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from gym_deltaco import CONTROL_FPS, MIN_IMAGE_SIZE
+from gym_deltaco import CONTROL_FPS
 from gym_deltaco import kinematics as kin
-from gym_deltaco.instructions import check_instructions, check_tasks
-from gym_deltaco.layout import AMBIGUITIES, Ambiguity, sample_layout
-from gym_deltaco.object_sets import (
-    ADVERSARIAL_PROBABILITY,
-    AdversarialDraw,
-    check_scenes,
-    check_task,
-    select_objects,
-)
+from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene import Scene
+from gym_deltaco.scene_config import DEFAULT_SCENE, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, SceneConfig
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import Task, get_task
 
-ACTION_SCALE = 0.1  # m of the end effector's motion for an action of 1
+ACTION_SCALE = 0.1  # m, motion of the end effector for an action of 1
+STATE_NAMES = [
+    *("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate"),
+    *("end_effector_x", "end_effector_y", "end_effector_z", "gripper_open"),
+]
+ACTION_NAMES = ["delta_x", "delta_y", "delta_z", "gripper"]
 
-# Of `agent_pos`: joints are given within half a turn of the rest position; 0.001 is for rounding.
+# Bounds of `agent_pos`. Joints are within half a turn of their rest position; 0.001 allows for rounding.
 _STATE_LOW = np.array([*(kin.REST_JOINTS - np.pi), *(kin.SHOULDER - kin.REACH), 0.0]) - 1e-3
 _STATE_HIGH = np.array([*(kin.REST_JOINTS + np.pi), *(kin.SHOULDER + kin.REACH), 1.0]) + 1e-3
 
@@ -41,64 +40,68 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     ## Observation
 
-    | key         | shape     | dtype   | what                                                               |
+    | key         | shape     | dtype   | meaning                                                            |
     |-------------|-----------|---------|--------------------------------------------------------------------|
-    | `pixels`    | (H, W, 3) | uint8   | RGB of the front camera, H = W = `image_size`                      |
-    | `agent_pos` | (10,)     | float32 | 6 joints (rad), end effector's x, y, z (m), gripper (1 open)       |
+    | `pixels`    | (H, W, 3) | uint8   | RGB image of the front camera, H = W = `scene.image_size`          |
+    | `agent_pos` | (10,)     | float32 | 6 joint angles (rad), end effector's x, y, z (m), gripper (1 open) |
+
+    `STATE_NAMES` names the numbers of `agent_pos`.
 
     ## Action
 
-    | number | range   | what                                                                             |
+    | number | range   | meaning                                                                          |
     |--------|---------|----------------------------------------------------------------------------------|
     | 0..2   | -1 .. 1 | change of the end effector's position in x, y, z, in units of 0.1 m              |
-    | 3      | -1 .. 1 | the gripper: above 0 open, else closed                                           |
+    | 3      | -1 .. 1 | gripper: open above 0, else closed                                               |
 
-    A step is 10 physics steps of 1/240 s, or 75 when the gripper opens or closes. An episode has 30 steps
-    and is then truncated; it never terminates. The end effector stays within x .4..0.8, y -.2..0.4 and
-    z -.34..-.1 m.
+    `ACTION_NAMES` names them. The end effector stays within x 0.4..0.8, y -0.2..0.4 and z -0.34..-0.1 m, with
+    the gripper pointing down.
+
+    ## Time
+
+    A step is 10 physics steps of 1/240 s, or 75 when the gripper opens or closes. The frame rate of 24 Hz
+    (`render_fps`, and the timestamps of datasets, 1/24 s apart) is therefore nominal. The arm is also faster
+    than a real one: averaged over a step of the expert, joints turn at up to 16 rad/s (in 99 % of the steps
+    at less than 12.5 rad/s), those of a real WidowX 250 at about 3 rad/s.
+
+    An episode is truncated after `scene.episode_length` steps; it never terminates.
 
     ## Reward and success
 
-    The reward is 1 once the task has succeeded, else 0. It succeeds at a step at which the target object,
-    released and at rest, lies in the target container: its middle within the container's half extents, low
-    enough to stand on its floor.
+    The reward is 1 once the task has succeeded, else 0. The task succeeds at the first step after which the
+    target object, released and at rest, lies in the target container: its center within the container's half
+    extents in x and y, and low enough to stand on the container's floor.
 
     ## Info
 
-    Of every reset and step; objects and containers are numbered as they are in the scene, -1 is none.
+    `reset` and `step` return the same keys. Objects and containers are numbered by their position in the
+    scene; -1 means none.
 
-    | key                   | what                                                                         |
+    | key                   | meaning                                                                      |
     |-----------------------|------------------------------------------------------------------------------|
     | `is_success`          | whether the task has succeeded in this episode                               |
-    | `task_id`             | index of the task, 0..299, or 1000..1479 for those by color and shape        |
+    | `task_id`             | index of the task, 0..299, or 1000..1479 for tasks by color and shape        |
     | `objects`             | (3,) int64: indices of the objects in the scene; 0..31 are the paper's       |
-    | `object_containers`   | (3,) int64: the container in which each of them lies: 0 green, 1 red         |
-    | `container_quadrants` | (2, 2) int64: i (0 right, 1 left) and j (0 back, 1 front) of both            |
+    | `object_containers`   | (3,) int64: container in which each object lies, 0 green, 1 red              |
+    | `container_quadrants` | (2, 2) int64: i (0 right, 1 left) and j (0 back, 1 front) of both containers |
     | `target_object`       | number of the object that the task asks for                                  |
     | `target_container`    | number of the container that the task asks for                               |
-    | `grasped_object`      | number of the object that the gripper has held last                          |
-    | `right_object`        | whether that one is the target                                               |
-    | `right_container`     | whether something lies in the target container, and nothing in the other one |
+    | `grasped_object`      | number of the object that the gripper held last                              |
+    | `right_object`        | whether the grasped object is the target                                     |
+    | `right_container`     | whether an object lies in the target container, and none in the other one    |
 
     Args:
-        task_id: 0..299, or 1000..1479 for those by color and shape. `reset(options={"task_id": ...})`
-            changes it from then on.
-        ambiguity: "container", the paper's scheme (i), or "object", scheme (ii).
-        image_size: Height and width of `pixels`, at least 8.
+        task_id: Index of the task, 0..299, or 1000..1479 for tasks by color and shape.
+            `reset(options={"task_id": ...})` changes it from then on.
+        scene: Settings of the scenes: ambiguity scheme, objects, image size, episode length, ...
         render_mode: "rgb_array" or None.
-        render_size: Height and width of what `render` returns, for people to look at.
-        objects: Name of the set of objects that scenes are made of: "all", as in the paper;
-            "scenario_a_train", without the 8 test objects; or "random:N" (`gym_deltaco.object_sets`).
-        adversarial_probability: Probability that a distractor is drawn from the objects that share the
-            target's color or shape, 0..1; 0.6 as in the paper's data, 0 for uniform draws.
-        adversarial_draw: Scope of a draw with that probability: "each", one distractor; or "scene", both
-            distractors of a scene, as in the authors' code.
-        instructions: Sentences of each task, as `gym_deltaco.instructions.read_instructions` gives them. The
-            `task_description` of an episode is then one of its task's, drawn by the episode's seed; the scene
-            stays the same. By default, it is the benchmark's template.
+        render_size: Height and width of the images that `render` returns, 8..4096 px.
+        instructions: Sentences of each task. The `task_description` of an episode is then one of its task's
+            sentences, drawn by the episode's seed; the scene stays the same. By default, it is the
+            benchmark's template.
 
     Raises:
-        ValueError: An argument is out of its range; the message says what is valid.
+        ValueError: An argument is invalid; the message says what is valid.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_FPS}
@@ -106,54 +109,53 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     def __init__(
         self,
         task_id: int = 0,
-        ambiguity: Ambiguity = "container",
-        image_size: int = 48,
+        scene: SceneConfig = DEFAULT_SCENE,
         render_mode: str | None = None,
         render_size: int = 256,
-        objects: str = "all",
-        adversarial_probability: float = ADVERSARIAL_PROBABILITY,
-        adversarial_draw: AdversarialDraw = "each",
         instructions: Mapping[int, Sequence[str]] | None = None,
     ) -> None:
-        check_scenes([task_id], objects, adversarial_probability, adversarial_draw)
-        self.objects = objects
-        self.task: Task = get_task(task_id)
-        if ambiguity not in AMBIGUITIES:
+        if not isinstance(scene, SceneConfig):
             raise ValueError(
-                f"`ambiguity` must be one of {', '.join(get_args(Ambiguity))}. Got {ambiguity!r}."
+                f"`scene` must be a `SceneConfig`, such as SceneConfig(image_size=96). Got {scene!r}."
             )
-        for name, size in (("image_size", image_size), ("render_size", render_size)):
-            if not isinstance(size, (int, np.integer)):
-                raise ValueError(f"`{name}` must be an integer. Got {size!r}.")
-            if size < MIN_IMAGE_SIZE:
-                raise ValueError(f"`{name}` must be at least {MIN_IMAGE_SIZE}. Got {size}.")
+        scene.check_tasks([task_id])
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"`render_mode` must be 'rgb_array' or None. Got {render_mode!r}.")
+        if type(render_size) is not int or not MIN_IMAGE_SIZE <= render_size <= MAX_IMAGE_SIZE:
+            raise ValueError(
+                f"`render_size` must be an integer from {MIN_IMAGE_SIZE} to {MAX_IMAGE_SIZE}. "
+                f"Got {render_size!r}."
+            )
         if instructions is not None:
-            check_instructions(instructions)
-        self.ambiguity: Ambiguity = ambiguity
-        self.adversarial_probability = adversarial_probability
-        self.adversarial_draw: AdversarialDraw = adversarial_draw
-        self.image_size = image_size
+            _check_instructions(instructions)
+        self.task: Task = get_task(task_id)
+        self.scene_config = scene
         self.render_mode = render_mode
         self.render_size = render_size
         self.instructions = instructions
         self._instruction: str | None = None  # of the current episode; None is the task's template
+        image_shape = (scene.image_size, scene.image_size, 3)
         self.observation_space: gym.Space[Any] = spaces.Dict(
             {
-                "pixels": spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
+                "pixels": spaces.Box(0, 255, image_shape, np.uint8),
                 "agent_pos": spaces.Box(
                     _STATE_LOW.astype(np.float32), _STATE_HIGH.astype(np.float32), dtype=np.float32
                 ),
             }
         )
-        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
-        # The simulator is connected at the first reset, so that a worker process has its own.
+        self.action_space = spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
+        # The simulator is connected at the first reset, so that each worker process has its own.
         self._simulation: Simulation | None = None
         self._scene: Scene | None = None
         self._is_closed = False
         self._is_success = False
         self._grasped_object = -1
+        self._n_steps = 0
+
+    @property
+    def _max_episode_steps(self) -> int:
+        """Number of steps of an episode, where LeRobot's rollout looks for it."""
+        return self.scene_config.episode_length
 
     @property
     def task_description(self) -> str:
@@ -165,7 +167,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         """The current scene, with its privileged state.
 
         Raises:
-            gymnasium.error.ResetNeeded: There is none yet.
+            gymnasium.error.ResetNeeded: The environment was not reset.
             gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """
         self._check_open()
@@ -179,16 +181,16 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         """Draws and builds a new scene.
 
         Args:
-            seed: Seed of `np_random`; None continues its draws.
-            options: "task_id": the task of this and the following episodes, 0..299, or 1000..1479 for those
-                by color and shape. Others are for wrappers.
+            seed: Seed of `np_random`; None continues its stream.
+            options: "task_id": index of the task of this and the following episodes, 0..299, or 1000..1479
+                for tasks by color and shape. Other keys are ignored.
 
         Returns:
             The first observation and info.
 
         Raises:
-            ValueError: There is no such task, the objects do not allow it, or `options` is no dictionary.
-            InstructionsError: The environment has `instructions`, but none for the task.
+            ValueError: The task does not exist, the objects or instructions have nothing for it, or `options`
+                is not a dictionary. The current scene stays.
             gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """
         self._check_open()
@@ -197,28 +199,23 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
                 f'`options` must be a dictionary, such as {{"task_id": 4}}, or None. Got {options!r}.'
             )
         task = get_task((options or {}).get("task_id", self.task.index))
-        check_task(task, self.objects)
-        if self.instructions is not None:
-            check_tasks(self.instructions, [task.index], "The environment")
+        self.scene_config.check_tasks([task.index])
+        if self.instructions is not None and task.index not in self.instructions:
+            raise ValueError(
+                f"`instructions` has no sentence for task {task.index} ({task.instruction!r}). Add one, or "
+                "choose another task."
+            )
         super().reset(seed=seed)
         # An interrupted reset leaves no scene, rather than half of one.
         self.task, self._scene, self._instruction = task, None, None
         if self._simulation is None:
             self._simulation = Simulation()
-        labels = select_objects(self.objects)
-        layout = sample_layout(
-            self.task,
-            self.ambiguity,
-            self.np_random,
-            labels,
-            self.adversarial_probability,
-            self.adversarial_draw,
-        )
-        self._scene = Scene(self._simulation, layout)
+        self._scene = Scene(self._simulation, sample_layout(task, self.scene_config, self.np_random))
         self._is_success = False
         self._grasped_object = -1
+        self._n_steps = 0
         if self.instructions is not None:
-            # A generator of its own, so that scenes are the same with and without.
+            # A generator of its own keeps scenes the same with and without instructions.
             (rng,) = self.np_random.spawn(1)
             sentences = self.instructions[task.index]
             self._instruction = sentences[int(rng.integers(len(sentences)))]
@@ -228,30 +225,35 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         """Moves the arm.
 
         Args:
-            action: (4,) in [-1, 1]; what lies beyond is clipped.
+            action: Real numbers, (4,); clipped to [-1, 1].
 
         Returns:
-            Observation, reward (1.0 once the task has succeeded), terminated (False), truncated (False: the
-            30 steps are counted by gymnasium's `TimeLimit`), info.
+            Observation, reward (1.0 once the task has succeeded), terminated (False), truncated (True from
+            the last step of the episode on), info.
 
         Raises:
-            ValueError: The action has another shape, or a number that is not finite. The scene is unchanged.
+            ValueError: The action has another shape, or numbers that are not real or not finite. The scene
+                stays as it is.
+            gymnasium.error.ResetNeeded: The environment was not reset.
+            gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """
         scene = self.scene
-        motion, gripper = np.split(_validated(action), [3])
+        motion, gripper = np.split(_checked_action(action), [3])
         scene.command(scene.arm.position + ACTION_SCALE * motion, is_open=bool(gripper[0] > 0))
+        self._n_steps += 1
         for index in range(len(scene.bodies)):
             if scene.is_grasped(index):
                 self._grasped_object = index
         info = self._info()
-        return self._observation(), float(info["is_success"]), False, False, info
+        is_truncated = self._n_steps >= self.scene_config.episode_length
+        return self._observation(), float(info["is_success"]), False, is_truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The scene for people, (render_size, render_size, 3), or None without a render mode."""
+        """Returns an image of the scene, (render_size, render_size, 3) uint8; None without a render mode."""
         return None if self.render_mode is None else self.scene.render(self.render_size)
 
     def close(self) -> None:
-        """Frees the simulator. Closing twice is harmless."""
+        """Disconnects the simulator. Closing twice is harmless."""
         self._is_closed = True
         self._scene = None
         if self._simulation is not None:
@@ -266,10 +268,13 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     def _observation(self) -> Observation:
         arm = self.scene.arm
-        # The waist may turn around the base again and again, and the wrist with it.
+        # The waist, and the wrist with it, may turn around the base any number of times.
         joints = (arm.joints - kin.REST_JOINTS + np.pi) % (2 * np.pi) - np.pi + kin.REST_JOINTS
         state = np.concatenate([joints, arm.position, [arm.is_open]])
-        return {"pixels": self.scene.render(self.image_size), "agent_pos": state.astype(np.float32)}
+        return {
+            "pixels": self.scene.render(self.scene_config.image_size),
+            "agent_pos": state.astype(np.float32),
+        }
 
     def _info(self) -> dict[str, Any]:
         scene, layout = self.scene, self.scene.layout
@@ -294,10 +299,29 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         }
 
 
-def _validated(action: NDArray[np.float32]) -> NDArray[np.float64]:
-    values = np.asarray(action, dtype=np.float64)
-    if values.shape != (4,):
-        raise ValueError(f"An action must have shape (4,): x, y, z and the gripper. Got {values.shape}.")
-    if not np.isfinite(values).all():
-        raise ValueError(f"An action must be finite. Got {values}.")
-    return np.clip(values, -1.0, 1.0)
+def _checked_action(action: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Checks an action and clips it to [-1, 1]."""
+    values = np.asarray(action)
+    if values.shape != (len(ACTION_NAMES),):
+        raise ValueError(f"An action must have shape (4,): x, y, z and gripper. Got {values.shape}.")
+    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+        raise ValueError(f"An action must consist of real, finite numbers. Got {action!r}.")
+    return np.clip(values.astype(np.float64), -1.0, 1.0)
+
+
+def _check_instructions(instructions: Mapping[int, Sequence[str]]) -> None:
+    """Checks that instructions map task indices to one or more sentences each."""
+    valid = (
+        "`instructions` must be a dictionary from task indices to lists of sentences, such as "
+        '{4: ["Put it into the green bin."]}.'
+    )
+    if not isinstance(instructions, Mapping):
+        raise ValueError(f"{valid} Got {reprlib.repr(instructions)}.")
+    for task_id, sentences in instructions.items():
+        try:
+            get_task(task_id)
+        except ValueError as error:
+            raise ValueError(f"{valid} {error}") from None
+        is_list = isinstance(sentences, (list, tuple)) and len(sentences) > 0
+        if not is_list or not all(isinstance(sentence, str) and sentence.strip() for sentence in sentences):
+            raise ValueError(f"{valid} Got {reprlib.repr(sentences)} for task {task_id}.")

@@ -9,36 +9,37 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco import EPISODE_STEPS, EXPERT_NOISE
+from gym_deltaco import EXPERT_NOISE
 from gym_deltaco.arm import FINGERTIP_OFFSET
 from gym_deltaco.env import ACTION_SCALE, Observation, PickPlaceEnv
 from gym_deltaco.workspace import CONTAINER_FLOOR, CONTAINER_HALF_EXTENTS, TRAY_FLOOR
 
 OPEN, CLOSED = 1.0, -1.0
 
-# Heights and errors in m. The gripper's height is that of the end effector; the fingertips are 0.05 m below.
-_HOVER_Z = -0.215  # where the fingertips pass above every object
-_ALIGNED = np.array([0.013, 0.012])  # error in x and y within which the gripper comes down
-_STRADDLING = np.array([0.02, 0.03])  # error in x and y that is allowed once the gripper is down
-_AROUND = np.array([0.02, 0.014, 0.015])  # error in x, y and z within which it closes
-_PAD_HEIGHT = 0.010  # of the middle of the pads above the fingertips
-_TIP_CLEARANCE = 0.004  # of the fingertips above the tray
-_PALM_CLEARANCE = 0.012  # of the object's top below the end effector
-_CARRY_CLEARANCE = 0.085  # of a carried object's lowest point above the tray
-_LIFTED_CLEARANCE = 0.06  # height of its lowest point above the tray from which an object may be carried
-_CARRY_SPEED = 0.8  # length of the motion at the most; diagonally, a held object would slip at full speed
-_DROP_SHARE = 0.3  # of the container, about its middle, where the drop point is drawn
-_OVER_CONTAINER = np.array([0.035, 0.022])  # error in x and y within which the object is lowered and let go
-_RELEASE_CLEARANCE = 0.012  # of the object's lowest point above the container's floor when it is let go
-_RELEASE_TOLERANCE = 0.025  # error in z within which it is let go
-_RETREAT = 0.05  # of the gripper, upwards, after it has let go
+# Heights, distances and errors in m. Heights of the gripper are those of the end effector; the fingertips are
+# 0.05 m lower.
+_HOVER_Z = -0.215  # height of the gripper at which its fingertips pass above every object
+_ALIGNED = np.array([0.013, 0.012])  # largest error in x and y at which the gripper starts to descend
+_STRADDLING = np.array([0.02, 0.03])  # largest error in x and y once the gripper is down
+_AROUND = np.array([0.02, 0.014, 0.015])  # largest error in x, y and z at which it closes
+_PAD_HEIGHT = 0.010  # center of the finger pads above the fingertips
+_TIP_CLEARANCE = 0.004  # fingertips above the tray
+_PALM_CLEARANCE = 0.012  # end effector above the object's top
+_CARRY_CLEARANCE = 0.085  # lowest point of a carried object above the tray
+_LIFTED_CLEARANCE = 0.06  # lowest point of an object above the tray from which on it is carried
+_CARRY_SPEED = 0.8  # largest norm of the action while carrying; at full diagonal speed, the object would slip
+_DROP_FRACTION = 0.3  # of the container's half extents, within which the drop point is drawn
+_OVER_CONTAINER = np.array([0.035, 0.022])  # largest error in x and y at which the object is lowered
+_RELEASE_CLEARANCE = 0.012  # lowest point of the object above the container's floor at the release
+_RELEASE_TOLERANCE = 0.025  # largest error in z at the release
+_RETREAT = 0.05  # motion of the gripper upwards after the release
 
 
 class Stage(Enum):
     """Stage of the expert's plan."""
 
     REACH = "move above the object"
-    DESCEND = "come down around it"
+    DESCEND = "descend around it"
     GRASP = "close the gripper"
     LIFT = "lift the object straight up"
     CARRY = "move above the container"
@@ -62,17 +63,17 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EX
 
     Args:
         env: The environment, without wrappers.
-        task_id: 0..299, or 1000..1479 for those by color and shape.
+        task_id: Index of the task, 0..299, or 1000..1479 for tasks by color and shape.
         seed: Seed of the scene, the drop point and the noise.
-        noise: Standard deviation of the noise on the motions.
+        noise: Standard deviation of the noise on the first three numbers of the actions.
 
     Yields:
-        The 30 steps.
+        Each step of the episode.
     """
     observation, _ = env.reset(seed=seed, options={"task_id": task_id})
-    # A stream of its own: the expert's draws must not repeat those of the scene.
+    # The expert's draws must not repeat those of the scene.
     expert = Expert(env, np.random.default_rng((seed, 1)), noise)
-    for _ in range(EPISODE_STEPS):
+    for _ in range(env.scene_config.episode_length):
         action = expert.act()
         next_observation, reward, _, _, info = env.step(action)
         yield Step(observation, action, reward, info, expert.stage)
@@ -80,17 +81,18 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EX
 
 
 class Expert:
-    """Acts in one episode of an environment, from the scene's privileged state. Each episode needs a new one.
+    """Policy for one episode that reads the privileged state of the scene.
 
-    The stage is a function of the scene, so a slipped or misplaced object is simply picked again.
+    The stage is a function of the scene, so that the expert picks a slipped or misplaced object again. Make a
+    new expert for each episode.
 
     Args:
-        env: The environment, already reset.
+        env: Environment, already reset.
         rng: Source of the drop point and of the noise.
-        noise: Standard deviation of the Gaussian noise on the three motions; the gripper's command, which is
-            binary, has none.
-        target_object: Number of the object to pick, as in the environment's info. None: as the task says.
-        target_container: Number of the container to place it in. None: as the task says.
+        noise: Standard deviation of the Gaussian noise on the first three numbers of the actions; the binary
+            command of the gripper has no noise.
+        target_object: Number of the object to pick, as in the environment's info; None for the task's target.
+        target_container: Number of the container to place it in; None for the task's target.
     """
 
     def __init__(
@@ -109,13 +111,13 @@ class Expert:
         self._container = layout.target_container if target_container is None else target_container
         self._grasp_height = layout.objects[self._target].model.grasp_height
         middle = layout.containers[self._container].quadrant.container_center
-        spread = _DROP_SHARE * np.array(CONTAINER_HALF_EXTENTS)
+        spread = _DROP_FRACTION * np.array(CONTAINER_HALF_EXTENTS)
         self._drop_xy = rng.uniform(middle - spread, middle + spread)
         self._rest: NDArray[np.float64] | None = None
         self.stage = Stage.REACH
 
     def act(self) -> NDArray[np.float32]:
-        """The next action, (4,) in [-1, 1], noise included."""
+        """Returns the next action, (4,) in [-1, 1], with noise."""
         gripper = self._scene.arm.position
         self.stage, goal, command = self._plan(gripper)
         motion = np.clip((goal - gripper) / ACTION_SCALE, -1, 1)
@@ -125,7 +127,7 @@ class Expert:
         return np.clip([*motion, command], -1, 1).astype(np.float32)
 
     def _plan(self, gripper: NDArray[np.float64]) -> tuple[Stage, NDArray[np.float64], float]:
-        """The stage, where the end effector shall go, (3,), m, and the gripper's command."""
+        """Returns the stage, the target of the end effector, (3,), m, and the gripper's command."""
         scene = self._scene
         if scene.arm.is_open and scene.container_around(self._target) == self._container:
             if self._rest is None:

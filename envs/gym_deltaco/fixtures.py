@@ -1,4 +1,4 @@
-"""What stands still in every scene: the table, the shallow tray on it, and the two containers."""
+"""Static bodies of a scene: the table, the shallow tray on it, and the two containers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 def _open_box(
     half_extents: tuple[float, float], floor: tuple[float, float], wall_top: float, thickness: float
 ) -> tuple[Box, ...]:
-    """A floor between two heights, and four walls that stand around it, inside the half extents."""
+    """Returns the boxes of a floor, given its bottom and top, and of four walls inside the half extents."""
     half_x, half_y = half_extents
     bottom, top = floor
     middle, half_height = (wall_top + bottom) / 2, (wall_top - bottom) / 2
@@ -47,7 +47,8 @@ def _open_box(
     )
 
 
-# The table's body is in the world's frame, the others' origin is the middle of the tray's floor, at its top.
+# The table is in the world's frame. The origin of the tray is the center of the top of its floor, that of a
+# container the center of its underside.
 TABLE_BOXES = (Box((*TRAY_CENTER, TABLE_TOP - 0.02), (0.7, 0.65, 0.02)),)
 TRAY_BOXES = _open_box(
     TRAY_HALF_EXTENTS, (TABLE_TOP - TRAY_FLOOR, 0.0), TRAY_WALL_HEIGHT, TRAY_WALL_THICKNESS
@@ -59,7 +60,7 @@ CONTAINER_BOXES = _open_box(
 
 @functools.cache
 def table_mesh() -> Mesh:
-    """The table's top around the tray, in the world's frame. What the tray hides would only take time."""
+    """Returns the table's top around the tray, in the world's frame. The tray would hide the rest."""
     (x, y, _), (half_x, half_y, _) = TABLE_BOXES[0]
     hole_x, hole_y = TRAY_HALF_EXTENTS
     rows: list[Row] = [((half_x, half_y), TABLE_TOP, _TABLE_COLOR), ((hole_x, hole_y), TABLE_TOP)]
@@ -68,18 +69,18 @@ def table_mesh() -> Mesh:
 
 @functools.cache
 def tray_mesh() -> Mesh:
-    """The tray; its origin is the middle of its floor."""
+    """Returns the tray; its origin is the center of the top of its floor."""
     return _open_box_mesh(TRAY_BOXES, _TRAY_WALL_COLOR, _TRAY_FLOOR_COLOR)
 
 
 @functools.cache
 def container_mesh(color: ContainerColor) -> Mesh:
-    """A container; its origin is the middle of its underside."""
+    """Returns a container; its origin is the center of its underside."""
     return _open_box_mesh(CONTAINER_BOXES, *_CONTAINER_COLORS[color])
 
 
 def _open_box_mesh(boxes: tuple[Box, ...], wall_color: Color, floor_color: Color) -> Mesh:
-    """The surface of `_open_box`: up outside, over the rim and down inside to the middle of the floor."""
+    """Returns the surface of an `_open_box`: up the outside, over the rim, down the inside, and the floor."""
     floor, wall = boxes[0], boxes[1]
     outer = np.array(floor.half_extents[:2])
     inner = outer - 2 * wall.half_extents[0]
@@ -96,7 +97,7 @@ def _open_box_mesh(boxes: tuple[Box, ...], wall_color: Color, floor_color: Color
 
 
 def _without_undersides(mesh: Mesh) -> Mesh:
-    """A mesh less the faces that look down."""
+    """Removes the faces that look down."""
     edges = mesh.triangles[:, 1:] - mesh.triangles[:, :1]  # (F, 2, 3)
     seen = np.cross(edges[:, 0], edges[:, 1])[:, 2] >= 0
     return Mesh(mesh.vertices, mesh.normals, mesh.faces[seen], mesh.colors[seen])

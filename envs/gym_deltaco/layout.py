@@ -1,31 +1,29 @@
-"""What a scene consists of: three objects, two containers, and where each is. No physics."""
+"""Layouts of scenes: three objects, two containers, and their positions. No physics."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, AdversarialDraw, find_label, find_model
+from gym_deltaco.object_sets import find_label, find_model, select_objects
 from gym_deltaco.objects import ObjectModel
-from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, ContainerColor, ContainerWord, ObjectLabel, Task
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.tasks import CONTAINER_COLORS, ContainerColor, ContainerWord, ObjectLabel, Task
 from gym_deltaco.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
-
-Ambiguity = Literal["container", "object"]
-AMBIGUITIES: tuple[str, ...] = get_args(Ambiguity)
 
 N_OBJECTS = 3
 MIN_OBJECT_DISTANCE = 0.065  # m
-# Half the opened gripper's extents, with the expert's noise: nothing else stands where its fingers come down.
-GRIPPER_CLEARANCE = (0.052, 0.018)  # m, in x and y
+# Half extents of the open gripper in x and y, with a margin for the expert's noise. Nothing else stands where
+# the fingers come down.
+GRIPPER_CLEARANCE = (0.052, 0.018)  # m
 _MAX_TRIES = 10_000
 _POSITION_AXES: tuple[tuple[ContainerWord, ContainerWord], ...] = (("front", "back"), ("left", "right"))
 
 
 class PlacedObject(NamedTuple):
-    """An object and where it is let fall."""
+    """An object and the pose from which it is dropped."""
 
     model: ObjectModel
     xy: NDArray[np.float64]  # (2,), m
@@ -38,18 +36,18 @@ class PlacedObject(NamedTuple):
 
 
 class PlacedContainer(NamedTuple):
-    """A container and where it stands."""
+    """A container and its quadrant."""
 
     color: ContainerColor
     quadrant: Quadrant
 
     def satisfies(self, word: ContainerWord) -> bool:
-        """Whether a word of an instruction describes it."""
+        """Returns whether a word of an instruction describes the container."""
         return container_matches(word, self.color, self.quadrant)
 
 
 class Layout(NamedTuple):
-    """A scene: one of the objects and one of the containers are what the task asks for."""
+    """Objects and containers of a scene, with the object and the container that the task asks for."""
 
     objects: tuple[PlacedObject, ...]
     containers: tuple[PlacedContainer, ...]  # green, red
@@ -57,45 +55,30 @@ class Layout(NamedTuple):
     target_container: int  # index into `containers`
 
 
-def sample_layout(
-    task: Task,
-    ambiguity: Ambiguity,
-    rng: np.random.Generator,
-    objects: Sequence[ObjectLabel] = OBJECTS,
-    adversarial_probability: float = ADVERSARIAL_PROBABILITY,
-    adversarial_draw: AdversarialDraw = "each",
-) -> Layout:
-    """Draws a scene for a task.
+def sample_layout(task: Task, scene: SceneConfig, rng: np.random.Generator) -> Layout:
+    """Draws a layout for a task.
 
     Args:
-        task: The task that the instruction asks for.
-        ambiguity: "container": exactly one object fits the instruction, which is what a demonstration
-            alone leaves open about containers (the paper's scheme i). "object": the target has an identical
-            twin on the other side of the tray, and only the demonstration tells which of the two (scheme ii).
+        task: Task whose instruction the scene must fit.
+        scene: Settings of the scenes, whose objects include one that fits the task.
         rng: Source of all draws.
-        objects: Objects that the scene is made of; the task asks for at least one of them.
-        adversarial_probability: Probability that a distractor is drawn from the objects that share the
-            target's color or shape, 0..1. In scheme ii, none is.
-        adversarial_draw: Scope of a draw with that probability: "each", one distractor; or "scene", both
-            distractors of a scene, as in the authors' code.
 
     Returns:
-        The scene.
+        The layout. With ambiguity "container", exactly one object fits the instruction. With "object", two
+        identical objects do; they stand on opposite sides of the tray, and the target is the one on the side
+        `twin_word(task)`.
     """
-    target = int(rng.choice([label.index for label in objects if task.describes(label)]))
-    if ambiguity == "container":
-        distractors = _sample_distractors(
-            task, find_label(target), rng, objects, adversarial_probability, adversarial_draw
-        )
+    labels = select_objects(scene.objects)
+    target = int(rng.choice([label.index for label in labels if task.describes(label)]))
+    if scene.ambiguity == "container":
+        distractors = _sample_distractors(task, find_label(target), scene, rng)
         containers, object_quadrants = _sample_quadrants(task, rng)
     else:
-        distractors = (
-            target,
-            int(rng.choice([label.index for label in objects if not task.describes(label)])),
-        )
+        other = int(rng.choice([label.index for label in labels if not task.describes(label)]))
+        distractors = target, other
         containers, object_quadrants = _sample_twin_quadrants(task, rng)
     models = [find_model(index) for index in (target, *distractors)]
-    placed = _place_objects(models, object_quadrants, containers, ambiguity, rng)
+    placed = _place_objects(models, object_quadrants, containers, scene.ambiguity, rng)
     order = rng.permutation(N_OBJECTS)
     return Layout(
         objects=tuple(placed[index] for index in order),
@@ -108,7 +91,7 @@ def sample_layout(
 
 
 def twin_word(task: Task) -> ContainerWord:
-    """Scheme ii: the side of the tray on which a task's target stands; its twin is on the other side."""
+    """Returns the side of the tray on which a task's target stands with ambiguity "object"."""
     if not task.is_position_task:
         return ("front", "back", "left", "right")[task.index % 4]
     axis = next(axis for axis in _POSITION_AXES if task.container in axis)
@@ -116,22 +99,24 @@ def twin_word(task: Task) -> ContainerWord:
 
 
 def _sample_distractors(
-    task: Task,
-    target: ObjectLabel,
-    rng: np.random.Generator,
-    objects: Sequence[ObjectLabel],
-    adversarial_probability: float,
-    adversarial_draw: AdversarialDraw,
+    task: Task, target: ObjectLabel, scene: SceneConfig, rng: np.random.Generator
 ) -> tuple[int, int]:
-    """Two objects that the instruction does not describe, often alike to the target in color or shape."""
-    others = [label for label in objects if not task.describes(label) and label.index != target.index]
-    alike = [label.index for label in others if label.color == target.color or label.shape == target.shape]
-    # None: each distractor has a draw of its own.
-    shared_draw = rng.random() if adversarial_draw == "scene" else None
+    """Draws two objects that the instruction does not describe, often with the target's color or shape."""
+    others = [
+        label
+        for label in select_objects(scene.objects)
+        if not task.describes(label) and label.index != target.index
+    ]
+    similar = [label.index for label in others if label.color == target.color or label.shape == target.shape]
+    shared_draw = rng.random() if scene.adversarial_draw == "scene" else None
     chosen: list[int] = []
     while len(chosen) < N_OBJECTS - 1:
-        left = [index for index in alike if index not in chosen]
-        if not (left and (rng.random() if shared_draw is None else shared_draw) < adversarial_probability):
+        left = [index for index in similar if index not in chosen]
+        # Each distractor has its own draw, unless the scene has one for both.
+        if (
+            not left
+            or (rng.random() if shared_draw is None else shared_draw) >= scene.adversarial_probability
+        ):
             left = [label.index for label in others if label.index not in chosen]
         chosen.append(int(rng.choice(left)))
     return chosen[0], chosen[1]
@@ -140,7 +125,11 @@ def _sample_distractors(
 def _sample_quadrants(
     task: Task, rng: np.random.Generator
 ) -> tuple[tuple[PlacedContainer, ...], tuple[Quadrant, Quadrant]]:
-    """Scheme i: containers in two random quadrants, of which a position word describes exactly one."""
+    """Draws quadrants for ambiguity "container": a position word describes exactly one of the two containers.
+
+    Returns:
+        The containers, and the two quadrants of the objects.
+    """
     pairs = [
         (QUADRANTS[green], QUADRANTS[red])
         for green in range(len(QUADRANTS))
@@ -157,7 +146,11 @@ def _sample_quadrants(
 def _sample_twin_quadrants(
     task: Task, rng: np.random.Generator
 ) -> tuple[tuple[PlacedContainer, ...], tuple[Quadrant, Quadrant]]:
-    """Scheme ii: the target's quadrant first, its twin's second; the containers take the other two."""
+    """Draws quadrants for ambiguity "object".
+
+    Returns:
+        The containers, and the quadrants of the target and of its twin.
+    """
     word = twin_word(task)
     side = [quadrant for quadrant in QUADRANTS if quadrant.satisfies(word)]
     other_side = [quadrant for quadrant in QUADRANTS if not quadrant.satisfies(word)]
@@ -179,13 +172,13 @@ def _place_objects(
     models: list[ObjectModel],
     quadrants: tuple[Quadrant, Quadrant],
     containers: tuple[PlacedContainer, ...],
-    ambiguity: Ambiguity,
+    ambiguity: str,
     rng: np.random.Generator,
 ) -> list[PlacedObject]:
-    """Draws where the objects stand, until all of them can be grasped.
+    """Draws poses of the objects until the gripper can reach all of them.
 
-    The target comes first; in scheme ii it takes the first quadrant and its twin the second. Each quadrant
-    holds at least one object.
+    The target comes first. With ambiguity "object", it takes the first quadrant and its twin the second. Each
+    quadrant holds at least one object.
     """
     for _ in range(_MAX_TRIES):
         homes = [0, 1, int(rng.integers(2))]
@@ -203,7 +196,7 @@ def _place_objects(
 
 
 def _is_clear(placed: list[PlacedObject], containers: tuple[PlacedContainer, ...]) -> bool:
-    """Whether the objects keep their distances, and the opened gripper can come down around each of them."""
+    """Returns whether objects are far enough apart, and the open gripper fits around each of them."""
     footprints = [item.model.footprint(item.yaw) for item in placed]
     for index, item in enumerate(placed):
         for container in containers:

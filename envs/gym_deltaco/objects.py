@@ -1,12 +1,12 @@
-"""The 32 objects as geometry: what is drawn, what collides, and where the gripper takes hold.
+"""Geometry of the 32 objects: visible meshes, collision parts and grasp heights.
 
-The authors' meshes are not public. These are our own parametric solids, made to resemble the paper's figures
-4 to 6 of the objects in name, shape and color. The labels are in `gym_deltaco.tasks.OBJECTS`.
+The authors' meshes are not public. These parametric solids resemble the objects in figures 4 to 6 of the
+paper in name, shape and color. Their labels are in `gym_deltaco.tasks.OBJECTS`.
 
-Recipes are in millimeters, with the table at z = 0 and the fingers closing along x; models are in meters,
-with the origin in the middle of the bounding box. The gripper opens to 74 mm and arrives with an error of
-about 10 mm, so nothing between the fingers is wider than 46 mm. The collision parts have vertical sides where
-an object is held, and a foot wide enough to land on, so they differ from what is drawn by up to 3 mm.
+Recipes are in millimeters, with the table at z = 0 and the fingers closing along x. Models are in meters,
+with the origin in the center of the bounding box. The gripper opens to 74 mm and arrives with an error of
+about 10 mm, so that objects are at most 46 mm wide between the fingers. The collision parts have vertical
+sides at the grasp height and a foot wide enough to land on; they differ from the mesh by up to 3 mm.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from gym_deltaco.tasks import OBJECTS, ObjectLabel
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """The geometry of one object: z up, standing as on a table, origin in the middle of its bounding box.
+    """Geometry of one object, upright, with the origin in the center of its bounding box.
 
     Attributes:
         label: Name, shape and color of the object.
-        mesh: The visible surface, in meters.
-        parts: Corners of the convex collision parts, in meters, (P, 3) each; together they are like the mesh.
-        grasp_height: Height above the object's base for the middle of the fingertips' pads, in meters.
-        yaw_range: Rotations about z at which it fits between the fingers: (low, high), in radians.
+        mesh: Visible surface, m.
+        parts: Corners of the convex collision parts, (P, 3) each, m. Their union approximates the mesh.
+        grasp_height: Height of the finger pads' center above the object's base, m.
+        yaw_range: Lowest and highest rotation about z at which it fits between the fingers, rad.
     """
 
     label: ObjectLabel
@@ -55,40 +55,40 @@ class ObjectModel:
 
     @cached_property
     def half_extents(self) -> np.ndarray:
-        """Half of the bounding box of the mesh, in meters, shape (3,)."""
+        """Half the size of the mesh's bounding box, (3,), m."""
         return self.mesh.vertices.max(axis=0)
 
     @property
     def height(self) -> float:
-        """Height of the object, in meters."""
+        """Height of the object, m."""
         return 2.0 * float(self.half_extents[2])
 
     @cached_property
     def radius(self) -> float:
-        """Radius of the upright cylinder about the origin that contains the object, in meters."""
+        """Radius of the upright cylinder around the origin that contains the object, m."""
         points = np.concatenate([self.mesh.vertices, self.hull_points])
         return float(np.hypot(points[:, 0], points[:, 1]).max())
 
     @cached_property
     def hull_points(self) -> np.ndarray:
-        """Corners of all collision parts, in meters, shape (P, 3)."""
+        """Corners of all collision parts, (P, 3), m."""
         return np.concatenate(self.parts)
 
     def footprint(self, yaw: float) -> np.ndarray:
-        """Half of its extents in x and y when it is turned about z by `yaw` (rad), in meters, shape (2,)."""
+        """Returns half extents in x and y, (2,), m, of the object rotated about z by `yaw` (rad)."""
         cosine, sine = np.cos(yaw), np.sin(yaw)
         return np.abs(self.hull_points[:, :2] @ np.array([[cosine, sine], [-sine, cosine]])).max(axis=0)
 
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """Recipe for an object, in millimeters and radians.
+    """Solids of an object, in millimeters and radians.
 
     Attributes:
         solids: Visible solids.
         parts: Convex solids for collisions.
-        grasp: Height above the table at which it is held.
-        yaw: Greatest angle by which it may be turned to either side.
+        grasp: Grasp height above the table.
+        yaw: Largest rotation about z to either side.
     """
 
     solids: Sequence[Loft]
@@ -99,13 +99,13 @@ class Recipe:
 
 @cache
 def object_model(index: int) -> ObjectModel:
-    """The model of an object, built on first use.
+    """Returns the model of one of the paper's objects; it is built on first use.
 
     Args:
-        index: 0..31, an index into `OBJECTS`.
+        index: Index into `OBJECTS`, 0..31.
 
     Raises:
-        ValueError: There is no such object.
+        ValueError: The index is out of range.
     """
     if index not in range(len(OBJECTS)):
         raise ValueError(f"An object's index must be an integer from 0 to {len(OBJECTS) - 1}. Got {index!r}.")
@@ -114,7 +114,7 @@ def object_model(index: int) -> ObjectModel:
 
 
 def build_model(label: ObjectLabel, recipe: Recipe) -> ObjectModel:
-    """The model that a recipe describes, in meters, with the origin in the middle of its bounding box."""
+    """Builds a model, in meters, from a recipe."""
     mesh = merged(solid.mesh() for solid in recipe.solids)
     center = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
     parts = tuple((part.points() - center) * _MILLIMETER for part in recipe.parts)
@@ -133,7 +133,7 @@ _MILLIMETER = 1e-3
 
 
 def _rgb(code: str) -> Color:
-    """A color of three hexadecimal digits, as in CSS: the simulation draws 16 levels of each channel."""
+    """Parses a color of three hexadecimal digits: the simulation renders 16 levels of each channel."""
     red, green, blue = (int(digit, 16) / 15.0 for digit in code)
     return red, green, blue
 
@@ -184,14 +184,14 @@ def _round_part(*profile: Row) -> Loft:
 
 
 def _block(low: Sequence[float], high: Sequence[float], paint: Color = WHITE) -> Loft:
-    """A box between two corners."""
+    """Returns a box between two corners."""
     (x, y, z), (half_x, half_y, half_z) = np.add(low, high) / 2.0, np.subtract(high, low) / 2.0
     half = (float(half_x), float(half_y))
     return Loft(SQUARE, [(half, (x, y, z - half_z), paint), (half, (x, y, z + half_z))])
 
 
 def _mottled(shift: int, *colors: Color) -> tuple[Color, ...]:
-    """Colors that alternate around a band, begun at another one, so that bands do not line up."""
+    """Returns colors that alternate around a band, shifted so that bands do not line up."""
     shift %= len(colors)
     return colors[shift:] + colors[:shift]
 
@@ -205,13 +205,20 @@ def _bark(shift: int) -> tuple[Color, ...]:
 
 
 def _strut(turn: float, radii: tuple[float, float], heights: tuple[float, float], paint: Color) -> Loft:
-    """A thin bar of an openwork stand, from one distance from the axis to another; `turn` in degrees."""
+    """Returns a thin bar of an openwork stand, between two distances from the axis and two heights.
+
+    Args:
+        turn: Rotation about z, degrees.
+        radii: Distances of its ends from the axis, mm.
+        heights: Heights of its ends, mm.
+        paint: Color.
+    """
     rows = [(3, (radius, 0, height), paint) for radius, height in zip(radii, heights, strict=True)]
     return Loft(_TRIANGLE, rows, turn=turn)
 
 
 def _thwart(y: float, half_width: float, z: float, paint: Color) -> Loft:
-    """A canoe's seat."""
+    """Returns the seat of a canoe."""
     return _block((-half_width, y - 3, z - 3), (half_width, y + 3, z), paint)
 
 

@@ -1,10 +1,10 @@
-"""Random objects without end: solids of the ten shapes and eight colors, one for each number.
+"""Random objects: any number of solids of the ten shapes and eight colors.
 
-An object is a function of its index alone. A family of profiles for each shape word draws its form; a color
-word draws its paint, which may have bands, stripes or spots of shades or of a second color. None has both the
-shape and the color of a test object of scenario A. Forms obey the rules of `gym_deltaco.objects`: nothing
-between the fingers is wider than 46 mm, and the sides are vertical where an object is held. Lengths are in
-millimeters here.
+An object is a function of its index. Its shape selects a family of profiles, from which its form is drawn.
+Its color selects a range of paints, with bands, stripes or spots of other shades or of a second color. No
+random object has both the shape and the color of a test object of scenario A. Forms follow the rules of
+`gym_deltaco.objects`: objects are at most 46 mm wide between the fingers, with vertical sides at the grasp
+height. Lengths in this module are in millimeters.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ from gym_deltaco.tasks import COLOR_SHAPE_PAIRS, OBJECTS, ObjectLabel
 from gym_deltaco.workspace import CAMERA
 
 FIRST_INDEX = len(OBJECTS)
-_SEED = 2210_04476  # of all random objects; another one gives other objects
+_SEED = 2210_04476  # seed of all random objects
 
-_MAX_RADIUS = 23.0  # between the fingers
-_PALM_DISTANCE = 35.0  # of an object's top above the height at which it is held, at the most
-_MIN_GRASP = 10.0
-_MIN_FOOT = 0.35  # of the height
+_MAX_RADIUS = 23.0  # half the width between the fingers
+_PALM_DISTANCE = 35.0  # largest distance of an object's top above its grasp height
+_MIN_GRASP = 10.0  # lowest grasp height
+_MIN_FOOT = 0.35  # smallest radius of a foot, relative to the height
 _MAX_FACES = 250
-_FACES_OF_AN_EXTRA = 64  # of a handle, which has the most
+_MAX_EXTRA_FACES = 64  # a handle has the most
 _MAX_PART_POINTS = 24
 
 
 @cache
 def random_label(index: int) -> ObjectLabel:
-    """Shape and color of a random object, and a name that no instruction uses.
+    """Returns the label of a random object; no instruction uses its name.
 
-    The pairs of `COLOR_SHAPE_PAIRS` come in turn, in a new order each time.
+    Successive indices run through all of `COLOR_SHAPE_PAIRS`, again and again, each time in a new order.
 
     Args:
         index: At least `FIRST_INDEX`.
 
     Raises:
-        ValueError: It is the index of one of the paper's objects, or none.
+        ValueError: The index is too small, or not an integer.
     """
     if not isinstance(index, (int, np.integer)) or index < FIRST_INDEX:
         raise ValueError(
@@ -71,13 +71,13 @@ def random_label(index: int) -> ObjectLabel:
 
 @cache
 def random_model(index: int) -> ObjectModel:
-    """The model of a random object, built on first use.
+    """Returns the model of a random object; it is built on first use.
 
     Args:
         index: At least `FIRST_INDEX`.
 
     Raises:
-        ValueError: It is the index of one of the paper's objects, or none.
+        ValueError: The index is too small, or not an integer.
     """
     label = random_label(index)
     rng = np.random.default_rng((_SEED, 0, label.index))
@@ -87,17 +87,17 @@ def random_model(index: int) -> ObjectModel:
 
 @dataclass(frozen=True, eq=False)
 class _Form:
-    """The form of an object, without its colors. Radii and centers are those of `Loft`.
+    """Form of an object, without its colors. Radii and centers are those of `Loft`.
 
     Attributes:
         outline: Outline of the visible solid.
         part_outline: Outline of the collision parts, with fewer corners.
-        outside: Rings from the bottom to the top.
-        band: Lowest and highest height at which the sides are vertical and widest: where it may be held.
-        inside: Rings from the top inwards and down, for something hollow.
-        is_ring: Whether it is open at the bottom, too.
-        yaw: Greatest angle by which it may be turned, rad.
-        extras: Further solids, as functions of their paint, and their collision parts.
+        outside: Rings of the outside, from the bottom to the top.
+        band: Lowest and highest height of the vertical, widest sides, within which the object may be held.
+        inside: Rings of the inside of a hollow object, from the top down.
+        is_ring: Whether the hole goes through the bottom.
+        yaw: Largest rotation about z to either side, rad.
+        extras: Further solids, as functions of their paint, with their collision parts.
     """
 
     outline: np.ndarray
@@ -138,7 +138,7 @@ def _recipe(form: _Form, color: str, rng: np.random.Generator) -> Recipe:
 
 
 def _parts(form: _Form) -> list[Loft]:
-    """Convex parts: the form, cut where it is narrow."""
+    """Cuts a form into convex parts at its waists."""
     max_rows = _MAX_PART_POINTS // len(form.part_outline)
     parts = []
     for piece in _cut_at_waists(form.outside):
@@ -151,7 +151,7 @@ def _parts(form: _Form) -> list[Loft]:
 
 
 def _cut_at_waists(rows: Sequence[Row]) -> list[Sequence[Row]]:
-    """Pieces of a profile that begin and end where it is narrower than below and above."""
+    """Cuts a profile at the rings that are narrower than their neighbors below and above."""
     cuts = [0]
     for number in range(1, len(rows) - 1):
         before, here, after = (_width(row) for row in rows[number - 1 : number + 2])
@@ -162,7 +162,7 @@ def _cut_at_waists(rows: Sequence[Row]) -> list[Sequence[Row]]:
 
 
 def _convex(rows: Sequence[Row]) -> list[Row]:
-    """Those rings that stand out: the others lie within the convex hull of their neighbors."""
+    """Removes the rings that lie within the convex hull of their neighbors."""
     kept: list[Row] = []
     for row in rows:
         while len(kept) > 1 and not _stands_out(kept[-2], kept[-1], row):
@@ -172,11 +172,11 @@ def _convex(rows: Sequence[Row]) -> list[Row]:
 
 
 def _stands_out(below: Row, row: Row, above: Row) -> bool:
-    share = (_height(row) - _height(below)) / (_height(above) - _height(below))
-    return _width(row) > _width(below) + share * (_width(above) - _width(below)) + 0.1
+    fraction = (_height(row) - _height(below)) / (_height(above) - _height(below))
+    return _width(row) > _width(below) + fraction * (_width(above) - _width(below)) + 0.1
 
 
-# Forms. Each function draws one of its shape.
+# Forms: each function draws one of its shape
 
 _HEXAGON = polygon(6)
 
@@ -190,14 +190,14 @@ def _pick[T](rng: np.random.Generator, options: Sequence[T]) -> T:
 
 
 def _round_outlines(rng: np.random.Generator, is_tall: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """A more or less round outline, and that of its parts; something tall falls over a hexagon."""
+    """Draws a round outline, and that of its parts; no hexagon if it is tall, since it would fall over."""
     fluted = polygon(16, (1.0, 0.92))
     outlines = [(CIRCLE, OCTAGON), (CIRCLE, OCTAGON), (OCTAGON, OCTAGON), (fluted, OCTAGON)]
     return _pick(rng, outlines if is_tall else [*outlines, (_HEXAGON, _HEXAGON)])
 
 
 def _foot(radius: float, height: float) -> float:
-    """A radius, or as much as an object needs to stand after a fall."""
+    """Returns a radius that is large enough for an object to stay upright when it is dropped."""
     return round(max(radius, _MIN_FOOT * height), 1)
 
 
@@ -261,7 +261,7 @@ def _chalice(rng: np.random.Generator) -> _Form:
 
 
 def _freeform(rng: np.random.Generator) -> _Form:
-    if rng.random() < 0.6:  # an irregular stack
+    if rng.random() < 0.6:  # irregular stack
         outline = polygon(10, rng.uniform(0.84, 1.0, 10).round(2).tolist())
         n_bulges, height = int(rng.integers(1, 4)), _between(rng, 38, 70)
         widest = _between(rng, 19, 21.5)
@@ -272,7 +272,7 @@ def _freeform(rng: np.random.Generator) -> _Form:
             outside.append((radius, (_between(rng, -1.5, 1.5), _between(rng, -1.5, 1.5), float(z))))
         outside += [(widest, height - 10), (widest, height)]
         return _Form(outline, OCTAGON, outside, (height - 10, height))
-    # A block that leans and narrows above its seat.
+    # Block that leans and narrows above its seat
     depth, seat = _between(rng, 14, 24), _between(rng, 20, 26)
     height = _between(rng, seat + 12, min(seat + 24, 52))
     lean = _between(rng, 6, 11) * _pick(rng, (-1, 1))
@@ -292,7 +292,7 @@ def _bottle(rng: np.random.Generator) -> _Form:
     neck = _between(rng, 7, 10)
     shoulder = round(max(_between(rng, 0.45, 0.6) * height, height - 28), 1)
     slope = _between(rng, 6, 14)
-    if rng.random() < 0.4:  # a waist
+    if rng.random() < 0.4:  # with a waist
         outside: list[Row] = [
             (body, 0),
             (body, shoulder * 0.35),
@@ -314,8 +314,8 @@ def _canoe(rng: np.random.Generator) -> _Form:
     keel = (half_width * _between(rng, 0.7, 0.85), half_length * _between(rng, 0.7, 0.85))
     extras = []
     for y in np.linspace(-0.5, 0.5, int(rng.integers(0, 4))) * half_length:
-        seat, place = (half_width * 0.8, 3.0), (0.0, float(y))
-        extras.append((lambda paint, seat=seat, place=place: _bench(seat, place, height, paint), ()))
+        seat, xy = (half_width * 0.8, 3.0), (0.0, float(y))
+        extras.append((lambda paint, seat=seat, xy=xy: _bench(seat, xy, height, paint), ()))
     return _Form(
         pointed_oval(16, lift),
         pointed_oval(8, lift),
@@ -327,8 +327,8 @@ def _canoe(rng: np.random.Generator) -> _Form:
     )
 
 
-def _bench(half: tuple[float, float], place: tuple[float, float], top: float, paint: Paint) -> Loft:
-    return Loft(SQUARE, [(half, (*place, top - 4), paint), (half, (*place, top - 1))])
+def _bench(half: tuple[float, float], xy: tuple[float, float], top: float, paint: Paint) -> Loft:
+    return Loft(SQUARE, [(half, (*xy, top - 4), paint), (half, (*xy, top - 1))])
 
 
 def _cup(rng: np.random.Generator) -> _Form:
@@ -338,7 +338,7 @@ def _cup(rng: np.random.Generator) -> _Form:
     variant = _pick(rng, ("plain", "plain", "handle", "lid"))
     if variant == "handle":
         top, height = min(top, 20.5), min(height, 48.0)
-        foot = min(max(foot, 0.42 * height), top)  # its handle pulls it over
+        foot = min(max(foot, 0.42 * height), top)  # its handle would pull it over
     outside = [(foot, 0), (top, height - 12), (top, height)]
     band = (height - 12, height)
     inside = [(top - 3, height), (foot - 3, 6)]
@@ -398,7 +398,7 @@ def _trapezoidal_prism(rng: np.random.Generator) -> _Form:
     narrow = max(_between(rng, 0.7, 0.88), 12.2 / x)
     small = (round(x * narrow, 1), round(y * narrow, 1))
     yaw = 0.3 if aspect == 1.0 or x < 18 else 0.2
-    if height < 40 and rng.random() < 0.35:  # wider below
+    if height < 40 and rng.random() < 0.35:  # wider at the bottom
         outside: list[Row] = [((x, y), 0), ((x, y), 15), (small, height)]
         return _Form(SQUARE, SQUARE, outside, (0, 15), yaw=yaw)
     outside = [(small, 0), ((x, y), height - 11), ((x, y), height)]
@@ -434,7 +434,7 @@ def _cylinder(rng: np.random.Generator) -> _Form:
 def _round_hole(rng: np.random.Generator) -> _Form:
     sides = int(_pick(rng, (8, 12, 16)))
     outline = polygon(sides, (1.0, 0.92) if sides == 16 and rng.random() < 0.6 else (1.0,))
-    if rng.random() < 0.4:  # a tube, or a shade that narrows
+    if rng.random() < 0.4:  # tube, or lampshade
         radius, wall = _between(rng, 18, 21), _between(rng, 4, 8)
         height = _between(rng, 24, 44)
         top = radius if rng.random() < 0.5 else _between(rng, 0.6, 0.85) * radius
@@ -472,7 +472,7 @@ _FAMILIES: Mapping[str, Callable[[np.random.Generator], _Form]] = MappingProxyTy
     }
 )
 
-# Paint. Hue (degrees), saturation and value of each color word, (low, high) each.
+# Paint: lowest and highest hue (degrees), saturation and value of each color
 _HSV = MappingProxyType(
     {
         "brown": ((14, 34), (0.45, 0.8), (0.38, 0.72)),
@@ -484,13 +484,13 @@ _HSV = MappingProxyType(
         "yellow": ((47, 56), (0.9, 1.0), (0.85, 1.0)),
     }
 )
-_ELEVATION = np.radians(-CAMERA.pitch)  # of the camera, which stands in the direction of y
+_ELEVATION = np.radians(-CAMERA.pitch)  # rad, of the camera, which stands in the direction of y
 _TOWARDS_CAMERA = np.array([0.0, np.cos(_ELEVATION), np.sin(_ELEVATION)])
 _BLACK, _WHITE = (1 / 15, 1 / 15, 1 / 15), (1.0, 1.0, 1.0)
 
 
 def _painted(form: _Form, color: str, rng: np.random.Generator) -> list[Loft]:
-    """The solids of a form, with paint that shows the color."""
+    """Returns the solids of a form, with paint that shows the color."""
     main, shade, dark = _palette(color, rng)
     others = [name for name in _HSV if name != color]
     accent = _palette(_pick(rng, others), rng)[0] if rng.random() < 0.5 else shade
@@ -506,9 +506,9 @@ def _painted(form: _Form, color: str, rng: np.random.Generator) -> list[Loft]:
 
 
 def _body(form: _Form, texture: str, main: Color, shade: Color, accent: Color, dark: Color) -> Loft:
-    """The main solid of a form, with a texture."""
+    """Returns the main solid of a form, with a texture."""
     is_patterned = texture in ("bands", "stripes", "spots", "label")
-    n_faces = _MAX_FACES - _FACES_OF_AN_EXTRA * len(form.extras)
+    n_faces = _MAX_FACES - _MAX_EXTRA_FACES * len(form.extras)
     n_rings = n_faces // (2 * len(form.outline)) - len(form.inside) - (0 if form.is_ring else 1)
     outside = _refined(form.outside, n_rings if is_patterned else len(form.outside))
     rows: list[Row] = [
@@ -520,7 +520,7 @@ def _body(form: _Form, texture: str, main: Color, shade: Color, accent: Color, d
 
 
 def _shows(body: Loft, main: Color, shade: Color, dark: Color) -> bool:
-    """Whether enough of a solid's outside has its color, as the camera sees it; black and white, of each."""
+    """Returns whether the camera sees enough of a solid's color; of black and white, enough of each."""
     mesh = body.mesh()
     corners = mesh.triangles
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -536,7 +536,7 @@ def _shows(body: Loft, main: Color, shade: Color, dark: Color) -> bool:
 
 
 def _paint_of(texture: str, number: int, n_rows: int, main: Color, shade: Color, accent: Color) -> Paint:
-    """The paint of a ring, counted from below."""
+    """Returns the paint of a ring; rings are counted from the bottom."""
     if texture == "bands":
         return main if number % 2 else shade
     if texture == "halves":
@@ -554,26 +554,26 @@ def _paint_of(texture: str, number: int, n_rows: int, main: Color, shade: Color,
 
 
 def _palette(color: str, rng: np.random.Generator) -> tuple[Color, Color, Color]:
-    """A color, a shade of it, and a darker one for the inside."""
+    """Draws a color, a shade of it, and a darker one for the inside."""
     if color == "black and white":
         return _BLACK, _WHITE, (0.4, 0.4, 0.4)
     (hue, saturation, value) = (float(rng.uniform(*limits)) for limits in _HSV[color])
     darker = rng.uniform(0.78, 0.9)
     main, shade, dark = (
-        _snapped(colorsys.hsv_to_rgb(hue % 360 / 360, saturation, value * share))
-        for share in (1.0, darker, 0.68)
+        _snapped(colorsys.hsv_to_rgb(hue % 360 / 360, saturation, value * brightness))
+        for brightness in (1.0, darker, 0.68)
     )
     return main, shade, dark
 
 
 def _snapped(rgb: Sequence[float]) -> Color:
-    """The nearest color that the simulation draws: 16 levels of each channel."""
+    """Returns the nearest color of those that the simulation renders: 16 levels of each channel."""
     red, green, blue = (round(15 * channel) / 15 for channel in rgb)
     return red, green, blue
 
 
 def _refined(rows: Sequence[Row], n_rows: int) -> list[Row]:
-    """A profile with rings added where they are farthest apart, up to a number of rings."""
+    """Adds rings to a profile where they are farthest apart, up to a number of rings."""
     refined = list(rows)
     while len(refined) < n_rows:
         gaps = [_height(above) - _height(below) for below, above in pairwise(refined)]

@@ -1,4 +1,4 @@
-"""A scene in the simulation: the arm at a table, objects that have been let fall, and what became of them."""
+"""A scene in the simulation: the arm, a table with a tray and containers, and objects."""
 
 from __future__ import annotations
 
@@ -29,25 +29,31 @@ OBJECT_MASS = 0.012  # kg
 _OBJECT_SURFACE = Contact(lateral_friction=1.0, spinning_friction=0.002, rolling_friction=0.0005)
 _FIXTURE_SURFACE = Contact(lateral_friction=0.6)
 
-# When an object counts as lying still in a container.
-_STANDING_TOLERANCE = 0.012  # m, of its lowest point above the container's floor
+# An object below these limits lies at rest in a container
+_STANDING_TOLERANCE = 0.012  # m, lowest point above the container's floor
 _MAX_LINEAR_SPEED = 0.05  # m/s
 _MAX_ANGULAR_SPEED = 2.0  # rad/s
 
-_SETTLING_STEPS = 120  # physics steps at the most, after an object is let fall
-_SETTLING_CHECK = 10  # physics steps after which it is looked whether all lie still
+_SETTLING_STEPS = 120  # largest number of physics steps after objects are dropped
+_SETTLING_CHECK = 10  # physics steps between checks whether all objects are at rest
 _SETTLED_SPEED = 0.005  # m/s
 
 
 class Scene:
-    """One scene, built in a simulation that it empties first."""
+    """One scene, built in a simulation that is emptied first.
+
+    Attributes:
+        layout: Layout from which it was built.
+        arm: The arm.
+        bodies: Ids of the objects in the simulation.
+    """
 
     def __init__(self, simulation: Simulation, layout: Layout) -> None:
         self.layout = layout
         self._simulation = simulation
         self._container_centers = np.array([item.quadrant.container_center for item in layout.containers])
         simulation.reset()
-        # From front to back, so that the renderer need not paint what is hidden.
+        # From front to back: the renderer skips hidden pixels.
         self.arm = Arm(simulation)
         self.bodies = [
             simulation.add_free_body(
@@ -80,38 +86,43 @@ class Scene:
         self._poses = [self._simulation.pose(body) for body in self.bodies]
 
     def command(self, position: NDArray[np.float64], is_open: bool) -> None:
-        """Runs one control step: moves to a position, (3,), m, and opens or closes the gripper."""
+        """Runs one control step of the arm.
+
+        Args:
+            position: Target of the end effector, (3,), m.
+            is_open: Target state of the gripper.
+        """
         self.arm.command(position, is_open)
         self._read()
 
     def place(self, index: int, position: ArrayLike, yaw: float = 0.0) -> None:
-        """Puts the middle of an object somewhere, (3,), m, upright and at rest, and lets it fall."""
+        """Drops an object from a position of its center, (3,), m, upright and turned by `yaw`, rad."""
         self._simulation.move(self.bodies[index], position, yaw)
         self._settle()
 
     def render(self, size: int) -> NDArray[np.uint8]:
-        """Image of the camera, (size, size, 3)."""
+        """Returns the image of the benchmark's camera, (size, size, 3) uint8."""
         return self._simulation.render(CAMERA, size)
 
     def object_pose(self, index: int) -> Pose:
-        """Where the middle of an object of the layout is, and how it moves."""
+        """Returns the pose and speed of the center of an object."""
         return self._poses[index]
 
     def object_span(self, index: int) -> tuple[float, float]:
-        """Heights of the lowest and the highest point of an object, m."""
+        """Returns the heights of the lowest and the highest point of an object, m."""
         pose = self._poses[index]
         heights = self.layout.objects[index].model.hull_points @ pose.rotation[2] + pose.position[2]
         return float(heights.min()), float(heights.max())
 
     def is_grasped(self, index: int) -> bool:
-        """Whether the closed gripper holds an object between its fingers, which close along x."""
+        """Returns whether the gripper is closed and holds an object between its fingers."""
         return not self.arm.is_open and all(
-            self._simulation.presses(self.bodies[index], self.arm.body, finger, axis=0)
+            self._simulation.presses(self.bodies[index], self.arm.body, finger, axis=0)  # they close along x
             for finger in self.arm.finger_links
         )
 
     def container_around(self, index: int) -> int:
-        """Index of the container in which an object is, low enough to stand on its floor; -1 for none."""
+        """Returns the container whose floor an object is low enough to stand on; -1 for none."""
         offsets = np.abs(self._poses[index].position[:2] - self._container_centers)
         inside = np.flatnonzero((offsets < CONTAINER_HALF_EXTENTS).all(axis=1))
         if not len(inside) or self.object_span(index)[0] > CONTAINER_FLOOR + _STANDING_TOLERANCE:
@@ -119,7 +130,7 @@ class Scene:
         return int(inside[0])
 
     def container_of(self, index: int) -> int:
-        """Index of the container in which an object lies, released and at rest; -1 for none."""
+        """Returns the container in which an object lies, released and at rest; -1 for none."""
         container, pose = self.container_around(index), self._poses[index]
         is_at_rest = pose.linear_speed < _MAX_LINEAR_SPEED and pose.angular_speed < _MAX_ANGULAR_SPEED
         if container < 0 or not is_at_rest or self._simulation.touch(self.bodies[index], self.arm.body):

@@ -1,16 +1,17 @@
-"""The settings that scenes are drawn and observed with, as one value."""
+"""Settings with which scenes are drawn and observed, as one value."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gym_deltaco import EPISODE_STEPS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE
-from gym_deltaco.object_sets import ADVERSARIAL_PROBABILITY, select_objects
+from gym_deltaco import EPISODE_STEPS
+from gym_deltaco.object_sets import select_objects
 from gym_deltaco.tasks import get_task
 
 AMBIGUITIES = ("container", "object")
 ADVERSARIAL_DRAWS = ("each", "scene")
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 8, 4096  # px
 MAX_EPISODE_LENGTH = 100_000
 
 
@@ -19,17 +20,17 @@ class SceneConfig:
     """Settings of the benchmark's scenes; the defaults are the benchmark's.
 
     Args:
-        ambiguity: "container", the paper's scheme (i): the instruction is clear, and a demonstration alone
-            leaves open which container is meant. "object", scheme (ii): the target has an identical twin, and
-            only a demonstration tells which of the two is meant.
-        objects: Objects that scenes are made of: "all", the paper's 32; "scenario_a_train", without the 8
-            test objects; or "random:N", the 24 training objects and N - 24 random ones.
+        ambiguity: Scheme of the paper. "container" (i): the instruction is clear, but a demonstration alone
+            does not tell which of the two containers is meant. "object" (ii): the target has an identical
+            twin, and only a demonstration tells which of the two is meant.
+        objects: Set of objects from which scenes are drawn: "all", the paper's 32; "scenario_a_train", the 24
+            training objects of scenario A; or "random:N", these 24 and N - 24 random objects.
         adversarial_probability: Probability that a distractor shares the target's color or shape, 0..1. It is
-            0.6 in the paper's data; with 0, distractors are uniform.
-        adversarial_draw: Scope of a draw with that probability: "each" distractor; or "scene", both
-            distractors of a scene, as in the authors' code.
-        image_size: Height and width of the policy's image, px.
-        episode_length: Number of steps of an episode.
+            0.6 in the paper's data; with 0, distractors are uniform. Unused with ambiguity "object".
+        adversarial_draw: Scope of a draw with that probability: "each" distractor; or the whole "scene", as
+            in the authors' code.
+        image_size: Height and width of the policy's image, 8..4096 px.
+        episode_length: Number of steps of an episode, 1..100000.
 
     Raises:
         ValueError: A setting is invalid; the message says what is valid.
@@ -37,7 +38,7 @@ class SceneConfig:
 
     ambiguity: str = "container"
     objects: str = "all"
-    adversarial_probability: float = ADVERSARIAL_PROBABILITY
+    adversarial_probability: float = 0.6
     adversarial_draw: str = "each"
     image_size: int = 48
     episode_length: int = EPISODE_STEPS
@@ -61,13 +62,13 @@ class SceneConfig:
                 raise ValueError(f"`{name}` must be an integer from {low} to {high}. Got {number!r}.")
 
     def check_tasks(self, task_ids: Iterable[int]) -> None:
-        """Checks that the objects include one that each task asks for.
+        """Checks that the objects include one that fits each task.
 
         Args:
             task_ids: Indices of tasks.
 
         Raises:
-            ValueError: A task does not exist, or asks for none of the objects.
+            ValueError: A task does not exist, or no object fits it.
         """
         labels = select_objects(self.objects)
         for task in {task.row: task for task in map(get_task, task_ids)}.values():
@@ -76,3 +77,6 @@ class SceneConfig:
                     f"Task {task.index} asks for a {task.object_phrase}, of which the objects "
                     f"{self.objects!r} have none. Choose other tasks, or other `objects`."
                 )
+
+
+DEFAULT_SCENE = SceneConfig()

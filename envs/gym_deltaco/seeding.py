@@ -1,4 +1,4 @@
-"""Seeds of episodes, so that training, validation and evaluation never show the same scene."""
+"""Seeds of episodes: training, validation and evaluation never show the same scene."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ SPLITS: tuple[str, ...] = get_args(Split)
 
 
 def episode_seed(seed: int, split: Split, task_id: int, episode: int, attempt: int = 0) -> int:
-    """The seed of one episode's `reset`, a function of what the episode is for.
+    """Derives the seed of an episode from its purpose.
 
     Args:
-        seed: The user's seed of the whole dataset or evaluation, at least 0.
-        split: Purpose of the episode.
-        task_id: Index of the task, 0..299, or 1000..1479 for those by color and shape.
-        episode: Number of the episode (or of the trial) of this task, from 0.
-        attempt: Number of attempts at this episode that failed before.
+        seed: Seed of the dataset or evaluation, at least 0.
+        split: "train", "validation" or "evaluation".
+        task_id: Index of the task, 0..299, or 1000..1479 for tasks by color and shape.
+        episode: Number of the episode or trial of this task, from 0.
+        attempt: Number of failed attempts at this episode.
 
     Returns:
-        A seed in [0, 2**63), for `env.reset(seed=...)`.
+        Seed for `env.reset(seed=...)`, 0..2**63 - 1.
 
     Raises:
         ValueError: The split is unknown, or a number is negative.

@@ -1,8 +1,8 @@
-"""A PyBullet client behind a small interface: the only module that uses PyBullet.
+"""A small interface to PyBullet, which no other module uses.
 
-Bodies are made from arrays, never from asset files: images from triangle meshes with a color for each face,
-contacts from boxes and convex hulls. A scene is rebuilt for every episode, because a rebuilt world repeats
-to the last bit, and one that is restored from a saved state does not.
+Bodies are made from arrays instead of asset files: triangle meshes with one color per face are rendered,
+boxes and convex hulls collide. A scene is rebuilt for every episode, because a rebuilt world is reproducible
+to the last bit, and one that is restored from a saved state is not.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from gym_deltaco.camera import Camera
-from gym_deltaco.quiet_pybullet import pybullet
+from gym_deltaco.pybullet_import import pybullet
 from gym_deltaco.solids import Mesh
 
 TIME_STEP = 1 / 240  # s
 GRAVITY = -10.0  # m/s²
-# Colors of meshes are looked up in one texture that holds every color of 16 levels in each channel.
+# All meshes share one texture, which holds every color of 16 levels in each channel.
 _COLOR_LEVELS = 16
 _TEXTURE_WIDTH = _TEXTURE_HEIGHT = 64
 _NO_SHAPE = -1
-_ANGULAR_DAMPING = 0.9  # of free bodies, 1/s: without it, round ones rock on their rims for seconds
+_ANGULAR_DAMPING = 0.9  # 1/s, of free bodies; without it, round ones rock on their rims for seconds
 _BASE = -1
 _CONTACT_NORMAL = 7  # field of a contact point
-# Depths closer than this may be equal: rounding alone can cause it. Depth is 0 at the near plane and 1 at the
-# far plane; in the scenes, this is a few micrometers.
+# Depths that differ by less may be equal, up to rounding. Depth is 0 at the near plane and 1 at the far
+# plane; in the scenes, the tolerance is a few micrometers.
 _DEPTH_TOLERANCE = 2e-6
 _MAX_BACKGROUNDS = 64
 
 
 class Box(NamedTuple):
-    """An axis-aligned box of a body's frame, for contacts."""
+    """A collision box, aligned with the axes of a body's frame."""
 
     center: tuple[float, float, float]  # m
     half_extents: tuple[float, float, float]  # m
 
 
 class Contact(NamedTuple):
-    """Surface properties of a body; PyBullet multiplies those of two touching bodies."""
+    """Surface properties of a body; PyBullet multiplies those of two bodies in contact."""
 
     lateral_friction: float = 1.0
     spinning_friction: float = 0.0  # m
@@ -60,7 +60,7 @@ _DEFAULT_CONTACT = Contact()
 
 
 class Pose(NamedTuple):
-    """Position and motion of a body in the world."""
+    """Pose and speed of a body in the world."""
 
     position: NDArray[np.float64]  # (3,), m
     rotation: NDArray[np.float64]  # (3, 3)
@@ -69,7 +69,7 @@ class Pose(NamedTuple):
 
 
 class _Background(NamedTuple):
-    """What a camera sees of the bodies that nothing moves."""
+    """Image of the static bodies."""
 
     pixels: NDArray[np.uint8]  # (size, size, 3)
     depths: NDArray[np.float32]  # (size, size)
@@ -77,7 +77,7 @@ class _Background(NamedTuple):
 
 @dataclass(frozen=True)
 class Link:
-    """A link of an articulated body, moved by one joint at its origin.
+    """A link of an articulated body, with a joint at its origin.
 
     Attributes:
         name: Name of the link.
@@ -86,11 +86,11 @@ class Link:
         axis: Axis of the joint in the link's frame.
         is_prismatic: Whether the joint slides (in m) instead of turning (in rad).
         is_rolled: Whether the link's frame is rolled by pi about the parent's x axis.
-        mass: kg.
+        mass: Mass, kg.
         inertia: Diagonal of the inertia tensor, kg m².
         mesh: Visible surface.
         boxes: Collision boxes, if any.
-        limits: Limits of the joint, m or rad; None for no limits.
+        limits: Lowest and highest position of the joint, m or rad; None for no limits.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Link:
 
 @functools.cache
 def camera_matrices(camera: Camera) -> tuple[Sequence[float], Sequence[float]]:
-    """View and projection matrices of a camera, 16 numbers each, in the form that PyBullet takes."""
+    """Returns the view and projection matrices of a camera, 16 numbers each in column-major order."""
     view = pybullet.computeViewMatrixFromYawPitchRoll(
         camera.target, camera.distance, camera.yaw, camera.pitch, roll=0, upAxisIndex=2
     )
@@ -119,13 +119,13 @@ def camera_matrices(camera: Camera) -> tuple[Sequence[float], Sequence[float]]:
 
 
 class Simulation:
-    """One world of PyBullet, without a window.
+    """A world of PyBullet, without a window.
 
-    The client is connected when an instance is made, and holds about 48 MB until `close`.
+    The constructor connects a client, which takes about 48 MB until `close`.
     """
 
     def __init__(self) -> None:
-        # PyBullet reads textures and unions of hulls from files only.
+        # PyBullet reads textures and unions of hulls from files.
         self._files = Path(tempfile.mkdtemp(prefix="gym_deltaco_"))
         self._texture_file = self._files / "colors.png"
         try:
@@ -137,10 +137,10 @@ class Simulation:
         self._release = weakref.finalize(self, _release, self._client, self._files, os.getpid())
         self._hull_files: dict[object, str] = {}
         self._texture = -1
-        # Body and link of what is visible; of what never moves, with what it looks like, and where it is.
+        # Visible parts, as body and link. Static parts have their mesh and position, as keys of backgrounds.
         self._static_parts: dict[tuple[int, int], tuple[object, ...]] = {}
         self._moving_parts: list[tuple[int, int]] = []
-        # Whether static and moving parts are visible; None after a change that was interrupted.
+        # Whether static and moving parts are shown; None after an interrupted change
         self._shown: tuple[bool, bool] | None = (True, True)
         self._backgrounds: dict[object, _Background] = {}
 
@@ -149,14 +149,14 @@ class Simulation:
         self._release()
 
     def __reduce__(self) -> NoReturn:
-        raise TypeError("A simulation cannot be copied or pickled: there is one client behind it.")
+        raise TypeError("A simulation cannot be copied or pickled, because it owns a PyBullet client.")
 
     def reset(self) -> None:
         """Empties the world."""
         pybullet.resetSimulation(physicsClientId=self._client)
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP,
-            # Up to 50 iterations, fewer where the contacts have converged: half the time of always 50.
+            # The threshold ends iterations early once contacts have converged, which halves the time.
             numSolverIterations=50,
             solverResidualThreshold=1e-4,
             deterministicOverlappingPairs=1,
@@ -180,9 +180,9 @@ class Simulation:
         position: ArrayLike = (0, 0, 0),
         contact: Contact = _DEFAULT_CONTACT,
     ) -> int:
-        """Adds a body that nothing moves. Returns its id."""
+        """Adds a static body with collision boxes, and returns its id."""
         body = self._add_body(mesh, self._boxes(boxes), position, yaw=0.0, mass=0.0, contact=contact)
-        self._add_static_part(body, mesh, position)
+        self._register_static_part(body, mesh, position)
         return body
 
     def add_free_body(
@@ -194,18 +194,18 @@ class Simulation:
         mass: float,
         contact: Contact = _DEFAULT_CONTACT,
     ) -> int:
-        """Adds a body that falls, and touches with the union of convex hulls.
+        """Adds a body that moves freely and collides as a union of convex hulls.
 
         Args:
             mesh: Visible surface, in the body's frame.
             hulls: Vertices of the hulls, (P, 3) each, m, in the body's frame.
             position: Position of the body's origin and center of mass, (3,), m.
             yaw: Angle about the vertical axis, rad.
-            mass: kg.
+            mass: Mass, kg.
             contact: Properties of its surface.
 
         Returns:
-            The body's id.
+            Id of the body.
         """
         body = self._add_body(mesh, self._hulls(mesh, hulls), position, yaw, mass, contact)
         self._show()
@@ -215,7 +215,7 @@ class Simulation:
     def add_articulated_body(
         self, base: Mesh, links: Sequence[Link], position: ArrayLike, contact: Contact
     ) -> int:
-        """Adds a chain of links on a fixed base. Joint i moves link i. Returns its id."""
+        """Adds a tree of links on a fixed base, where joint i moves link i, and returns its id."""
         body = pybullet.createMultiBody(
             baseMass=0,
             baseVisualShapeIndex=self._visual_shape(base),
@@ -237,7 +237,7 @@ class Simulation:
             physicsClientId=self._client,
         )
         self._paint(body, _BASE)
-        self._add_static_part(body, base, position)
+        self._register_static_part(body, base, position)
         self._moving_parts += [(body, link) for link in range(len(links))]
         for index, link in enumerate(links):
             self._paint(body, index)
@@ -322,33 +322,33 @@ class Simulation:
     # State
 
     def pose(self, body: int) -> Pose:
-        """Where a body is, and how it moves."""
+        """Returns the pose and speed of a body."""
         position, quaternion = pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
         linear, angular = pybullet.getBaseVelocity(body, physicsClientId=self._client)
         rotation = np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
         return Pose(np.array(position), rotation, math.hypot(*linear), math.hypot(*angular))
 
     def move(self, body: int, position: ArrayLike, yaw: float = 0.0) -> None:
-        """Puts a body somewhere, upright and without motion."""
+        """Moves a body to a position, (3,), m, and a yaw, rad, upright and at rest."""
         quaternion = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
         pybullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=self._client)
 
     def touch(self, body: int, other: int) -> bool:
-        """Whether two bodies touch, as of the last step."""
+        """Returns whether two bodies were in contact in the last step."""
         return bool(pybullet.getContactPoints(body, other, physicsClientId=self._client))
 
     def presses(self, body: int, other: int, other_link: int, axis: int) -> bool:
-        """Whether a body and a link of another press on each other, mostly along an axis of the world."""
+        """Returns whether a body and a link of another one press on each other along an axis of the world."""
         contacts = pybullet.getContactPoints(body, other, linkIndexB=other_link, physicsClientId=self._client)
         return any(abs(contact[_CONTACT_NORMAL][axis]) > math.sqrt(0.5) for contact in contacts)
 
     def joint_positions(self, body: int, joints: Sequence[int]) -> NDArray[np.float64]:
-        """Angles (rad) or distances (m) of joints, (len(joints),)."""
+        """Returns positions of joints, (len(joints),), rad or m."""
         states = pybullet.getJointStates(body, joints, physicsClientId=self._client)
         return np.array([state[0] for state in states])
 
     def set_joint_positions(self, body: int, positions: ArrayLike) -> None:
-        """Puts all joints of a body somewhere at once, without motion."""
+        """Sets the positions of all joints of a body, rad or m, at rest."""
         for joint, position in enumerate(np.asarray(positions)):
             pybullet.resetJointState(body, joint, position, physicsClientId=self._client)
 
@@ -360,14 +360,14 @@ class Simulation:
         max_forces: Sequence[float],
         gains: Sequence[float],
     ) -> None:
-        """Sets what the joints' motors hold from the next step on.
+        """Sets the targets of the joints' motors from the next step on.
 
         Args:
             body: Id of the articulated body.
             joints: Indices of the joints.
-            positions: Targets, rad or m.
-            max_forces: N m or N.
-            gains: Share of the position error that a motor corrects in one step, 0..1.
+            positions: Target positions, rad or m.
+            max_forces: Largest torques or forces, N m or N.
+            gains: Fraction of the position error that a motor corrects in one step, 0..1.
         """
         pybullet.setJointMotorControlArray(
             body,
@@ -380,7 +380,7 @@ class Simulation:
         )
 
     def mirror_joints(self, body: int, joints: tuple[int, int], axis: ArrayLike, max_force: float) -> None:
-        """Couples two joints, so that both are always equally far from zero."""
+        """Couples two joints so that both keep the same distance from zero."""
         constraint = pybullet.createConstraint(
             body,
             joints[0],
@@ -399,22 +399,22 @@ class Simulation:
     # Images
 
     def render(self, camera: Camera, size: int) -> NDArray[np.uint8]:
-        """An image, (size, size, 3), by PyBullet's software renderer (the same on every machine).
+        """Renders an image, (size, size, 3) uint8, in software (the same on every machine).
 
-        What never moves takes two thirds of the renderer's time. It is rendered once, and all else is put
-        before it by the depth of each pixel. The image is that of all bodies together, to the last bit: where
-        two depths are too close to tell which is nearer, all are rendered together.
+        Static bodies take two thirds of the time. They are rendered once; moving bodies are then composed
+        with this background by the depth of each pixel. The result is the image of all bodies, to the last
+        bit: where two depths are too close to compare, all bodies are rendered together.
         """
         background = self._background(camera, size)
         self._show(static=False)
         pixels, depths = self._image(camera, size)
-        lead = depths - background.depths  # below 0 where something moving is nearer
-        is_something = depths < 1 - _DEPTH_TOLERANCE
-        if (is_something & (np.abs(lead) < _DEPTH_TOLERANCE)).any():
+        difference = depths - background.depths  # negative where a moving body is nearer
+        is_covered = depths < 1 - _DEPTH_TOLERANCE
+        if (is_covered & (np.abs(difference) < _DEPTH_TOLERANCE)).any():
             self._show()
             return np.ascontiguousarray(self._image(camera, size)[0])
         image = background.pixels.copy()
-        np.copyto(image, pixels, where=(is_something & (lead < 0))[..., None])
+        np.copyto(image, pixels, where=(is_covered & (difference < 0))[..., None])
         return image
 
     def _background(self, camera: Camera, size: int) -> _Background:
@@ -427,12 +427,12 @@ class Simulation:
             self._backgrounds[key] = _Background(np.ascontiguousarray(pixels), depths)
         return self._backgrounds[key]
 
-    def _add_static_part(self, body: int, mesh: Mesh, position: ArrayLike) -> None:
+    def _register_static_part(self, body: int, mesh: Mesh, position: ArrayLike) -> None:
         self._show()
         self._static_parts[body, _BASE] = (mesh, *np.asarray(position, dtype=np.float64).tolist())
 
     def _show(self, static: bool = True, moving: bool = True) -> None:
-        """Shows or hides all parts of a kind. The renderer leaves out what is fully transparent."""
+        """Shows or hides all static and all moving parts. The renderer skips fully transparent ones."""
         before, self._shown = self._shown or (None, None), None
         kinds = (self._static_parts, self._moving_parts)
         for parts, was_visible, is_visible in zip(kinds, before, (static, moving), strict=True):
@@ -443,7 +443,7 @@ class Simulation:
         self._shown = static, moving
 
     def _image(self, camera: Camera, size: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """The visible bodies' colors, (size, size, 3), and depths, (size, size)."""
+        """Renders colors, (size, size, 3), and depths, (size, size), of the visible parts."""
         view, projection = camera_matrices(camera)
         _, _, pixels, depths, _ = pybullet.getCameraImage(
             size,
@@ -460,31 +460,29 @@ class Simulation:
             flags=pybullet.ER_NO_SEGMENTATION_MASK,
             physicsClientId=self._client,
         )
-        # Tuples of numbers, if PyBullet was built without NumPy.
+        # They are tuples if PyBullet was built without NumPy.
         image = np.asarray(pixels, dtype=np.uint8).reshape(size, size, 4)
         return image[..., :3], np.asarray(depths, dtype=np.float32).reshape(size, size)
 
 
 def _connect() -> int:
-    """Connects a client without a window. Returns its id."""
+    """Connects a client without a window, and returns its id."""
     client = pybullet.connect(pybullet.DIRECT)
     if client < 0:
-        raise RuntimeError(
-            "PyBullet has no free client left. Close the environments that are no longer used."
-        )
+        raise RuntimeError("PyBullet has no free client left. Close environments that are no longer used.")
     return client
 
 
 def _release(client: int, files: Path, process: int) -> None:
-    """Frees what a simulation holds, when it is closed, forgotten, or the interpreter ends."""
-    # A forked process has a copy of the client, but not of the files.
+    """Disconnects the client of a simulation, and removes its files."""
+    # A forked process has its own copy of the client, but shares the files.
     if os.getpid() == process:
         shutil.rmtree(files, ignore_errors=True)
     pybullet.disconnect(physicsClientId=client)
 
 
 def _color_texture() -> Image.Image:
-    """Every color of 16 levels in each channel, 64 x 64, in the order of `_texture_coordinates`."""
+    """Draws a texture of all colors of 16 levels in each channel, 64 x 64 px."""
     code = np.arange(_COLOR_LEVELS**3)
     levels = np.stack(
         [code // _COLOR_LEVELS**2, code // _COLOR_LEVELS % _COLOR_LEVELS, code % _COLOR_LEVELS], axis=-1
@@ -494,17 +492,17 @@ def _color_texture() -> Image.Image:
 
 
 def _texture_coordinates(colors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where the texture has the color nearest to each of `colors`, (N, 3) in 0..1. Returns (N, 2) in 0..1."""
+    """Returns coordinates, (N, 2) in 0..1, of the texture's colors that are nearest to `colors`, (N, 3)."""
     levels = np.rint(np.asarray(colors) * (_COLOR_LEVELS - 1)).astype(int)
     code = levels @ (_COLOR_LEVELS**2, _COLOR_LEVELS, 1)
     row, column = np.divmod(code, _TEXTURE_WIDTH)
     return np.stack([(column + 0.5) / _TEXTURE_WIDTH, 1 - (row + 0.5) / _TEXTURE_HEIGHT], axis=-1)
 
 
-# Not all of thousands of random objects, which would take gigabytes in each process, at 254 kB each.
+# At 254 kB each, thousands of random objects would take gigabytes in each process.
 @functools.lru_cache(maxsize=1000)
 def _visual_arrays(mesh: Mesh) -> tuple[list, list, list, list]:
-    """Vertices, normals, texture coordinates and indices for PyBullet; no two faces share a vertex."""
+    """Returns vertices, normals, texture coordinates and indices for PyBullet; faces share no vertices."""
     corners = mesh.faces.reshape(-1)
     uvs = np.repeat(_texture_coordinates(mesh.colors), 3, axis=0)
     return (
@@ -516,7 +514,7 @@ def _visual_arrays(mesh: Mesh) -> tuple[list, list, list, list]:
 
 
 def _obj_text(hulls: Sequence[NDArray[np.float64]]) -> str:
-    """Convex hulls as groups of a Wavefront file, of whose faces PyBullet only takes the points."""
+    """Formats convex hulls as groups of a Wavefront file; PyBullet uses the vertices of their faces."""
     lines = []
     first = 1
     for index, points in enumerate(hulls):

@@ -1,8 +1,8 @@
-"""Solids from code: an outline, scaled and stacked along a profile, becomes a colored triangle mesh.
+"""Parametric solids: an outline, scaled and stacked along a profile, becomes a colored triangle mesh.
 
-A vase is a circle stacked along its silhouette, a bin is a square, a canoe a pointed oval. A `Loft` says so
-as data; `Loft.mesh` makes its triangles, and `Loft.points` the corners of a collision part. Lengths are in
-whatever unit the caller likes.
+A vase is a circle stacked along its silhouette, a bin a square, a canoe a pointed oval. A `Loft` describes
+such a solid; `Loft.mesh` makes its triangles, and `Loft.points` the corners of a collision part. Lengths have
+any unit.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ Center = float | tuple[float, float, float]
 Paint = Color | Sequence[Color]
 Row = tuple[Radius, Center] | tuple[Radius, Center, Paint]
 
+# Triangles of a smaller area, relative to the squared diagonal of the bounding box, are dropped
 _MIN_AREA = 1e-9
-"""Triangles of a smaller relative area, as a share of the bounding box's squared diagonal, are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh with one color per face. Faces that share a vertex are shaded smoothly into each other.
+    """A triangle mesh with one color per face. Shading is smooth across faces that share a vertex.
 
     Attributes:
-        vertices: Positions, shape (V, 3).
-        normals: Unit normals of the vertices, shape (V, 3).
-        faces: Indices of vertices, counter-clockwise seen from outside, shape (F, 3).
-        colors: RGB in [0, 1], shape (F, 3).
+        vertices: Positions, (V, 3).
+        normals: Unit normals of the vertices, (V, 3).
+        faces: Indices of vertices, counterclockwise seen from outside, (F, 3).
+        colors: RGB in [0, 1], (F, 3).
     """
 
     vertices: np.ndarray
@@ -40,17 +40,17 @@ class Mesh:
     colors: np.ndarray
 
     def __post_init__(self) -> None:
-        """Meshes are shared, so nobody may write to them."""
+        """Makes the arrays read-only, since meshes are shared."""
         for array in (self.vertices, self.normals, self.faces, self.colors):
             array.setflags(write=False)
 
     @property
     def triangles(self) -> np.ndarray:
-        """Corners of the faces, shape (F, 3, 3): face, corner, xyz."""
+        """Corners of the faces, (F, 3, 3): face, corner, xyz."""
         return self.vertices[self.faces]
 
     def moved(self, offset: Sequence[float] | np.ndarray, scale: float = 1.0) -> Mesh:
-        """The mesh shifted by `offset` (x, y, z), and then scaled."""
+        """Returns the mesh shifted by `offset` (x, y, z), then scaled."""
         return Mesh((self.vertices + np.asarray(offset)) * scale, self.normals, self.faces, self.colors)
 
 
@@ -59,18 +59,18 @@ class Loft:
     """An outline in the xy plane, stacked along z.
 
     Attributes:
-        outline: Unit outline, counter-clockwise and star-shaped about the axis, shape (n, 2); or (n, 3): the
-            third column lifts its points by a length.
-        profile: A row per ring, along the surface from the bottom, outside, to the top (and on inwards, for
-            something hollow): (radius, center) or (radius, center, paint). The radius scales the outline,
-            in x and y alike or as (x, y). The center is a height on the axis or a point (x, y, z). The paint
-            is the color of the surface that arrives at this ring, or several that alternate around it; it
-            stays until another row changes it. Both ends are closed by caps.
-        closed: Join the last ring to the first one, as for a torus, instead of capping the ends.
-        tilt: Turn about the y axis, degrees, before the rest.
-        turn: Turn about the z axis, degrees, after `tilt`.
-        offset: Shift (x, y, z), last.
-        crease: Edges with a sharper angle than this stay hard, degrees.
+        outline: Unit outline, counterclockwise and star-shaped about the axis, (n, 2); or (n, 3), with
+            heights of its points.
+        profile: Rings from the bottom along the outside to the top, and on along the inside of a hollow
+            solid: (radius, center) or (radius, center, paint). The radius scales the outline, equally or as
+            (x, y). The center is a height on the axis or a point (x, y, z). The paint is the color of the
+            surface between the previous ring and this one, or several colors that alternate around it; it
+            stays until another ring changes it. Caps close both ends.
+        closed: Whether the last ring is joined to the first one, as in a torus, instead of capping both.
+        tilt: Rotation about the y axis, degrees; applied first.
+        turn: Rotation about the z axis, degrees; applied second.
+        offset: Translation (x, y, z); applied last.
+        crease: Angle between faces above which their edge is not smoothed, degrees.
     """
 
     outline: np.ndarray
@@ -82,17 +82,17 @@ class Loft:
     crease: float = 40.0
 
     def points(self) -> np.ndarray:
-        """All points of all rings, shape (rows * n, 3): the corners of a collision part."""
+        """Returns the points of all rings, (rows * n, 3), which are the corners of a collision part."""
         return np.concatenate([self._ring(row) for row in self.profile])
 
     def mesh(self) -> Mesh:
-        """The surface.
+        """Returns the surface.
 
         Raises:
-            ValueError: The first row has no paint.
+            ValueError: The first ring has no paint.
         """
         if len(self.profile[0]) < 3:
-            raise ValueError(f"The first row of a profile needs a paint. Got {self.profile[0]!r}.")
+            raise ValueError(f"The first ring of a profile needs a paint. Got {self.profile[0]!r}.")
         if self.closed:
             rows = [*self.profile, self.profile[0]]
         else:
@@ -111,7 +111,7 @@ class Loft:
         return shaded(np.concatenate(triangles), np.concatenate(colors), self.crease)
 
     def _ring(self, row: Row) -> np.ndarray:
-        """One ring of points in space, shape (n, 3)."""
+        """Returns the points of one ring, (n, 3)."""
         radius, center = row[:2]
         ring = np.zeros((len(self.outline), 3))
         if np.any(radius):
@@ -122,12 +122,12 @@ class Loft:
 
 
 def shaded(triangles: np.ndarray, colors: np.ndarray, crease: float) -> Mesh:
-    """A mesh of loose triangles: smooth where the faces at a corner meet gently, hard elsewhere.
+    """Makes a mesh of triangles, and smooths the edges between faces that meet at a small angle.
 
     Args:
-        triangles: Shape (F, 3, 3): face, corner, xyz. Degenerate ones are dropped.
-        colors: Shape (F, 3).
-        crease: Faces that meet at a sharper angle are not smoothed, degrees.
+        triangles: (F, 3, 3): face, corner, xyz. Degenerate triangles are dropped.
+        colors: RGB in [0, 1], (F, 3).
+        crease: Largest angle between faces whose edge is smoothed, degrees.
     """
     flat = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(flat, axis=1)
@@ -138,21 +138,21 @@ def shaded(triangles: np.ndarray, colors: np.ndarray, crease: float) -> Mesh:
     angle = np.arccos(np.clip(-np.einsum("fci,fci->fc", sides, np.roll(sides, 1, axis=1)), -1.0, 1.0))
 
     corners = triangles.reshape(-1, 3)
-    place = np.unique(corners.round(6), axis=0, return_inverse=True)[1].ravel()
+    point = np.unique(corners.round(6), axis=0, return_inverse=True)[1].ravel()
     face = np.repeat(np.arange(len(triangles)), 3)
-    gentle = (flat @ flat.T > np.cos(np.radians(crease)))[face][:, face]
-    blend = (place[:, None] == place) & gentle  # (3F, 3F): corners whose faces share a normal
+    is_smooth = (flat @ flat.T > np.cos(np.radians(crease)))[face][:, face]
+    blend = (point[:, None] == point) & is_smooth  # (3F, 3F): corners whose faces share a normal
     normals = blend @ (flat[face] * angle.reshape(-1, 1))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
 
     _, first, faces = np.unique(
-        np.column_stack([place, normals.round(6)]), axis=0, return_index=True, return_inverse=True
+        np.column_stack([point, normals.round(6)]), axis=0, return_index=True, return_inverse=True
     )
     return Mesh(corners[first], normals[first], faces.reshape(-1, 3), colors)
 
 
 def merged(meshes: Iterable[Mesh]) -> Mesh:
-    """Several meshes as one."""
+    """Joins several meshes into one."""
     meshes = list(meshes)
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return Mesh(
@@ -164,16 +164,16 @@ def merged(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def polygon(sides: int, radii: Sequence[float] = (1.0,)) -> np.ndarray:
-    """A regular polygon with a corner on the x axis; or a star, whose radii alternate. Shape (sides, 2)."""
+    """Returns a regular polygon with a corner on the x axis, or a star with alternating radii, (sides, 2)."""
     angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     return np.column_stack([np.cos(angle), np.sin(angle)]) * np.resize(radii, (sides, 1))
 
 
 def rounded_square(corner: float) -> np.ndarray:
-    """The square of half side 1 with its corners rounded off by three points each, shape (12, 2).
+    """Returns a square of half side 1 whose corners are rounded with three points each, (12, 2).
 
     Args:
-        corner: Radius of the corners, in (0, 1).
+        corner: Radius of the corners, 0..1.
     """
     angle = np.radians([0.0, 45.0, 90.0])
     arc = 1.0 - corner + corner * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -181,11 +181,11 @@ def rounded_square(corner: float) -> np.ndarray:
 
 
 def pointed_oval(sides: int, lift: float = 0.0) -> np.ndarray:
-    """The outline of a boat along y, shape (sides, 3).
+    """Returns the outline of a boat along y, (sides, 3).
 
     Args:
         sides: Number of corners, a multiple of 4; two of them are the tips.
-        lift: Height of the tips above the middle.
+        lift: Height of the tips above the center.
     """
     along = np.linspace(-1.0, 1.0, sides // 2 + 1)[:-1]
     starboard = np.column_stack([1.0 - np.abs(along) ** 2.6, along, lift * np.abs(along) ** 4])
@@ -193,7 +193,7 @@ def pointed_oval(sides: int, lift: float = 0.0) -> np.ndarray:
 
 
 def _rotation(degrees: float, axis: int) -> np.ndarray:
-    """Rotation about a coordinate axis, counter-clockwise, shape (3, 3)."""
+    """Returns a counterclockwise rotation about a coordinate axis, (3, 3)."""
     cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)
@@ -202,7 +202,7 @@ def _rotation(degrees: float, axis: int) -> np.ndarray:
     return matrix
 
 
-# Outlines that several objects have.
+# Outlines of several objects
 CIRCLE, OCTAGON = polygon(12), polygon(8)
 ROUNDED = rounded_square(0.5)
 SQUARE = np.array([(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)])

@@ -1,11 +1,11 @@
-"""The 300 tasks as data: which object goes into which container, and on which a scenario trains and tests.
+"""The 300 tasks and their splits, as data.
 
-Rows of the task table are what is asked for: 32 objects by name (rows 0..31), 8 colors (32..39) and 10
-shapes (40..49). Columns are the container: green, red, front, back, left, right. The index of a task is
-`50 * column + row` (paper, appendix A). Nothing here depends on a simulator.
+Rows of the task table are objects: 32 names (rows 0..31), 8 colors (32..39) and 10 shapes (40..49). Columns
+are containers: green, red, front, back, left, right. The index of a task is `50 * column + row` (paper,
+appendix A).
 
-Beyond the paper's table, 80 rows ask for an object by its color and its shape together, since random objects
-have no names: rows 50..129, `50 + 10 * color + shape`. Their tasks are `1000 + 80 * column + row - 50`.
+Beyond the paper's table, 80 rows (50..129) ask for an object by color and shape, `50 + 10 * color + shape`,
+since random objects have no names. The index of such a task is `1000 + 80 * column + row - 50`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from types import MappingProxyType
 from typing import Literal
 
@@ -40,12 +41,12 @@ CONTAINER_WORDS: tuple[ContainerWord, ...] = ("green", "red", "front", "back", "
 
 @dataclass(frozen=True)
 class ObjectLabel:
-    """Name, shape and color of an object. Its geometry is in `gym_deltaco.objects` or `random_objects`.
+    """Name, shape and color of an object; its geometry is in `gym_deltaco.objects` or `random_objects`.
 
     Attributes:
-        index: 0..31 for the paper's objects, in the order of its table, where 0..23 are scenario A's training
-            objects; 32..10007 for random ones.
-        name: Name of the object, such as "conic cup"; a random one's is in no instruction.
+        index: 0..31 for the paper's objects, in the order of its table (0..23 are scenario A's training
+            objects); 32..10007 for random objects.
+        name: Name of the object, such as "conic cup". No instruction uses the name of a random object.
         shape: One of `SHAPES`.
         color: One of `COLORS`.
     """
@@ -107,31 +108,31 @@ _PAIR_TASKS = range(1000, 1000 + N_COLUMNS * _N_PAIRS)
 
 @dataclass(frozen=True)
 class Task:
-    """A task: an object, asked for by name, color, shape, or color and shape, and a container.
+    """A task: put an object, given by name, color, shape, or color and shape, into a container.
 
     Attributes:
-        index: 0..299, `50 * column + row`; or 1000..1479, by color and shape.
+        index: 0..299, `50 * column + row`; or 1000..1479 for tasks by color and shape.
     """
 
     index: int
 
     @property
     def row(self) -> int:
-        """0..49: 32 names, 8 colors, 10 shapes; 50..129: pairs of a color and a shape."""
+        """Row of the task table: 0..31 names, 32..39 colors, 40..49 shapes, 50..129 colors with shapes."""
         if self.index in _PAIR_TASKS:
             return N_ROWS + (self.index - _PAIR_TASKS.start) % _N_PAIRS
         return self.index % N_ROWS
 
     @property
     def column(self) -> int:
-        """0..5, an index into `CONTAINER_WORDS`."""
+        """Column of the task table, 0..5: an index into `CONTAINER_WORDS`."""
         if self.index in _PAIR_TASKS:
             return (self.index - _PAIR_TASKS.start) // _N_PAIRS
         return self.index // N_ROWS
 
     @property
     def kind(self) -> TaskKind:
-        """Word by which the instruction names the object."""
+        """Property by which the instruction describes the object."""
         if self.row < _FIRST_COLOR_ROW:
             return "name"
         if self.row >= N_ROWS:
@@ -140,21 +141,21 @@ class Task:
 
     @property
     def container(self) -> ContainerWord:
-        """The word that singles out the container."""
+        """Word by which the instruction describes the container."""
         return CONTAINER_WORDS[self.column]
 
     @property
     def is_position_task(self) -> bool:
-        """Whether the container is asked for by its place (front, back, left, right), not by its color."""
+        """Whether the container is described by its position (front, back, left, right), not its color."""
         return self.container not in CONTAINER_COLORS
 
     @cached_property
     def targets(self) -> tuple[int, ...]:
-        """Indices of those of the paper's 32 objects that the instruction describes."""
+        """Indices of the paper's objects that the instruction describes."""
         return tuple(label.index for label in OBJECTS if self.describes(label))
 
     def describes(self, label: ObjectLabel) -> bool:
-        """Whether an object is what the instruction asks for."""
+        """Returns whether the instruction describes an object."""
         if self.kind == "name":
             return label.index == self.row
         if self.kind == "color":
@@ -165,21 +166,21 @@ class Task:
 
     @property
     def _color(self) -> str:
-        """The color that a task by color, or by color and shape, asks for."""
+        """Color of a task by color, or by color and shape."""
         return COLORS[
             self.row - _FIRST_COLOR_ROW if self.kind == "color" else (self.row - N_ROWS) // len(SHAPES)
         ]
 
     @property
     def _shape(self) -> str:
-        """The shape that a task by shape, or by color and shape, asks for."""
+        """Shape of a task by shape, or by color and shape."""
         return SHAPES[
             self.row - _FIRST_SHAPE_ROW if self.kind == "shape" else (self.row - N_ROWS) % len(SHAPES)
         ]
 
     @property
     def object_phrase(self) -> str:
-        """The object as the instruction calls it, such as "blue colored object"."""
+        """Object in the words of the instruction, such as "blue colored object"."""
         if self.kind == "name":
             label = OBJECTS[self.row]
             return f"{label.color} colored, {label.shape} shaped {label.name}"
@@ -191,7 +192,7 @@ class Task:
 
     @property
     def instruction(self) -> str:
-        """The sentence, such as "Put blue colored object in front bin."."""
+        """Template sentence, such as "Put blue colored object in front bin."."""
         return f"Put {self.object_phrase} in {self.container} bin."
 
 
@@ -204,10 +205,10 @@ class Scenario:
     """A split of the rows of the task table; every row comes with all six containers.
 
     Attributes:
-        name: "a" or "b" for the paper's, "a_validation" for the one that settings are chosen on,
-            "a_clean" for the one whose training shows no test object.
-        train_rows: Rows whose tasks are trained on.
-        test_rows: Rows whose tasks are held out of training.
+        name: "a" or "b" for the paper's scenarios; "a_validation" for choosing settings; "a_clean" for
+            training without test objects.
+        train_rows: Rows of the training tasks.
+        test_rows: Rows of the test tasks.
     """
 
     name: str
@@ -232,18 +233,18 @@ def _tasks_of_rows(rows: Iterable[int]) -> tuple[int, ...]:
 
 SCENARIOS = MappingProxyType(
     {
-        # Novel objects, colors and shapes.
+        # Novel objects, colors and shapes
         "a": Scenario(
             "a", train_rows=(*range(24), *range(36, 45)), test_rows=(*range(24, 36), *range(45, 50))
         ),
-        # All objects are known by name; colors and shapes are novel.
+        # All objects are trained on by name; colors and shapes are novel.
         "b": Scenario(
             "b", train_rows=(*range(32), *range(36, 45)), test_rows=(*range(32, 36), *range(45, 50))
         ),
     }
 )
 
-# Held out of scenario A's training rows to choose settings on; see `VALIDATION`.
+# Training rows of scenario A that are held out for choosing settings; see `VALIDATION`
 _VALIDATION_ROWS = (6, 10, 12, 16, 36, 38, 40, 44)
 
 VALIDATION = Scenario(
@@ -251,26 +252,26 @@ VALIDATION = Scenario(
     train_rows=tuple(row for row in SCENARIOS["a"].train_rows if row not in _VALIDATION_ROWS),
     test_rows=_VALIDATION_ROWS,
 )
-"""Scenario A's training tasks, split once more: settings are chosen on 48 of them, never on the test tasks.
+"""Scenario A's 198 training tasks, split once more, so that settings are never chosen on test tasks.
 
-Held out are four names (narrow tray, pacifier vase, crooked lid trash can, modern canoe), two colors (white,
-orange) and two shapes (vase, canoe); the other 150 tasks are trained on meanwhile, and the final model is
-trained on all 198. The rows were chosen from the table alone, before any result, by a rule that makes these
-tasks resemble the test tasks:
+The 48 validation tasks are four names (narrow tray, pacifier vase, crooked lid trash can, modern canoe), two
+colors (white, orange) and two shapes (vase, canoe). Settings are chosen by training on the other 150 tasks;
+the final model trains on all 198. The rows were chosen from the table alone, before any result, so that
+validation tasks resemble the test tasks:
 
-1. A held-out object is never a target: no remaining row asks for its name, color or shape. It still stands in
-   training scenes as a distractor, as the test objects do.
-2. Each held-out color and shape has two objects or more, of which at least one is held out by name as well,
-   and at least one remains a target under its own name.
-3. The four objects have four different colors and four different shapes, and one of the shapes (cylinder) is
-   in no remaining instruction, as "round hole" is in none of scenario A's.
-4. Two of the objects are low and oblong (the tray and the canoe), two upright.
+1. A held-out object is never a target in training: no other training row describes it. It is still a
+   distractor in training scenes, as the test objects are.
+2. Each held-out color and shape has at least two objects. At least one of them is held out by name as well,
+   and at least one remains a target by name.
+3. The four objects have four different colors and shapes. One of the shapes (cylinder) is in no training
+   instruction, as "round hole" is in none of scenario A.
+4. Two of the objects are low and oblong (tray and canoe), two upright.
 
-Scenario A itself breaks the first point: its test object 29 is the target of the six yellow training tasks.
+Scenario A itself breaks the first rule: its test object 29 is the target of the six yellow training tasks.
 """
 
-# Scenario A without its yellow tasks, which ask for a test object. With the objects "scenario_a_train" of
-# `gym_deltaco.object_sets`, its training shows no test object at all.
+# Scenario A without its yellow tasks, whose target is a test object. With the objects "scenario_a_train", no
+# training scene shows a test object.
 _YELLOW_ROW = _FIRST_COLOR_ROW + COLORS.index("yellow")
 CLEAN = Scenario(
     "a_clean",
@@ -278,7 +279,7 @@ CLEAN = Scenario(
     test_rows=SCENARIOS["a"].test_rows,
 )
 
-# What random objects may be: they share shape and color with no test object of scenario A.
+# Colors and shapes of random objects, which no test object of scenario A has
 _TEST_PAIRS = {(label.color, label.shape) for label in OBJECTS if label.index in SCENARIOS["a"].test_rows}
 COLOR_SHAPE_PAIRS = tuple(
     (color, shape) for color in COLORS for shape in SHAPES if (color, shape) not in _TEST_PAIRS
@@ -298,52 +299,43 @@ TASK_SETS = MappingProxyType(
         "scenario_a_validation": VALIDATION.test_tasks,
         "scenario_a_clean_train": CLEAN.train_tasks,
         "scenario_a_clean_test": CLEAN.test_tasks,
-        # With the objects "random:N": scenario A's training tasks, and those by color and shape.
+        # For the objects "random:N": scenario A's training tasks, and tasks by color and shape
         "random_train": (*SCENARIOS["a"].train_tasks, *_COLOR_SHAPE_TASKS),
     }
 )
 
 
-def is_task(index: int) -> bool:
-    """Whether there is a task of an index."""
-    return 0 <= index < N_TASKS or index in _PAIR_TASKS
-
-
 def get_task(index: int) -> Task:
-    """The task of an index.
+    """Returns the task of an index.
 
     Args:
-        index: 0..299 for the paper's tasks, 1000..1479 for those by color and shape.
+        index: 0..299 for the paper's tasks, 1000..1479 for tasks by color and shape.
 
     Raises:
-        ValueError: There is no task of that index.
+        ValueError: The index is not an integer, or out of range.
     """
-    try:
-        number = int(index)
-        is_valid = number == index and is_task(number)
-    except (TypeError, ValueError, OverflowError):
-        is_valid = False
-    if not is_valid:
+    is_integer = isinstance(index, Integral) and not isinstance(index, bool)
+    if not is_integer or not (0 <= index < N_TASKS or index in _PAIR_TASKS):
         raise ValueError(
-            f"`task_id` must be an integer from 0 to {N_TASKS - 1}. Got {index!r}. Tasks by color and shape "
-            f"are {_PAIR_TASKS.start} to {_PAIR_TASKS.stop - 1}."
+            f"`task_id` must be an integer from 0 to {N_TASKS - 1}, or from {_PAIR_TASKS.start} to "
+            f"{_PAIR_TASKS.stop - 1} for tasks by color and shape. Got {index!r}."
         )
-    return TASKS[number] if number < N_TASKS else Task(number)
+    return TASKS[int(index)] if index < N_TASKS else Task(int(index))
 
 
 def select_tasks(selection: str) -> tuple[int, ...]:
-    """The tasks that a selection names, in the order given, each once.
+    """Parses a selection of tasks.
 
     Args:
-        selection: Names of task sets, indices and ranges (both ends included), separated by commas:
-            "scenario_a_test", "4", "4,50-73", "scenario_b_test,0-9".
+        selection: Names of task sets, indices and inclusive ranges, separated by commas: "scenario_a_test",
+            "4,50-73", "scenario_b_test,0-9".
 
     Returns:
-        Indices of tasks, at least one.
+        Indices of the selected tasks in the order of the selection, each once; at least one.
 
     Raises:
-        ValueError: Something in the selection is not a task set, an index or a range; an index is out of
-            range; or nothing is selected.
+        ValueError: A part of the selection is not a task set, an index or a range; an index is out of range;
+            or the selection is empty.
     """
     selected: list[int] = []
     for term in filter(None, (part.strip() for part in selection.split(","))):
@@ -353,17 +345,17 @@ def select_tasks(selection: str) -> tuple[int, ...]:
         elif span is None:
             raise ValueError(
                 f"Unknown task selection {term!r}. Valid are the task sets {', '.join(TASK_SETS)}, and "
-                f"indices and ranges of 0 to {N_TASKS - 1}, separated by commas, such as '4,50-73'."
+                f"indices and ranges from 0 to {N_TASKS - 1}, separated by commas, such as '4,50-73'."
             )
         else:
             first, last = int(span[1]), int(span[2] or span[1])
             if last < first:
-                raise ValueError(f"The range {term!r} is empty: its end lies before its start.")
+                raise ValueError(f"The range {term!r} is empty. Write the smaller index first.")
             get_task(first), get_task(last)
             selected.extend(get_task(index).index for index in range(first, last + 1))
     if not selected:
         raise ValueError(
-            f"The task selection {selection!r} is empty. Name a task set ({', '.join(TASK_SETS)}) or indices "
-            "such as '4,50-73'."
+            f"The task selection {selection!r} is empty. Valid are the task sets {', '.join(TASK_SETS)}, and "
+            f"indices and ranges from 0 to {N_TASKS - 1}, separated by commas, such as '4,50-73'."
         )
     return tuple(dict.fromkeys(selected))

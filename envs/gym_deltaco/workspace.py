@@ -1,7 +1,7 @@
-"""Where things are: the table, the tray, its four quadrants, the containers and the camera.
+"""Positions and sizes of the table, the tray, its four quadrants, the containers and the camera.
 
-The origins of the numbers are the paper's appendix and the authors' published settings. A quadrant is a pair
-(i, j): i is 0 on the right of the image and 1 on its left, j is 0 at the back, near the robot, 1 in front.
+The numbers are from the paper's appendix and the authors' published settings. A quadrant is a pair (i, j): i
+is 0 on the right of the image and 1 on the left; j is 0 at the back, near the robot, and 1 in front.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CONTAINER_FLOOR = TRAY_FLOOR + CONTAINER_FLOOR_THICKNESS  # m
 CONTAINER_WALL_HEIGHT = 0.022  # m above the tray's floor
 CONTAINER_WALL_THICKNESS = 0.004  # m
 
-DROP_HEIGHT = -0.30  # m, of an object's middle when it is let fall into the tray
+DROP_HEIGHT = -0.30  # m, height of an object's center when it is dropped into the tray
 CAMERA = Camera(target=(0.6, 0.2, -0.28), distance=0.37, yaw=180, pitch=-40)
 
 
@@ -46,12 +46,12 @@ class Quadrant(NamedTuple):
 
     @property
     def container_center(self) -> NDArray[np.float64]:
-        """Where a container stands, (2,), m."""
+        """Center of a container in the quadrant, (2,), m."""
         return np.array([0.515 + 0.16 * self.i, 0.18 + 0.14 * self.j])
 
     @property
     def object_region(self) -> Region:
-        """Where the middle of an object may be: inset by 38 mm on the sides to the tray's middle."""
+        """Region of the centers of objects, inset by 38 mm on the two sides that face the tray's center."""
         low = np.array([0.44 + 0.15 * self.i, 0.14 + 0.12 * self.j])
         high = np.array([0.59 + 0.15 * self.i, 0.26 + 0.12 * self.j])
         inset = 0.038
@@ -60,12 +60,12 @@ class Quadrant(NamedTuple):
         return Region(low, high)
 
     def satisfies(self, word: ContainerWord) -> bool:
-        """Whether it lies where a position word says; False for a color."""
+        """Returns whether a word describes the position of the quadrant; False for a color."""
         return word in (("right", "left")[self.i], ("back", "front")[self.j])
 
 
 def container_matches(word: ContainerWord, color: ContainerColor, quadrant: Quadrant) -> bool:
-    """Whether a word of an instruction, a color or a position, describes a container."""
+    """Returns whether a word of an instruction, a color or a position, describes a container."""
     return word == color or quadrant.satisfies(word)
 
 

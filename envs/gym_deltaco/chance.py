@@ -1,0 +1,80 @@
+"""Chance levels: success rates of policies that ignore the task, computed from layouts alone.
+
+Distractors are drawn around the target, from objects of its color or shape. A policy can therefore guess the
+target from the scene, without an instruction or a demonstration. `python -m gym_deltaco.chance` prints the
+chance levels of a set of tasks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from gym_deltaco.layout import sample_layout
+from gym_deltaco.scene_config import DEFAULT_SCENE, SceneConfig
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel, get_task, select_tasks
+
+_TEST_OBJECTS = frozenset(SCENARIOS["a"].test_rows) & frozenset(range(len(OBJECTS)))
+
+
+def _n_shared(label: ObjectLabel, labels: Sequence[ObjectLabel]) -> int:
+    """Returns how many colors and shapes an object shares with the other two of a scene, 0..4."""
+    # It shares both with itself.
+    return sum((label.color == other.color) + (label.shape == other.shape) for other in labels) - 2
+
+
+# A rule scores each object of a scene, given all three, and picks the one with the highest score.
+RULES: dict[str, Callable[[ObjectLabel, Sequence[ObjectLabel]], tuple[int, ...]]] = {
+    "random object": lambda label, labels: (),
+    "most shared colors and shapes": lambda label, labels: (_n_shared(label, labels),),
+    "one of the eight test objects": lambda label, labels: (label.index in _TEST_OBJECTS,),
+    "test object, then most shared": lambda label, labels: (
+        label.index in _TEST_OBJECTS,
+        _n_shared(label, labels),
+    ),
+}
+
+
+def chance_levels(
+    task_ids: Sequence[int], scene: SceneConfig = DEFAULT_SCENE, n_trials: int = 100, first_trial: int = 0
+) -> dict[str, float]:
+    """Computes success rates of policies that pick an object by a rule and one of two containers at random.
+
+    Args:
+        task_ids: Indices of the tasks.
+        scene: Settings of the scenes.
+        n_trials: Number of scenes of each task, at least 1.
+        first_trial: Number of the first trial; scenes are those of evaluations whose seed it is.
+
+    Returns:
+        Expected success rate by name of the rule, 0..1. Objects with the same score are equally likely.
+    """
+    found: dict[str, list[float]] = {name: [] for name in RULES}
+    for task_id in task_ids:
+        for trial in range(first_trial, first_trial + n_trials):
+            rng = np.random.default_rng(episode_seed(0, "evaluation", task_id, 0, trial))
+            layout = sample_layout(get_task(task_id), scene, rng)
+            labels = [item.label for item in layout.objects]
+            for name, rule in RULES.items():
+                scores = [rule(label, labels) for label in labels]
+                best = [number for number, score in enumerate(scores) if score == max(scores)]
+                found[name].append((layout.target_object in best) / len(best))
+    return {name: float(np.mean(rates)) / 2 for name, rates in found.items()}
+
+
+def main() -> None:
+    """Prints the chance levels of a set of tasks."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("tasks", nargs="?", default="scenario_a_test", help="selection of tasks")
+    parser.add_argument("--trials", type=int, default=100, help="number of scenes of each task")
+    options = parser.parse_args()
+    for name, rate in chance_levels(select_tasks(options.tasks), n_trials=options.trials).items():
+        sys.stdout.write(f"{name + ':':<31} {rate:.1%}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""Imports PyBullet without its message on the standard error ("pybullet build time: ...").
+
+PyBullet is the optional dependency `sim`, because many systems have to compile it. Only the environment needs
+it; tasks, layouts, datasets and policies do not.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def _discarded_stderr() -> Iterator[None]:
+    """Discards what compiled code prints to the standard error."""
+    saved = os.dup(2)
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)
+
+
+try:
+    with _discarded_stderr():
+        import pybullet
+except ModuleNotFoundError as error:
+    raise ImportError(
+        "The environment needs PyBullet, which is not installed. Install it with "
+        '`pip install "lerobot_policy_deltaco[sim]"`; it needs a C++ compiler where there is no wheel.',
+        name="pybullet",
+    ) from error
+except ImportError as error:
+    raise ImportError(
+        f"PyBullet is installed, but does not load: {error}. Build it again with `pip install "
+        "--force-reinstall --no-cache-dir --no-deps pybullet`; it needs a C++ compiler.",
+        name="pybullet",
+    ) from error
+
+__all__ = ["pybullet"]

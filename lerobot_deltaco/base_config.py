@@ -1,0 +1,323 @@
+"""Options that both policies share, and what is inferred from the training dataset."""
+
+# No `from __future__ import annotations`: LeRobot's parser reads the annotations.
+
+import copy
+import logging
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+
+from gym_deltaco.env import ACTION_NAMES
+from lerobot_deltaco.language import LANGUAGE_ENCODERS, MINILM_L6
+from lerobot_deltaco.optimization import CosineSchedulerConfig, FusedAdamWConfig
+
+logger = logging.getLogger(__name__)
+
+PARAPHRASE_SPLITS = ("all", "train", "held_out")
+# Options whose contents a checkpoint holds: files and datasets of the machine that made it.
+SOURCES = ("paraphrases", "demo_repo_id", "demo_root")
+
+
+@dataclass
+class TaskConditionedConfig(PreTrainedConfig):
+    """Options of a policy that performs the task of a demonstration, an instruction, or both.
+
+    Args:
+        language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'), all-MiniLM-L6-v2,
+            all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `offline` brings
+            the first two.
+        paraphrases: CSV file with sentences for the benchmark's tasks. In training, each sample's instruction
+            is drawn from the sentences of its task.
+        paraphrases_split: Split of the file's sentences for training: train, the sentences that are not held
+            out for any task; held_out, the last sentence of each task; or all.
+        paraphrases_with_templates: Whether to also train on the task string itself.
+        image_size: Height and width to which images are scaled, px.
+        num_mixture_components: Number of Gaussians of the action's distribution. One averages two actions
+            that are equally good; of several, the policy takes the likeliest.
+        gripper: Gripper's dimension of the action: an index, "auto" (the last one whose name contains
+            "gripper", if any) or "none".
+        gripper_closed: Which values of the gripper's dimension mean closed: low or high.
+        demo_camera: Name of the camera of demonstrations, such as "observation.images.front". By default, the
+            first.
+        demo_repo_id: Dataset of demonstrations for evaluation, with at least one episode of each task. The
+            checkpoint keeps them.
+        demo_root: Folder of that dataset, if it is not in LeRobot's cache.
+        demo_episode: Episode of that dataset to use as the demonstration of every instruction, such as a
+            sentence of your own.
+        demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default, those
+            that are trained on.
+        tasks_per_batch: Largest number of tasks in a batch of `deltaco train`, with equally many samples of
+            each (the paper: 16 tasks x 64 samples); 0 for samples of any tasks.
+        upsampled_tasks: Regular expression for the instructions of the tasks that get `upsampled_fraction` of
+            each batch of `deltaco train`.
+        upsampled_fraction: Fraction of each batch for the upsampled tasks; 0.5 in the paper's scenario B.
+        seed: Seed of the draws of demonstrations and shifts, which also depend on the step.
+        dtype: Precision of training: float32 or bfloat16; the last layers always use float32, and acting
+            does. Without instructions for bfloat16, a CPU uses float32.
+        optimizer_lr: Learning rate of AdamW.
+        optimizer_weight_decay: Weight decay of AdamW.
+        scheduler_warmup_steps: Number of warmup steps of the cosine schedule.
+        grad_clip_norm: Maximum norm of the gradient; 0 for no clipping.
+    """
+
+    language_encoder: str = MINILM_L6
+    paraphrases: str | None = None
+    paraphrases_split: str = "train"
+    paraphrases_with_templates: bool = False
+    image_size: int = 48
+    num_mixture_components: int = 1
+    gripper: str = "auto"
+    gripper_closed: str = "low"
+    demo_camera: str | None = None
+    demo_repo_id: str | None = None
+    demo_root: str | None = None
+    demo_episode: int | None = None
+    demo_episodes: list[int] | None = None
+    tasks_per_batch: int = 16
+    upsampled_tasks: str | None = None
+    upsampled_fraction: float = 0.5
+    seed: int = 0
+    dtype: str = "float32"
+    optimizer_lr: float = 3e-4
+    optimizer_weight_decay: float = 0.0
+    scheduler_warmup_steps: int = 0
+    grad_clip_norm: float = 0.0
+    push_to_hub: bool = False
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.MIN_MAX,
+        }
+    )
+    # Filled in by training: the tasks that a one-hot policy knows.
+    one_hot_tasks: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dtype == "bfloat16" and self.device == "cpu" and not _has_bfloat16():
+            logger.warning(
+                "This processor has no instructions for bfloat16. The policy is trained in float32."
+            )
+            self.dtype = "float32"
+        try:
+            self.check()
+        except ValueError as error:
+            # LeRobot's parser only says that the class cannot be instantiated.
+            logger.error("%s", error)
+            raise
+
+    def check(self) -> None:
+        """Checks the options.
+
+        Raises:
+            ValueError: An option is invalid; the message says what is valid.
+        """
+        self.check_choices(
+            language_encoder=LANGUAGE_ENCODERS,
+            paraphrases_split=PARAPHRASE_SPLITS,
+            gripper_closed=("low", "high"),
+            dtype=("float32", "bfloat16"),
+        )
+        if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
+            raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
+        self.check_ranges(
+            image_size=(16, 1024),
+            num_mixture_components=(1, 1000),
+            tasks_per_batch=(0, 1_000_000),
+            upsampled_fraction=(0, 1),
+            seed=(0, 2**63 - 1),
+            optimizer_lr=(1e-12, 10),
+            optimizer_weight_decay=(0, 1e3),
+            scheduler_warmup_steps=(0, 1_000_000_000),
+            grad_clip_norm=(0, 1e6),
+        )
+        check_pattern("upsampled_tasks", self.upsampled_tasks)
+        # Images must stay in 0..1, and actions in -1..1: the networks are made for these.
+        valid = {"VISUAL": ("IDENTITY",), "ACTION": ("MIN_MAX", "IDENTITY")}
+        for kind, names in valid.items():
+            mode = self.normalization_mapping.get(kind, NormalizationMode.IDENTITY)
+            if mode.name not in names:
+                raise ValueError(
+                    f"`normalization_mapping` must be {' or '.join(names)} for {kind}. Got {mode.name}."
+                )
+
+    def check_choices(self, **choices: Any) -> None:
+        """Checks that options are among their valid values.
+
+        Raises:
+            ValueError: One is not.
+        """
+        for name, valid in choices.items():
+            if getattr(self, name) not in valid:
+                raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
+
+    def check_ranges(self, **ranges: tuple[float, float]) -> None:
+        """Checks that options are between their least and greatest valid values.
+
+        Raises:
+            ValueError: One is not.
+        """
+        for name, (least, greatest) in ranges.items():
+            value = getattr(self, name)
+            if not least <= value <= greatest:
+                raise ValueError(f"`{name}` must be from {least} to {greatest}. Got {value}.")
+
+    # What the dataset says
+
+    def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
+        """Finds out which dimension is the gripper, and how actions are scaled.
+
+        LeRobot calls this with the training dataset's features, before it makes the policy.
+
+        Args:
+            features: Features of the training dataset.
+        """
+        names = features.get("action", {}).get("names")
+        if isinstance(names, dict):
+            names = next(iter(names.values()))
+        if names and list(names) == ACTION_NAMES:
+            # The benchmark's actions are in -1..1 already.
+            self.normalization_mapping["ACTION"] = NormalizationMode.IDENTITY
+        if self.gripper == "auto":
+            found = [index for index, name in enumerate(names or ()) if "gripper" in str(name).lower()]
+            self.gripper = str(found[-1]) if found else "none"
+
+    def validate_features(self) -> None:
+        """Checks the inputs and outputs that LeRobot found in the dataset.
+
+        Raises:
+            ValueError: There is no camera, no action, or no such gripper.
+        """
+        if not self.image_features:
+            raise ValueError(
+                "The policy needs at least one camera. The dataset's inputs are "
+                f"{', '.join(sorted(self.input_features or {})) or 'none'}."
+            )
+        if self.action_feature is None:
+            raise ValueError(
+                "The policy needs the feature 'action'. The dataset's outputs are "
+                f"{', '.join(sorted(self.output_features or {})) or 'none'}."
+            )
+        shapes = {name: tuple(feature.shape) for name, feature in self.image_features.items()}
+        if any(len(shape) != 3 or shape[0] != 3 for shape in shapes.values()):
+            raise ValueError(f"Images must have the shape (3, height, width). Got {shapes}.")
+        for name, feature in (
+            ("action", self.action_feature),
+            ("observation.state", self.robot_state_feature),
+        ):
+            if feature is not None and (len(feature.shape) != 1 or feature.shape[0] < 1):
+                raise ValueError(
+                    f"`{name}` must be a vector, of the shape (n,). The dataset's has the shape "
+                    f"{tuple(feature.shape)}."
+                )
+        (action_dim,) = self.action_feature.shape
+        if self.gripper_index is not None and not self.gripper_index < action_dim:
+            raise ValueError(
+                f"`gripper` is {self.gripper_index}, but the action has only the dimensions 0 to "
+                f"{action_dim - 1}. Name one of these, or 'none'."
+            )
+        if action_dim == 1 and self.gripper_index is not None:
+            raise ValueError("The action is nothing but a gripper. Set `gripper` to 'none' to learn it.")
+        if self.demo_camera is not None and self.demo_camera not in self.image_features:
+            raise ValueError(
+                f"`demo_camera` must be one of the dataset's cameras, {', '.join(self.image_features)}. Got "
+                f"{self.demo_camera!r}."
+            )
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, that of the demonstrations first."""
+        names = list(self.image_features)
+        if self.demo_camera is not None:
+            names.sort(key=lambda name: name != self.demo_camera)
+        return tuple(names)
+
+    @property
+    def gripper_index(self) -> int | None:
+        """Dimension of the action that is the gripper; None without one."""
+        return int(self.gripper) if self.gripper.isdecimal() else None
+
+    def gripper_opening(self, actions: torch.Tensor) -> torch.Tensor:
+        """Returns the gripper's commands in actions (frames, action), greater for more open, (frames,)."""
+        command = actions[:, self.gripper_index]
+        return command if self.gripper_closed == "low" else -command
+
+    @property
+    def state_dim(self) -> int:
+        """Size of the robot's state, 0 without one."""
+        return self.robot_state_feature.shape[0] if self.robot_state_feature else 0
+
+    @property
+    def embedding_dim(self) -> int:
+        """Size of an instruction's embedding."""
+        return LANGUAGE_ENCODERS[self.language_encoder].embedding_dim
+
+    # Each policy says these of itself
+
+    @property
+    def uses_demonstrations(self) -> bool:
+        """Whether the policy takes demonstrations."""
+        raise NotImplementedError
+
+    @property
+    def n_demo_frames(self) -> int:
+        """Number of frames of a demonstration."""
+        return 2
+
+    # LeRobot's interface
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        saved = copy.copy(self)
+        for name in SOURCES:
+            setattr(saved, name, None)
+        PreTrainedConfig._save_pretrained(saved, save_directory)
+
+    def get_optimizer_preset(self) -> FusedAdamWConfig:
+        """Returns AdamW; without weight decay, it is Adam."""
+        return FusedAdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineSchedulerConfig | None:
+        """Returns the cosine schedule of the learning rate."""
+        return CosineSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """Only the present observation is used."""
+        return
+
+    @property
+    def action_delta_indices(self) -> None:
+        """Only the next action is predicted."""
+        return
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """Rewards are not used."""
+        return
+
+
+def check_pattern(name: str, pattern: str | None) -> None:
+    """Checks that an option is a regular expression, or None.
+
+    Raises:
+        ValueError: It is not.
+    """
+    try:
+        re.compile(pattern or "")
+    except re.error as error:
+        raise ValueError(f"`{name}` must be a regular expression. Got {pattern!r}: {error}.") from None
+
+
+def _has_bfloat16() -> bool:
+    """Returns whether this processor has instructions for bfloat16; without them, it is emulated, slowly."""
+    return torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()

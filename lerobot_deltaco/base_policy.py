@@ -1,0 +1,348 @@
+"""What both policies share: tasks of an episode, banks of demonstrations, checkpoints."""
+
+# No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor, nn
+
+from lerobot_deltaco.base_config import TaskConditionedConfig
+from lerobot_deltaco.demonstrations import (
+    Demonstration,
+    DemonstrationBank,
+    RobotData,
+    kept_frames,
+    open_dataset,
+    read_demonstrations,
+    read_robot_data,
+)
+from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
+from lerobot_deltaco.task_bank import TASK_BANK, find_task_bank, read_task_bank, write_task_bank
+
+DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
+
+
+class TrainingDivergedError(FloatingPointError):
+    """Raised when the loss or a weight is not finite; the message says what the cause may be."""
+
+
+class TaskConditionedPolicy(PreTrainedPolicy):
+    """A policy that performs the task of a demonstration, an instruction, or both.
+
+    In training, each sample's demonstration is another episode of its task in the training dataset. In
+    evaluation, `set_tasks` passes demonstrations and instructions at the start of an episode; without it, the
+    instruction is the batch's `task`, and its demonstration comes from the bank of the checkpoint.
+
+    Args:
+        config: Configuration of the policy. LeRobot fills in its input and output features beforehand.
+        dataset_stats: Statistics of the training dataset, by which the processors normalize; None in
+            evaluation.
+        dataset_meta: Metadata of the training dataset; None in evaluation.
+
+    Attributes:
+        instructions: Embeddings of instructions.
+        demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
+    """
+
+    config_class: ClassVar[type] = TaskConditionedConfig
+    name = "task_conditioned"
+
+    def __init__(
+        self,
+        config: TaskConditionedConfig,
+        dataset_stats: dict[str, dict[str, Tensor]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        super().__init__(config)
+        self.config: Any = config
+        self._meta, self._stats = dataset_meta, dataset_stats
+        if dataset_meta is not None:
+            config.set_dataset_feature_metadata(dataset_meta.features)
+        config.validate_features()
+        self.instructions = InstructionEmbeddings(config.language_encoder)
+        self.paraphrases = _read_paraphrases(config)
+        self.demonstrations: DemonstrationBank | None = self._read_evaluation_bank()
+        self.training_bank: DemonstrationBank | None = None
+        # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.
+        self._tasks: tuple[tuple[str, ...], DemonstrationsOfTasks] | None = None
+        self._episode: Any = None
+        # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
+        self.register_buffer("step", torch.zeros((), dtype=torch.int64))
+
+    def get_optim_params(self) -> list[nn.Parameter]:
+        """Returns all weights that are trained. Frozen encoders are not among them."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    # Episodes
+
+    def reset(self) -> None:
+        """Ends the episode. The next action begins a new one."""
+        self._tasks = self._episode = None
+
+    def set_tasks(self, instructions: Sequence[str], demonstrations: DemonstrationsOfTasks) -> None:
+        """Sets the tasks of the episode that begins with the next action, until `reset`.
+
+        Args:
+            instructions: Instruction of each sample; an empty string leaves it out.
+            demonstrations: One or more demonstrations of each sample's task; an empty list leaves them out.
+
+        Raises:
+            ValueError: They differ in number.
+        """
+        if len(instructions) != len(demonstrations):
+            raise ValueError(
+                f"There must be as many lists of demonstrations as instructions. Got {len(demonstrations)} "
+                f"and {len(instructions)}."
+            )
+        self._tasks, self._episode = (tuple(instructions), demonstrations), None
+
+    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """Returns the action as a chunk of one, (batch, 1, action)."""
+        return self.select_action(batch, **kwargs).unsqueeze(1)
+
+    def _tasks_of(self, batch: dict[str, Any]) -> tuple[tuple[str, ...], DemonstrationsOfTasks | None]:
+        """Returns the instructions of a batch, and the demonstrations that `set_tasks` gave, if any."""
+        if self._tasks is not None:
+            return self._tasks
+        tasks = batch.get("task")
+        if isinstance(tasks, (list, tuple)) and tasks and all(isinstance(task, str) for task in tasks):
+            return tuple(tasks), None
+        raise ValueError(
+            "`task` must be a list with an instruction for each sample of the batch. Got "
+            f"{'none' if tasks is None else repr(tasks)}. LeRobot takes it from the environment's "
+            '`task_description`, or from --task; in Python, set observation["task"] before the preprocessor.'
+        )
+
+    def banked_demonstrations(self, tasks: Sequence[str], n_each: int = 1) -> list[list[Demonstration]]:
+        """Returns demonstrations of tasks from the bank; samples of the same task take different ones.
+
+        Args:
+            tasks: Task string of each sample.
+            n_each: Number of demonstrations of each sample.
+
+        Raises:
+            ValueError: There is no demonstration of a task.
+        """
+        bank = self.demonstrations if self.demonstrations is not None else self.training_bank
+        if bank is None:
+            raise ValueError(
+                "The policy has no demonstrations. Name a dataset of them with --policy.demo_repo_id and "
+                "--policy.demo_root, or pass some to `set_tasks`."
+            )
+        if self.config.demo_episode is not None:
+            return [[bank.of_episode(self.config.demo_episode)] for _ in tasks]
+        found, n_taken = [], dict.fromkeys(tasks, 0)
+        for task in tasks:
+            known, first = bank.of_task(task), n_taken[task]
+            found.append([known[(first + n) % len(known)] for n in range(n_each)])
+            n_taken[task] += n_each
+        return found
+
+    # Observations
+
+    def _images(self, batch: dict[str, Any]) -> Tensor:
+        """Returns the images of all cameras, that of the demonstrations first, (batch, cameras, 3, S, S)."""
+        return torch.stack([self._camera_image(batch, name) for name in self.config.cameras], dim=1)
+
+    def _camera_image(self, batch: dict[str, Any], name: str) -> Tensor:
+        """Returns the image of a camera, (batch, 3, S, S) in 0..1."""
+        image, size = batch[name], self.config.image_size
+        if image.shape[-2:] == (size, size):
+            return image
+        return F.interpolate(image, (size, size), mode="bilinear", antialias=True)
+
+    # Training
+
+    def set_training_data(self, bank: DemonstrationBank, robot_data: RobotData | None) -> None:
+        """Sets the demonstrations for training, which are otherwise read with the first batch.
+
+        Args:
+            bank: The training episodes.
+            robot_data: States and actions of the robot in them; None if the policy does not need them.
+        """
+        self.training_bank = bank.to(self.step.device)
+
+    def _prepare_training(self) -> None:
+        """Reads the training episodes, unless they are there."""
+        if self.training_bank is None:
+            # The loop's mixed precision is not for what is fitted to them.
+            with torch.autocast(self.step.device.type, enabled=False):
+                self._read_training_data()
+
+    def _read_training_data(self) -> None:
+        if self._meta is None:
+            raise ValueError("A policy is trained with its dataset's metadata. Pass them as `dataset_meta`.")
+        frames = getattr(self._meta, "frames_in_memory", None)
+        if frames is not None and self.config.demo_episodes is None:
+            bank = frames.demonstrations(
+                self.config.cameras[0], self.config.image_size, self.config.n_demo_frames
+            )
+            self.set_training_data(bank, frames.robot_data())
+            return
+        dataset = open_dataset("--dataset.root", self._meta.repo_id, self._meta.root)
+        chosen = self.config.demo_episodes or list(range(dataset.meta.total_episodes))
+        bank = self._read_bank(dataset, chosen)
+        has_states = self.config.state_dim > 0
+        self.set_training_data(bank, read_robot_data(dataset, chosen) if has_states else None)
+
+    def _read_bank(self, dataset: Any, episodes: Sequence[int] | None) -> DemonstrationBank:
+        config = self.config
+        return read_demonstrations(
+            dataset, config.cameras[0], config.image_size, config.n_demo_frames, episodes
+        )
+
+    def _read_evaluation_bank(self) -> DemonstrationBank | None:
+        """Reads the demonstrations for evaluation that the configuration names."""
+        if self.config.demo_repo_id is None or not self.config.uses_demonstrations:
+            return None
+        dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
+        return self._read_bank(dataset, None)
+
+    def _step_generator(self) -> torch.Generator:
+        """Returns the source of a training step's draws, on the CPU."""
+        step = int(self.step) if self.training else 0
+        rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
+        sequence = np.random.SeedSequence((self.config.seed, step, rank))
+        (state,) = sequence.generate_state(1, np.uint64)
+        return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+    def _draw_instructions(self, tasks: Sequence[str], generator: torch.Generator) -> list[str]:
+        """Returns the instruction of each training sample: its task string, or a sentence for it."""
+        if self.paraphrases is None:
+            return list(tasks)
+        return self.paraphrases.draw(tasks, generator)
+
+    def _finish_step(
+        self, batch: dict[str, Any], loss: Tensor, logged: dict[str, Tensor], reduction: str
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Checks and reduces the loss of each sample (batch,), and counts the training step.
+
+        Raises:
+            TrainingDivergedError: The loss is not finite.
+        """
+        if self.training:
+            if not bool(torch.isfinite(loss).all()):
+                raise TrainingDivergedError(_why_not_finite(batch, int(self.step)))
+            self.step += 1
+        scalars = torch.stack([value.detach().float() for value in logged.values()]).tolist()
+        loss = loss.mean() if reduction == "mean" else loss
+        return loss, dict(zip(logged, scalars, strict=True))
+
+    def _autocast(self, device: torch.device) -> contextlib.AbstractContextManager:
+        """Returns the context in which training computes in the configured precision."""
+        if self.config.dtype == "float32":
+            return contextlib.nullcontext()
+        return torch.autocast(device.type, torch.bfloat16)
+
+    # Checkpoints
+
+    def _save_pretrained(self, save_directory: Path, *args: Any, **kwargs: Any) -> None:
+        name = _non_finite_weight(self)
+        if name is not None:
+            raise TrainingDivergedError(
+                f"After training step {int(self.step)}, the weight {name} is not finite, and no checkpoint is "
+                "saved. Lower --policy.optimizer_lr, or limit the gradient with --policy.grad_clip_norm=10, "
+                "and go on from the last checkpoint with --resume=true."
+            )
+        # LeRobot 0.6.1 may pass a `state_dict`; later versions do not, and call this on every process.
+        super()._save_pretrained(save_directory, *args, **kwargs)
+        if not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0:
+            bank = self.demonstrations if self.config.uses_demonstrations else None
+            write_task_bank(save_directory / TASK_BANK, self.instructions, bank)
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:
+        """Loads a policy with the instructions and demonstrations that were saved with it.
+
+        See `PreTrainedPolicy.from_pretrained` for the arguments.
+
+        Raises:
+            ValueError: A file of the checkpoint is damaged, or does not fit the others.
+        """
+        policy = super().from_pretrained(pretrained_name_or_path, **{**kwargs, "strict": True})
+        path = find_task_bank(pretrained_name_or_path, **kwargs)
+        config = policy.config
+        n_kept = len(kept_frames(0, 0, config.n_demo_frames))
+        shape = (n_kept, 3, config.image_size, config.image_size)
+        bank = read_task_bank(path, policy.instructions, shape, config.state_dim)
+        # Demonstrations that the command line names come before those of the checkpoint.
+        if policy.demonstrations is None and bank is not None:
+            policy.demonstrations = bank.to(config.device)
+        return policy
+
+    @classmethod
+    def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
+        try:
+            policy = super()._load_as_safetensor(model, model_file, map_location, strict)
+        except RuntimeError as error:
+            raise ValueError(
+                f"{model_file} does not have the weights of this policy: {str(error).splitlines()[-1].strip()} "
+                "The config.json beside it belongs to other weights, or to another version."
+            ) from error
+        name = _non_finite_weight(policy)
+        if name is not None:
+            raise ValueError(f"{model_file} is damaged: the weight {name} has numbers that are not finite.")
+        return policy
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str,
+        model_type: str,
+        license: str | None,
+        tags: list[str] | None,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> Any:
+        """Returns the card of the policy on the Hugging Face Hub. The arguments are those of LeRobot."""
+        from lerobot_deltaco.cards import policy_card
+
+        return policy_card(self, dataset_repo_id, license, tags, cfg, dataset_meta)
+
+
+def _read_paraphrases(config: TaskConditionedConfig) -> Paraphrases | None:
+    """Reads the sentences that training draws from, by task string."""
+    if config.paraphrases is None:
+        return None
+    from gym_deltaco.tasks import get_task
+    from lerobot_deltaco.paraphrases import read_paraphrases
+
+    sentences = read_paraphrases(config.paraphrases, config.paraphrases_split)
+    by_task = {get_task(task_id).instruction: own for task_id, own in sentences.items()}
+    return Paraphrases(by_task, config.paraphrases_with_templates)
+
+
+def _non_finite_weight(module: nn.Module) -> str | None:
+    """Returns the name of a weight with a number that is not finite; None if there is none."""
+    for name, tensor in module.state_dict().items():
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            return name
+    return None
+
+
+def _why_not_finite(batch: dict[str, Any], step: int) -> str:
+    """Returns the message of a loss that is not finite."""
+    damaged = [
+        name
+        for name, values in batch.items()
+        if isinstance(values, Tensor) and values.is_floating_point() and not bool(values.isfinite().all())
+    ]
+    cause = (
+        f"In its batch, {', '.join(f'`{name}`' for name in damaged)} has numbers that are not finite: the "
+        "dataset or its statistics are damaged."
+        if damaged
+        else "The batch was finite, so the training has diverged: lower --policy.optimizer_lr, or limit the "
+        "gradient with --policy.grad_clip_norm=10."
+    )
+    return (
+        f"The loss of training step {step + 1} is not finite. {cause} A checkpoint that was saved is from "
+        "before that: go on from it with --resume=true."
+    )

@@ -1,0 +1,150 @@
+"""The checkpoints of a training run, as LeRobot's training loop writes them, and the policies in them."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from lerobot.policies import PreTrainedPolicy
+    from lerobot.processor import PolicyProcessorPipeline
+
+WEIGHTS = "model.safetensors"
+CONFIG, TRAIN_CONFIG = "config.json", "train_config.json"
+_RENAMING_STEP = "rename_observations_processor"
+
+
+class Checkpoint(NamedTuple):
+    """A checkpoint of a training run, or a policy that was published without its run.
+
+    Attributes:
+        folder: Folder of the policy.
+        step: Training step.
+        experiment: Job name of the run.
+        seed: Seed of the training.
+        policy_type: Type of the policy, such as "deltaco_match" or "act".
+        image_size: Height and width of the images that it was trained on, px.
+    """
+
+    folder: Path
+    step: int
+    experiment: str
+    seed: int
+    policy_type: str
+    image_size: int
+
+    @property
+    def weights_digest(self) -> str:
+        """SHA-256 of the weights, in hexadecimal."""
+        with (self.folder / WEIGHTS).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def find_checkpoints(path: Path) -> list[Checkpoint]:
+    """Returns the checkpoints of a run, ascending by step, or the one in a folder.
+
+    Args:
+        path: Output folder of a training, or folder of a policy.
+
+    Raises:
+        ValueError: There are none, or one is damaged.
+    """
+    if (path / WEIGHTS).is_file() and (path / CONFIG).is_file():
+        return [_read_checkpoint(path)]
+    # What is beyond the link `last`, which LeRobot sets when a checkpoint is complete, is being written.
+    last = (path / "checkpoints" / "last").resolve().name
+    found = [
+        _read_checkpoint(folder / "pretrained_model")
+        for folder in (path / "checkpoints").glob("*")
+        if folder.name.isdecimal() and (folder / "pretrained_model" / WEIGHTS).is_file()
+        if not last.isdecimal() or int(folder.name) <= int(last)
+    ]
+    if not found:
+        raise ValueError(
+            f"{path} has no checkpoints. Name the `--output_dir` of a training, or the folder of a policy "
+            f"({CONFIG}, {WEIGHTS})."
+        )
+    return sorted(found, key=lambda checkpoint: checkpoint.step)
+
+
+def _read_checkpoint(folder: Path) -> Checkpoint:
+    try:
+        policy = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        run: dict[str, Any] = {}
+        if (folder / TRAIN_CONFIG).is_file():
+            run = json.loads((folder / TRAIN_CONFIG).read_text(encoding="utf-8"))
+        images = [item["shape"] for item in policy["input_features"].values() if item["type"] == "VISUAL"]
+        parent = folder.resolve().parent.name
+        return Checkpoint(
+            folder,
+            int(parent) if parent.isdecimal() else int(run.get("steps", 0)),
+            run.get("job_name") or folder.resolve().name,
+            run.get("seed") or policy.get("seed") or 0,
+            policy["type"],
+            images[0][-1],
+        )
+    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise ValueError(f"The configuration of the policy in {folder} cannot be read: {error!r}.") from error
+
+
+class LoadedPolicy(NamedTuple):
+    """A policy in evaluation mode, with its processors."""
+
+    policy: PreTrainedPolicy
+    preprocessor: PolicyProcessorPipeline
+    postprocessor: PolicyProcessorPipeline
+
+    @property
+    def rename_map(self) -> Mapping[str, str]:
+        """Names that the preprocessor gives to observations."""
+        return next((step.rename_map for step in self.preprocessor.steps if hasattr(step, "rename_map")), {})
+
+
+def load_policy(
+    folder: Path, overrides: Sequence[str] = (), rename_map: Mapping[str, str] | None = None
+) -> LoadedPolicy:
+    """Loads a policy of any LeRobot type and its processors.
+
+    Args:
+        folder: Folder with the policy's configuration and weights.
+        overrides: Options of the policy, as on LeRobot's command line but without `policy.`:
+            "--device=cpu", "--demo_root=DIR".
+        rename_map: Names under which the policy knows the environment's observations, by the environment's
+            names; None takes those with which it was trained.
+
+    Raises:
+        ValueError: The overrides do not fit the policy, or packages of its type are missing.
+    """
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.policies import get_policy_class, make_pre_post_processors
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
+
+    register_third_party_plugins()
+    config = PreTrainedConfig.from_pretrained(folder, cli_overrides=list(overrides))
+    if getattr(config, "pretrained_backbone_weights", None) is not None:
+        # Those of the checkpoint take their place, so they need not be downloaded.
+        config.pretrained_backbone_weights = None
+    try:
+        policy_class = get_policy_class(config.type)
+        # The steps of its processors are registered there, if it has some of its own.
+        importlib.import_module(type(config).__module__.replace("configuration_", "processor_"))
+    except ImportError as error:
+        raise ValueError(
+            f"{folder} holds a policy of the type {config.type!r}, whose packages are missing: {error}."
+        ) from error
+    policy = policy_class.from_pretrained(folder, config=config)
+    policy.to(config.device)
+    policy.eval()
+    replaced: dict[str, Any] = {"device_processor": {"device": str(config.device)}}
+    if rename_map is not None:
+        replaced[_RENAMING_STEP] = {"rename_map": dict(rename_map)}
+    processors = make_pre_post_processors(
+        config, pretrained_path=str(folder), preprocessor_overrides=replaced
+    )
+    return LoadedPolicy(policy, *processors)

@@ -1,0 +1,1 @@
+"""`--policy.type=deltaco`: the method, baselines and ablations of the paper."""

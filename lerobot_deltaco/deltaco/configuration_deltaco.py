@@ -1,0 +1,243 @@
+"""`--policy.type=deltaco`: every method, baseline and ablation of the paper as a configuration."""
+
+# No `from __future__ import annotations`: LeRobot's parser reads the annotations.
+
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_deltaco.base_config import TaskConditionedConfig
+from lerobot_deltaco.language import MINILM_L3
+from lerobot_deltaco.losses import GRIPPER_LOSSES
+from lerobot_deltaco.networks import BACKBONES
+from lerobot_deltaco.optimization import CosineSchedulerConfig
+from lerobot_deltaco.vision import VISION_ENCODERS, VISION_INPUTS
+
+
+class Conditioning(NamedTuple):
+    """How a method conditions the policy network."""
+
+    film: str  # input through FiLM
+    concat: str  # input concatenated to the feature points
+    encoder_loss: str  # loss that aligns demonstrations with instructions
+
+
+# The methods of the paper's tables 1 and 2.
+METHODS = MappingProxyType(
+    {
+        "deltaco": Conditioning("demo", "language", "contrastive"),
+        "language_only": Conditioning("language", "none", "none"),
+        "demo_only": Conditioning("demo", "none", "contrastive"),
+        "one_hot": Conditioning("one_hot", "none", "none"),
+        "bc_z": Conditioning("demo", "none", "cosine"),
+        # The mean of two imitation losses: of the language (through a projection) and of the demonstration.
+        "mcil": Conditioning("language_or_demo", "none", "none"),
+    }
+)
+INPUTS = ("none", "demo", "language", "demo+language")
+ENCODER_LOSSES = ("contrastive", "cosine", "none")
+DEMO_ENCODERS = ("cnn", "attention", "pretrained")
+# Options that have an effect with `demo_encoder=pretrained` alone.
+_PRETRAINED_OPTIONS = (
+    "vision_encoder",
+    "vision_encoder_weights",
+    "vision_image_size",
+    "vision_input",
+    "demo_variants",
+    "demo_head",
+)
+
+
+@PreTrainedConfig.register_subclass("deltaco")
+@dataclass
+class DeltacoConfig(TaskConditionedConfig):
+    """DeL-TaCo (Yu & Mooney, ICLR 2023): a policy conditioned on a demonstration and an instruction.
+
+    The defaults are the paper's (tables 5 to 7), for images of 48 x 48 pixels. On a small machine, choose
+    `backbone=strided`: half of the residual blocks, with up to 64 channels, on maps of half the size, for a
+    seventeenth of the arithmetic.
+
+    Args:
+        method: Method of the paper: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
+        film: Ablation: input through FiLM, instead of the method's: none, demo, language or demo+language.
+        concat: Ablation: input that is concatenated to the feature points, instead of the method's; the same
+            values.
+        encoder_loss: Ablation: encoder loss, instead of the method's: contrastive, cosine or none.
+        language_head: Sizes of the hidden layers of fully connected layers after the language encoder, whose
+            output has unit length, such as [512]; none by default. MCIL always has such layers; by default
+            [384], as in the authors' code.
+        demo_encoder: Encoder of demonstrations: cnn, the paper's; attention (ours), which compares the frames
+            at each location and attends to a few; or pretrained, a frozen image encoder.
+        vision_encoder: Frozen image encoder for `demo_encoder=pretrained`: clip-vit-base-patch32,
+            r3m-resnet18, r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0 (which
+            the extra `offline` brings), a folder with an image model of transformers, or its name on the Hub.
+        vision_encoder_weights: File with R3M's weights, which are otherwise downloaded.
+        vision_image_size: Height and width to which the grid of a demonstration's frames is scaled for that
+            encoder; by default, the size of the images that it was trained on.
+        vision_input: Format of R3M's images: published, that of R3M; or authors, as in the authors' code, in
+            0..1 instead of 0..255 and not scaled to 224 pixels.
+        demo_variants: Number of variants of each demonstration (random shifts, and random frames between the
+            ends) that a pretrained encoder encodes before training; each sample gets one of them.
+        demo_head: Sizes of the hidden layers of fully connected layers after a pretrained encoder, such as
+            [256]; by default, there are no layers at all.
+        demo_rows: Number of rows of the grid of a demonstration's frames, m in the paper.
+        demo_columns: Number of columns of that grid, n in the paper. Its m n frames are the first, the last,
+            and random ones between them; `attention` takes as many frames, without a grid.
+        backbone: Convolutional network: paper or strided.
+        gripper_loss: Loss of the gripper: squared_error, or cross_entropy (ours).
+        encoder_loss_weight: Weight of the encoder loss, alpha_d in the paper's equation 3.
+        temperature: Temperature of the contrastive loss.
+        shift_padding: Largest random shift of observations in training, px; 0 for none.
+        demo_shift_padding: Largest random shift of demonstrations in training, px; 0 for none.
+        drop_n_last_frames: Number of frames at the end of each episode that are not trained on.
+        initial_weights: Initial weights of the networks: authors, as in the authors' code; or torch,
+            PyTorch's. By default, the authors' for the paper's backbone.
+        scheduler_name: Schedule of the learning rate: constant, or cosine, which decays to 0.
+    """
+
+    method: str = "deltaco"
+    film: str | None = None
+    concat: str | None = None
+    encoder_loss: str | None = None
+    language_encoder: str = MINILM_L3
+    language_head: list[int] | None = None
+    demo_encoder: str = "cnn"
+    vision_encoder: str = "clip-vit-base-patch32"
+    vision_encoder_weights: str | None = None
+    vision_image_size: int | None = None
+    vision_input: str = "published"
+    demo_variants: int = 8
+    demo_head: list[int] | None = None
+    demo_rows: int = 1
+    demo_columns: int = 2
+    backbone: str = "paper"
+    gripper_loss: str = "squared_error"
+    encoder_loss_weight: float = 10.0
+    temperature: float = 0.1
+    shift_padding: int = 4
+    demo_shift_padding: int = 4
+    drop_n_last_frames: int = 0
+    initial_weights: str | None = None
+    scheduler_name: str = "constant"
+    # Filled in by the pretrained image encoder: the size of its features.
+    demo_feature_dim: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.initial_weights is None:
+            self.initial_weights = "authors" if self.backbone == "paper" else "torch"
+        if self.demo_encoder == "pretrained" and self.demo_feature_dim is None:
+            spec = VISION_ENCODERS.get(self.vision_encoder)
+            self.demo_feature_dim = None if spec is None else spec.feature_dim
+        super().__post_init__()
+
+    def check(self) -> None:
+        """Checks the options.
+
+        Raises:
+            ValueError: An option is invalid; the message says what is valid.
+        """
+        super().check()
+        self.check_choices(
+            method=METHODS,
+            film=(None, *INPUTS),
+            concat=(None, *INPUTS),
+            encoder_loss=(None, *ENCODER_LOSSES),
+            demo_encoder=DEMO_ENCODERS,
+            vision_input=VISION_INPUTS,
+            backbone=BACKBONES,
+            gripper_loss=GRIPPER_LOSSES,
+            initial_weights=("authors", "torch"),
+            scheduler_name=("constant", "cosine"),
+        )
+        self.check_ranges(
+            demo_variants=(1, 1000),
+            demo_rows=(1, 64),
+            demo_columns=(1, 64),
+            encoder_loss_weight=(0, 1e6),
+            temperature=(1e-3, 1e3),
+            shift_padding=(0, 1024),
+            demo_shift_padding=(0, 1024),
+            drop_n_last_frames=(0, 1_000_000),
+        )
+        if self.n_demo_frames < 2:
+            raise ValueError(
+                "A demonstration has its first and its last frame: `demo_rows` * `demo_columns` must be "
+                f"at least 2. Got {self.n_demo_frames}."
+            )
+        for name in ("language_head", "demo_head"):
+            if not all(size >= 1 for size in getattr(self, name) or []):
+                raise ValueError(f"`{name}` must be sizes of layers. Got {getattr(self, name)}.")
+        if self.demo_encoder != "pretrained":
+            for name in _PRETRAINED_OPTIONS:
+                if getattr(self, name) != getattr(type(self), name, None):
+                    raise ValueError(
+                        f"`{name}` has no effect with `demo_encoder={self.demo_encoder}`. Leave it out, or "
+                        "set `demo_encoder` to 'pretrained'."
+                    )
+        self._check_conditioning()
+        self.check_demo_dim()
+
+    def _check_conditioning(self) -> None:
+        overridden = [name for name in ("film", "concat", "encoder_loss") if getattr(self, name) is not None]
+        if overridden and self.method in ("one_hot", "mcil"):
+            raise ValueError(f"`{overridden[0]}` cannot be changed in the method {self.method!r}.")
+        film, concat, encoder_loss = self.conditioning
+        if film == concat == "none":
+            raise ValueError("`film` and `concat` are both 'none': the policy would get no task.")
+        if encoder_loss != "none" and not self.uses_demonstrations:
+            raise ValueError(
+                f"`encoder_loss` is {encoder_loss!r}, but no demonstration is used. Set it to 'none', or use "
+                "one in `film` or `concat`."
+            )
+
+    def check_demo_dim(self) -> None:
+        """Checks that embeddings of demonstrations have the size that the method needs.
+
+        Raises:
+            ValueError: They are compared with embeddings of instructions, which have another size.
+        """
+        if not self.uses_demonstrations or self.demo_dim in (None, self.embedding_dim):
+            return
+        if self.conditioning.encoder_loss != "none" or self.method == "mcil":
+            raise ValueError(
+                f"The demonstrations' embeddings, of {self.vision_encoder!r}, have {self.demo_dim} numbers, "
+                f"and the instructions' have {self.embedding_dim}. To compare them, give `demo_head` layers, "
+                "such as [256]; or set `encoder_loss` to 'none'."
+            )
+
+    @property
+    def conditioning(self) -> Conditioning:
+        """The method's, with what an ablation changes."""
+        changed = {
+            name: getattr(self, name) for name in Conditioning._fields if getattr(self, name) is not None
+        }
+        return METHODS[self.method]._replace(**changed)
+
+    @property
+    def uses_demonstrations(self) -> bool:
+        """Whether the policy takes demonstrations."""
+        return any("demo" in source for source in self.conditioning[:2])
+
+    @property
+    def uses_language(self) -> bool:
+        """Whether instructions are embedded: as an input, or for the encoder loss."""
+        film, concat, encoder_loss = self.conditioning
+        return "language" in film or "language" in concat or encoder_loss != "none"
+
+    @property
+    def n_demo_frames(self) -> int:
+        """Number of frames of a demonstration."""
+        return self.demo_rows * self.demo_columns
+
+    @property
+    def demo_dim(self) -> int | None:
+        """Size of a demonstration's embedding; None until a pretrained encoder has been loaded."""
+        if self.demo_encoder == "pretrained" and self.demo_head is None:
+            return self.demo_feature_dim
+        return self.embedding_dim
+
+    def get_scheduler_preset(self) -> CosineSchedulerConfig | None:
+        """Returns the schedule of the learning rate; None is a constant."""
+        return None if self.scheduler_name == "constant" else super().get_scheduler_preset()

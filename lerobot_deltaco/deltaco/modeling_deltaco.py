@@ -1,0 +1,425 @@
+"""The policy of DeL-TaCo (Yu & Mooney, ICLR 2023), and the baselines and ablations of the paper.
+
+    demonstration ---> demonstration encoder ---> z_demo ---- FiLM ------+
+                                                    |                    |
+                                     encoder loss (training)    image ---> policy network ---> action
+                                                    |                    |
+    instruction ----> language encoder --------> z_lang ---- concat -----+--- proprioception
+
+A method chooses what goes through FiLM and what is concatenated (`METHODS`).
+"""
+
+# No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor
+
+from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
+from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.deltaco.demo_encoders import (
+    AttentionEncoder,
+    FrameGridEncoder,
+    encode_bank,
+    shift_demonstrations,
+)
+from lerobot_deltaco.demonstrations import DemonstrationBank, sample_frames
+from lerobot_deltaco.losses import (
+    GRIPPER_LOSSES,
+    contrastive_logits,
+    contrastive_loss,
+    cosine_loss,
+    imitation_loss,
+    join_action,
+)
+from lerobot_deltaco.networks import (
+    BACKBONES,
+    PolicyNetwork,
+    UnitHead,
+    fuse_batch_norms,
+    initialize_as_authors,
+    random_shift,
+    uniform_linear_layers,
+)
+from lerobot_deltaco.vision import VisionEncoder, load_vision_encoder
+
+_AUTHORS_ENCODER_BOUND = 1e-4  # of the initial weights of the paper's demonstration encoder
+
+
+class Episode(NamedTuple):
+    """The conditioning of the running episode, computed once."""
+
+    instructions: tuple[str, ...]
+    film: Tensor | None  # (batch, film_dim)
+    concat: Tensor | None  # (batch, embedding)
+    network: PolicyNetwork
+
+
+class DeltacoPolicy(TaskConditionedPolicy):
+    """The paper's policy. See `TaskConditionedPolicy` for its arguments.
+
+    Attributes:
+        model: Network that predicts actions.
+        demo_encoder: Encoder of demonstrations, or the layers after a frozen one; None without demonstrations.
+        language_head: Layers after the language encoder; None for none.
+    """
+
+    config_class = DeltacoConfig
+    name = "deltaco"
+
+    def __init__(
+        self,
+        config: DeltacoConfig,
+        dataset_stats: dict[str, dict[str, Tensor]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        super().__init__(config, dataset_stats, dataset_meta)
+        self.config: DeltacoConfig = config
+        if config.method == "one_hot" and not config.one_hot_tasks:
+            config.one_hot_tasks = known_tasks(dataset_meta)
+        self._vision_encoder = None
+        if config.demo_encoder == "pretrained" and config.uses_demonstrations:
+            if config.demo_feature_dim is None:
+                config.demo_feature_dim = self._load_vision_encoder().feature_dim
+                config.check_demo_dim()
+        self.model = _make_network(config)
+        self.demo_encoder = _make_demo_encoder(config)
+        self.language_head = _make_language_head(config)
+        if config.initial_weights == "authors":
+            initialize_as_authors(self.model)
+            if isinstance(self.demo_encoder, FrameGridEncoder):
+                uniform_linear_layers(self.demo_encoder, _AUTHORS_ENCODER_BOUND)
+
+    # The loss
+
+    def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Returns the loss of a batch: L = L_pi + alpha_d L_demo (the paper's equation 3).
+
+        Args:
+            batch: Batch from the preprocessor; it is not changed.
+                `observation.image`, or any cameras: (batch, 3, H, W) float in 0..1.
+                `observation.state`, if there is one: (batch, state), normalized.
+                `action`: (batch, action), -1..1.
+                `task`: list of task strings, (batch,).
+                `episode_index`, if demonstrations are used: (batch,) int64.
+            reduction: "mean", or "none" for the loss of each sample.
+
+        Returns:
+            The loss, () or (batch,), and the scalars to log.
+
+        Raises:
+            ValueError: A task has no demonstration, or is not known to a one-hot policy.
+            TrainingDivergedError: The loss is not finite.
+        """
+        generator, tasks = self._step_generator(), list(batch["task"])
+        with self._autocast(batch[ACTION].device):
+            loss, logged = self._loss(batch, tasks, generator)
+        return self._finish_step(batch, loss, logged, reduction)
+
+    def _loss(
+        self, batch: dict[str, Any], tasks: list[str], generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the loss of each sample, (batch,), and its parts to log."""
+        config = self.config
+        images = self._images(batch)
+        if self.training and config.shift_padding:
+            images = random_shift(images, config.shift_padding, generator)
+        distinct = {task: n for n, task in enumerate(dict.fromkeys(tasks))}
+        column = torch.tensor([distinct[task] for task in tasks], device=images.device)
+        demo = language = known = None
+        if config.uses_demonstrations:
+            demo = self._embed_training_demonstrations(batch["episode_index"], tasks, generator)
+        if config.uses_language:
+            # With paraphrases, one is drawn for each task, and one for each sample.
+            known = self._embed_instructions(
+                self._draw_instructions(list(distinct), generator), images.device
+            )
+            language = known[column]
+            if self.paraphrases is not None:
+                language = self._embed_instructions(self._draw_instructions(tasks, generator), images.device)
+        if config.method == "mcil":
+            # The mean of the losses with the instruction's embedding and with the demonstration's.
+            parts = [self._imitation_loss(batch, images, film, None) for film in (language, demo)]
+            loss = torch.stack([part[0] for part in parts]).mean(dim=0)
+            logged = {name: torch.stack([part[1][name] for part in parts]).mean() for name in parts[0][1]}
+        else:
+            film, concat = self._conditioning_inputs(tasks, demo, language, images.device)
+            loss, logged = self._imitation_loss(batch, images, film, concat)
+        if config.conditioning.encoder_loss != "none":
+            assert demo is not None
+            assert language is not None
+            assert known is not None
+            logits = contrastive_logits(demo.float(), known, config.temperature)  # (batch, distinct)
+            if config.conditioning.encoder_loss == "contrastive":
+                encoder_loss = contrastive_loss(logits, column)
+            else:
+                encoder_loss = cosine_loss(demo.float(), language)
+            loss = loss + config.encoder_loss_weight * encoder_loss
+            logged["encoder_loss"] = encoder_loss.mean()
+            logged["demo_accuracy"] = (logits.argmax(dim=1) == column).float().mean()
+        return loss, logged
+
+    def _imitation_loss(
+        self, batch: dict[str, Any], images: Tensor, film: Tensor | None, concat: Tensor | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the imitation loss L_pi (equation 2) of each sample, (batch,), and its parts to log."""
+        predicted, gripper = self.model(images, film, self._concatenated(batch, concat))
+        kind = self.config.gripper_loss
+        index, weight = self.config.gripper_index, GRIPPER_LOSSES[kind]
+        return imitation_loss(predicted, gripper, self.model.log_std, batch[ACTION], index, weight, kind)
+
+    # Acting
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """Returns the mean action; of several mixture components, that of the likeliest one.
+
+        Args:
+            batch: As in `forward`, without `action` and `episode_index`. `task` is not needed if `set_tasks`
+                gave the instructions.
+
+        Returns:
+            Actions, (batch, action), normalized as in `forward`.
+
+        Raises:
+            ValueError: There is no instruction, or a task has no demonstration.
+        """
+        instructions, demonstrations = self._tasks_of(batch)
+        images = self._images(batch)
+        if self._episode is None or self._episode.instructions != instructions:
+            self._episode = self._begin_episode(instructions, demonstrations, images.device)
+        episode: Episode = self._episode
+        concat = self._concatenated(batch, episode.concat)
+        predicted, gripper = episode.network(images, episode.film, concat)
+        if gripper is not None:
+            gripper = torch.sigmoid(gripper.float())
+        return join_action(predicted.mode.float(), gripper, self.config.gripper_index)
+
+    def _begin_episode(
+        self,
+        instructions: tuple[str, ...],
+        demonstrations: DemonstrationsOfTasks | None,
+        device: torch.device,
+    ) -> Episode:
+        """Encodes the instructions and demonstrations of an episode."""
+        demo = language = None
+        if self.config.uses_demonstrations:
+            if demonstrations is None:
+                demonstrations = self.banked_demonstrations(instructions)
+            demo = self._embed_demonstrations(demonstrations, device)
+        if self.config.method == "mcil":
+            # The samples of a batch use the instruction and the demonstration in turn, unless one is left out.
+            language = self._embed_instructions(instructions, device)
+            by_language = [
+                bool(text) and (not shown or n % 2 == 0)
+                for n, (text, shown) in enumerate(zip(instructions, demonstrations or (), strict=True))
+            ]
+            assert demo is not None
+            film = torch.where(torch.tensor(by_language, device=device)[:, None], language, demo)
+            return Episode(instructions, film, None, self._acting_network())
+        if any("language" in part for part in self.config.conditioning[:2]):
+            language = self._embed_instructions(instructions, device)
+        film, concat = self._conditioning_inputs(instructions, demo, language, device)
+        return Episode(instructions, film, concat, self._acting_network())
+
+    def _acting_network(self) -> PolicyNetwork:
+        """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
+        return self.model if self.training else fuse_batch_norms(self.model)
+
+    # Embeddings
+
+    def _embed_instructions(self, instructions: Sequence[str], device: torch.device) -> Tensor:
+        """Returns embeddings of instructions, (instructions, embedding)."""
+        embeddings = self.instructions(instructions, device)
+        return embeddings if self.language_head is None else self.language_head(embeddings)
+
+    def _embed_demonstrations(self, demonstrations: DemonstrationsOfTasks, device: torch.device) -> Tensor:
+        """Returns embeddings of the first demonstration of each sample, (batch, embedding)."""
+        if not all(shown for shown in demonstrations) and self.config.method != "mcil":
+            raise ValueError("This policy takes a demonstration. Pass one for each sample.")
+        first = [shown[0] if shown else None for shown in demonstrations]
+        present = [shown for shown in first if shown is not None]
+        if not present:
+            return torch.zeros(len(first), self.config.embedding_dim, device=device)
+        assert self.demo_encoder is not None
+        if self.config.demo_encoder == "pretrained":
+            known = [shown.features for shown in present]
+            if any(features is None for features in known):
+                bank = DemonstrationBank(
+                    torch.stack([shown.frames for shown in present]),
+                    [shown.task for shown in present],
+                    range(len(present)),
+                )
+                known = list(self._encode_bank(bank, n_variants=0)[:, 0].float())
+            embedded = self.demo_encoder(torch.stack([found.to(device) for found in known]))
+        else:
+            generator = torch.Generator().manual_seed(self.config.seed)
+            frames = torch.stack([shown.frames for shown in present]).to(device)
+            embedded = self.demo_encoder(sample_frames(frames, self.config.n_demo_frames, generator))
+        found = iter(embedded)
+        return torch.stack(
+            [torch.zeros_like(embedded[0]) if shown is None else next(found) for shown in first]
+        )
+
+    def _embed_training_demonstrations(
+        self, episodes: Tensor, tasks: Sequence[str], generator: torch.Generator
+    ) -> Tensor:
+        """Returns embeddings of other episodes of the samples' tasks, (batch, embedding)."""
+        self._prepare_training()
+        bank, config = self.training_bank, self.config
+        assert bank is not None
+        assert self.demo_encoder is not None
+        rows = bank.draw_other_episodes(episodes, tasks, generator)
+        if config.demo_encoder == "pretrained":
+            is_random = config.demo_shift_padding > 0 or config.n_demo_frames > 2
+            if bank.features is None:
+                bank.features = self._encode_bank(bank, config.demo_variants if is_random else 0)
+            variant = torch.zeros_like(rows)
+            if self.training and is_random:
+                drawn = torch.randint(1, bank.features.shape[1], (len(rows),), generator=generator)
+                variant = drawn.to(rows.device)
+            return self.demo_encoder(bank.features[rows, variant].float())
+        frames = sample_frames(bank.frames[rows], config.n_demo_frames, generator)
+        if self.training:
+            grid_rows = config.demo_rows if config.demo_encoder == "cnn" else None
+            frames = shift_demonstrations(frames, config.demo_shift_padding, grid_rows, generator)
+        return self.demo_encoder(frames)
+
+    def _encode_bank(self, bank: DemonstrationBank, n_variants: int) -> Tensor:
+        config = self.config
+        encoder = self._load_vision_encoder()
+        padding, frames, rows = config.demo_shift_padding, config.n_demo_frames, config.demo_rows
+        return encode_bank(bank, encoder, frames, rows, n_variants, padding, config.seed)
+
+    def _load_vision_encoder(self) -> VisionEncoder:
+        if self._vision_encoder is None:
+            config = self.config
+            self._vision_encoder = load_vision_encoder(
+                config.vision_encoder,
+                config.vision_encoder_weights,
+                config.vision_image_size,
+                config.vision_input,
+            )
+        return self._vision_encoder
+
+    def _read_evaluation_bank(self) -> DemonstrationBank | None:
+        bank = super()._read_evaluation_bank()
+        if bank is not None and self.config.demo_encoder == "pretrained":
+            self._vision_encoder = None
+            bank.features = self._encode_bank(bank, n_variants=0)
+        return bank
+
+    def _conditioning_inputs(
+        self, tasks: Sequence[str], demo: Tensor | None, language: Tensor | None, device: torch.device
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Returns the embeddings that go through FiLM, and those that are concatenated.
+
+        Args:
+            tasks: Instruction of each sample.
+            demo: Embeddings of demonstrations, (batch, embedding); None if they are not used.
+            language: Embeddings of instructions, (batch, embedding); None if they are not used.
+            device: Device of one-hot tasks.
+
+        Raises:
+            ValueError: A one-hot policy does not know a task.
+        """
+
+        def source(name: str) -> Tensor | None:
+            if name == "none":
+                return None
+            if name == "one_hot":
+                return one_hot(tasks, self.config.one_hot_tasks, device)
+            used = [demo if part == "demo" else language for part in name.split("+")]
+            return torch.cat([embedding for embedding in used if embedding is not None], dim=-1)
+
+        film, concat, _ = self.config.conditioning
+        return source(film), source(concat)
+
+    def _concatenated(self, batch: dict[str, Any], embedding: Tensor | None) -> Tensor | None:
+        """Returns what is concatenated to the feature points: an embedding and the robot's state."""
+        parts = [] if embedding is None else [embedding]
+        if self.config.state_dim:
+            parts.append(batch[OBS_STATE])
+        return torch.cat(parts, dim=-1) if parts else None
+
+
+def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) -> Tensor:
+    """Returns one-hot vectors of tasks, (batch, known tasks).
+
+    Raises:
+        ValueError: A task is not known.
+    """
+    unknown = next((task for task in tasks if task not in known), None)
+    if unknown is not None:
+        raise ValueError(
+            f"This one-hot policy does not know the task {unknown!r}. It knows the {len(known)} tasks of its "
+            f"training dataset, such as {known[0]!r}."
+        )
+    index = {task: n for n, task in enumerate(known)}
+    return F.one_hot(torch.tensor([index[task] for task in tasks], device=device), len(known)).float()
+
+
+def known_tasks(meta: LeRobotDatasetMetadata | None) -> list[str]:
+    """Returns the task strings of the training dataset, which a one-hot policy knows.
+
+    Raises:
+        ValueError: There are no metadata.
+    """
+    if meta is None:
+        raise ValueError(
+            "A one-hot policy knows the tasks of its dataset. Pass the metadata as `dataset_meta`."
+        )
+    return list(meta.tasks.index)
+
+
+def _make_network(config: DeltacoConfig) -> PolicyNetwork:
+    film, concat, _ = config.conditioning
+    demo_dim = config.demo_dim or 0
+    dims = {
+        "none": 0,
+        "demo": demo_dim,
+        "language": config.embedding_dim,
+        "demo+language": demo_dim + config.embedding_dim,
+        "language_or_demo": config.embedding_dim,
+        "one_hot": len(config.one_hot_tasks),
+    }
+    backbone = BACKBONES[config.backbone]
+    assert config.action_feature is not None
+    return PolicyNetwork(
+        n_cameras=len(config.image_features),
+        film_dim=dims[film],
+        concat_dim=dims[concat] + config.state_dim,
+        action_dim=config.action_feature.shape[0] - (config.gripper_index is not None),
+        has_gripper=config.gripper_index is not None,
+        channels=backbone.channels,
+        stem_stride=backbone.stem_stride,
+        num_components=config.num_mixture_components,
+    )
+
+
+def _make_demo_encoder(config: DeltacoConfig) -> FrameGridEncoder | AttentionEncoder | UnitHead | None:
+    if not config.uses_demonstrations:
+        return None
+    if config.demo_encoder == "pretrained":
+        assert config.demo_feature_dim is not None
+        assert config.demo_dim is not None
+        return UnitHead(config.demo_feature_dim, config.demo_head, config.demo_dim)
+    if config.demo_encoder == "attention":
+        return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
+    size, stride = config.image_size, BACKBONES[config.backbone].demo_stride
+    return FrameGridEncoder(size, size, config.demo_rows, config.demo_columns, config.embedding_dim, stride)
+
+
+def _make_language_head(config: DeltacoConfig) -> UnitHead | None:
+    """Makes the layers after the language encoder; MCIL brings both inputs into one space by them."""
+    hidden_dims = config.language_head
+    if config.method == "mcil" and hidden_dims is None:
+        hidden_dims = [config.embedding_dim]
+    if hidden_dims is None or not config.uses_language:
+        return None
+    return UnitHead(config.embedding_dim, hidden_dims, config.embedding_dim)

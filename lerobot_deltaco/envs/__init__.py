@@ -1,1 +1,0 @@
-"""The benchmark's environment as LeRobot's training and evaluation use it."""

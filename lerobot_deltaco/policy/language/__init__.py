@@ -1,1 +1,0 @@
-"""Instructions as embeddings: frozen sentence encoders, and sentences that people wrote."""

@@ -1,0 +1,156 @@
+"""`deltaco train`: LeRobot's own training loop, over frames in memory and batches of tasks.
+
+Two names that the loop looks up are replaced while a training runs: the function that makes its datasets,
+and the sampler. All else, from the arguments to the checkpoints, is LeRobot's.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
+from lerobot.scripts import lerobot_train
+from lerobot.utils.constants import ACTION
+from numpy.typing import NDArray
+
+from lerobot_deltaco.base_config import TaskConditionedConfig
+from lerobot_deltaco.deltaco_match.keyframes import release_frames
+from lerobot_deltaco.demonstrations import check_dataset_folder
+from lerobot_deltaco.frames import FramesInMemory
+from lerobot_deltaco.optimization import keep_freed_memory
+from lerobot_deltaco.task_batches import TaskBatchSampler
+
+
+def train() -> None:
+    """Trains as the command line says, with the arguments of `lerobot-train`."""
+    keep_freed_memory()
+    training = _InMemoryTraining()
+    with ExitStack() as stack:
+        for name, replacement in (
+            ("make_train_eval_datasets", training.make_datasets),
+            ("EpisodeAwareSampler", training.make_sampler),
+        ):
+            stack.enter_context(patch.object(lerobot_train, name, replacement))
+        lerobot_train.main()
+
+
+class _InMemoryTraining:
+    """What stands for LeRobot's dataset and sampler during one training."""
+
+    def __init__(self) -> None:
+        self._make_datasets = lerobot_train.make_train_eval_datasets
+        self._config: TrainPipelineConfig | None = None
+        self._frames: FramesInMemory | None = None
+
+    def make_datasets(self, config: TrainPipelineConfig) -> tuple[FramesInMemory, LeRobotDataset | None]:
+        """Makes LeRobot's datasets, the first of them in memory.
+
+        Raises:
+            ValueError: No policy is trained, or the data cannot be held in memory.
+            MemoryError: They do not fit.
+        """
+        policy = config.policy
+        if policy is None or config.dataset.streaming:
+            raise ValueError(
+                "`deltaco train` trains policies on frames in memory. For reward models and --dataset.streaming, "
+                "use `lerobot-train`."
+            )
+        # Fail before the slow decoding.
+        check_dataset_folder("--dataset.root", config.dataset.root)
+        if isinstance(policy, TaskConditionedConfig):
+            check_dataset_folder("--policy.demo_root", policy.demo_root)
+        config.num_workers = 0
+        dataset, held_back = self._make_datasets(config)
+        if dataset.meta.depth_keys or dataset.meta.has_language_columns:
+            raise ValueError(
+                "The dataset has depth images or columns of messages, which only `lerobot-train` prepares."
+            )
+        image_size = None
+        if isinstance(policy, TaskConditionedConfig):
+            # Scaled beforehand where that takes less memory than the images as they are.
+            shapes = [dataset.meta.features[camera]["shape"] for camera in dataset.meta.camera_keys]
+            if any(3 * policy.image_size**2 < np.prod(shape) for shape in shapes):
+                image_size = policy.image_size
+        self._config, self._frames = config, FramesInMemory(dataset, image_size)
+        # The policy, which gets the metadata, draws its demonstrations from these frames.
+        dataset.meta.frames_in_memory = self._frames
+        return self._frames, held_back
+
+    def make_sampler(self, *arguments: Any, **options: Any) -> EpisodeAwareSampler | TaskBatchSampler:
+        """Makes a sampler of batches of tasks, if they are wanted, or LeRobot's.
+
+        Raises:
+            ValueError: There are no such batches.
+        """
+        assert self._config is not None
+        assert self._frames is not None
+        stock = _ResumableSampler(*arguments, **options)
+        policy = self._config.policy
+        if not isinstance(policy, TaskConditionedConfig) or not policy.tasks_per_batch:
+            return stock
+        tasks = self._frames.tasks
+        use = np.zeros(len(tasks), dtype=bool)
+        use[stock.indices] = True
+        use &= _until_release(self._frames, policy)
+        return TaskBatchSampler(
+            tasks,
+            self._config.batch_size,
+            _tasks_per_batch(policy.tasks_per_batch, self._config.batch_size, len(np.unique(tasks[use]))),
+            _upsampled(policy.upsampled_tasks, self._frames.task_names, set(tasks[use].tolist())),
+            policy.upsampled_fraction,
+            seed=options.get("seed", 0),
+            use=use,
+        )
+
+
+class _ResumableSampler(EpisodeAwareSampler):
+    """LeRobot's sampler, which counts its epochs itself, also where a resumed training has begun.
+
+    accelerate 1.15 counts the epochs of a process from 0, and sets them in the sampler: with LeRobot's own,
+    a resumed training begins with the order of the first epoch, wherever it was interrupted.
+    """
+
+    def set_epoch(self, epoch: int) -> None:
+        """Does nothing: the epoch is that of `load_state_dict`, or follows the last one."""
+
+
+def _until_release(frames: FramesInMemory, policy: TaskConditionedConfig) -> NDArray[np.bool_]:
+    """Returns which frames come before the gripper's last opening in their episode, or soon after it."""
+    use = np.ones(len(frames), dtype=bool)
+    n_after = getattr(policy, "frames_after_release", None)
+    if n_after is None or policy.gripper_index is None:
+        return use
+    spans = list(frames.spans.values())
+    gripper = policy.gripper_opening(frames.columns[ACTION])
+    for release, (_, last) in zip(release_frames(gripper, spans), spans, strict=True):
+        if release is not None:
+            use[release + 1 + n_after : last + 1] = False
+    return use
+
+
+def _tasks_per_batch(wanted: int, batch_size: int, n_tasks: int) -> int:
+    """Returns the largest number of tasks up to the wanted one that divides the batch."""
+    return max(n for n in range(1, min(wanted, n_tasks) + 1) if batch_size % n == 0)
+
+
+def _upsampled(pattern: str | None, task_names: Sequence[str], present: set[int]) -> list[int]:
+    """Returns the tasks whose instructions match a regular expression.
+
+    Raises:
+        ValueError: None does.
+    """
+    if pattern is None:
+        return []
+    found = [n for n, name in enumerate(task_names) if n in present and re.search(pattern, name)]
+    if not found:
+        raise ValueError(
+            f"`upsampled_tasks` is {pattern!r}, which is found in no task of the dataset. They are such as "
+            f"{task_names[0]!r}."
+        )
+    return found

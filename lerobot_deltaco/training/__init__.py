@@ -1,1 +1,0 @@
-"""Fast training: LeRobot's own loop, over frames in memory and batches of tasks."""

@@ -1,0 +1,27 @@
+"""Success rates of policies that ignore the task."""
+
+import pytest
+
+from gym_deltaco.chance import RULES, chance_levels
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.tasks import TASK_SETS
+
+
+def test_chance_levels_of_the_test_tasks():
+    levels = chance_levels(TASK_SETS["scenario_a_test"], n_trials=20)
+    assert list(levels) == list(RULES)
+    assert list(levels.values()) == pytest.approx([1 / 6, 0.209, 0.282, 0.297], abs=0.02)
+
+
+def test_adversarial_distractors_give_the_target_away():
+    uniform, adversarial = (
+        chance_levels(range(24, 32), SceneConfig(adversarial_probability=p), first_trial=1000) for p in (0, 1)
+    )
+    rule = "most shared colors and shapes"
+    assert uniform["random object"] == adversarial["random object"] == pytest.approx(1 / 6)
+    assert uniform[rule] + 0.1 < adversarial[rule]
+
+
+def test_an_identical_twin_has_the_same_score_as_the_target():
+    levels = chance_levels([24, 74], SceneConfig(ambiguity="object"), n_trials=5)
+    assert levels["most shared colors and shapes"] == 0.25
