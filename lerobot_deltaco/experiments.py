@@ -25,6 +25,7 @@ from typing import Any, Literal
 from tqdm import tqdm
 
 from gym_deltaco.atomic_files import write_json
+from lerobot_deltaco.checkpoints import find_checkpoints
 from lerobot_deltaco.collect import CollectionPlan, is_finished
 from lerobot_deltaco.recipes import ExperimentError, Recipe, Scale, read_recipe
 from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord, read_records
@@ -106,9 +107,11 @@ class Run:
 
     def unevaluated_steps(self, plan: EvaluationPlan | None = None) -> list[int]:
         """Returns the steps of the checkpoints without a record; by default, of the recipe's plan."""
+        if last_step(self.folder) == 0:
+            return []
         plan = plan or self.recipe.evaluation
-        steps = {record.step for record in read_run_records(self.folder) if record.plan == plan}
-        return [step for step in checkpoint_steps(self.folder) if step not in steps]
+        done = {record.step for record in read_run_records(self.folder) if record.plan == plan}
+        return [found.step for found in find_checkpoints(self.folder) if found.step not in done]
 
     def check_settings(self) -> None:
         """Checks that the run, if it has a checkpoint, was begun with the same settings.
@@ -202,13 +205,6 @@ def last_step(run: Path) -> int:
     """Returns the step of the last checkpoint of a run; 0 without any."""
     path = run / "checkpoints" / "last" / "training_state" / "training_step.json"
     return int(json.loads(path.read_text(encoding="utf-8"))["step"]) if path.is_file() else 0
-
-
-def checkpoint_steps(run: Path) -> list[int]:
-    """Returns the steps of the complete checkpoints of a run, ascending."""
-    last = last_step(run)  # LeRobot sets the link `last` when a checkpoint is complete
-    steps = (int(path.name) for path in (run / "checkpoints").glob("*") if path.name.isdecimal())
-    return sorted(step for step in steps if step <= last)
 
 
 def read_run_records(run: Path) -> list[EvaluationRecord]:

@@ -1,7 +1,6 @@
-"""MERGE: delete this file. Stand-ins for `collect`, `records` and the configurations until they are there."""
+"""MERGE: delete this file. Stand-ins for `collect` and `records` until they are there."""
 
 import sys
-import tempfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -13,48 +12,6 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import select_tasks
 
 DATA_SETS = ("T198", "T54", "E54", "E102", "T150", "V48")
-
-DELTACO = """
-class DeltacoConfig(PreTrainedConfig):
-    method: str = "deltaco"
-    film: str | None = None
-    concat: str | None = None
-    encoder_loss: str | None = None
-    language_encoder: str = ""
-    language_head: list[int] | None = None
-    paraphrases: str | None = None
-    paraphrases_with_templates: bool = False
-    demo_encoder: DemoEncoder = "cnn"
-    vision_encoder: str | None = None
-    vision_image_size: int | None = None
-    vision_input: str = "published"
-    demo_variants: int = 1
-    demo_head: tuple[int, ...] | None = None
-    demo_rows: int = 5
-    backbone: Literal["paper", "strided"] = "paper"
-    num_mixture_components: int = 1
-    gripper_loss: str = ""
-    shift_padding: int = 4
-    demo_shift_padding: int = 4
-    drop_n_last_frames: int = 0
-    tasks_per_batch: int = 16
-    upsampled_tasks: str | None = None
-    upsampled_fraction: float = 0.0
-    dtype: str = ""
-    optimizer_lr: float = 3e-4
-    optimizer_weight_decay: float = 0.0
-    scheduler_name: str = ""
-    scheduler_warmup_steps: int = 0
-"""
-DELTACO_MATCH = """
-class DeltacoMatchConfig(PreTrainedConfig):
-    optimizer_lr: float = 1e-3
-    demo_episodes: list[int] | None = None
-    inputs: str = "both"
-    p_drop_demonstration: float = 0.25
-    p_drop_instruction: float = 0.25
-    feature_matching: bool = True
-"""
 
 
 @dataclass(frozen=True)
@@ -142,15 +99,6 @@ def _install():
             module = sys.modules[f"lerobot_deltaco.{name}"] = ModuleType(f"lerobot_deltaco.{name}")
             for item in items:
                 setattr(module, item.__name__, item)
-    from lerobot_deltaco import recipes
-
-    if not (package / "base_config.py").exists():
-        recipes.PACKAGE = Path(tempfile.mkdtemp())
-        for name, source in {"deltaco": DELTACO, "deltaco_match": DELTACO_MATCH}.items():
-            path = recipes.PACKAGE / name / f"configuration_{name}.py"
-            path.parent.mkdir()
-            path.write_text(source)
-        (recipes.PACKAGE / "base_config.py").write_text("")
 
 
 _install()

@@ -11,7 +11,6 @@ from PIL import Image
 from test_experiments import FakeCommands, make_record
 
 from lerobot_deltaco import demo, experiments, records
-from lerobot_deltaco.experiments import checkpoint_steps
 from lerobot_deltaco.recipes import ExperimentError
 
 
@@ -47,7 +46,7 @@ class FakeDemoCommands(FakeCommands):
         plan = records.EvaluationPlan(
             trials=int(options.get("--trials", 4)), counterfactual=options.get("--counterfactual", "none")
         )
-        (step,) = checkpoint_steps(run)
+        step = experiments.last_step(run)
         # Trials 0 of all tasks succeed.
         record = make_record(demo.EXPERIMENT, 1, step, plan)
         records.write_records(run / "evaluations" / f"{plan.counterfactual}.parquet", [record])

@@ -7,9 +7,11 @@ import pytest
 import stand_ins  # noqa: F401  (MERGE: delete this line)
 
 from lerobot_deltaco import experiments, records
+from lerobot_deltaco.checkpoints import find_checkpoints
 from lerobot_deltaco.experiments import Run, last_progress, last_step, run_experiments
 from lerobot_deltaco.recipes import RECIPES, ExperimentError, experiment_names, read_recipe
 
+CONFIG = {"type": "deltaco", "input_features": {"image": {"type": "VISUAL", "shape": [3, 48, 48]}}}
 SMALL = ("training.steps=20", "training.save_freq=10")
 
 
@@ -53,6 +55,8 @@ class FakeCommands:
                 (checkpoint / "training_state").mkdir(parents=True, exist_ok=True)
                 (checkpoint / "pretrained_model").mkdir(exist_ok=True)
                 (checkpoint / "pretrained_model" / "train_config.json").write_text(json.dumps(options))
+                (checkpoint / "pretrained_model" / "config.json").write_text(json.dumps(CONFIG))
+                (checkpoint / "pretrained_model" / "model.safetensors").touch()
                 (checkpoint / "training_state" / "training_step.json").write_text(json.dumps({"step": step}))
             if fails:
                 break
@@ -61,7 +65,7 @@ class FakeCommands:
         run = Path(arguments[1])
         experiment, seed = run.parent.relative_to(run.parents[2]), int(run.name.removeprefix("seed_"))
         plan = read_recipe(str(experiment)).evaluation
-        for step in experiments.checkpoint_steps(run):
+        for step in (checkpoint.step for checkpoint in find_checkpoints(run)):
             path = run / "evaluations" / f"{step:06}.parquet"
             if not fails and not path.exists():
                 records.write_records(path, [make_record(str(experiment), seed, step, plan)])
@@ -347,3 +351,14 @@ def test_last_progress_of_a_log(tmp_path):
     assert last_progress(log) == ""
     log.write_text(" 10%|#    | 1/10\r 20%|##   | 2/10 [00:01<00:09]")
     assert last_progress(log) == "20%"
+
+
+def test_policies_accept_their_options():
+    from lerobot.configs import PreTrainedConfig
+
+    import lerobot_policy_deltaco  # noqa: F401  (registers the types)
+
+    for name in experiment_names():
+        options = dict(read_recipe(name).policy)
+        kind = PreTrainedConfig.get_choice_class(options.pop("type"))
+        kind(**options)
