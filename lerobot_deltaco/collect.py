@@ -23,7 +23,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -32,25 +32,17 @@ from tqdm import tqdm
 
 from gym_deltaco import CONTROL_FPS, ENV_ID, EXPERT_NOISE
 from gym_deltaco.atomic_files import write_json
+from gym_deltaco.env import ACTION_NAMES, STATE_NAMES, PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, get_task, select_tasks
 from lerobot_deltaco import dataset_writer
-
-if TYPE_CHECKING:
-    from gym_deltaco.env import PickPlaceEnv
 
 Split = Literal["train", "validation"]
 
 ROBOT_TYPE = "widowx_250"
 DESCRIPTION_FILE = "meta/deltaco.json"
 MAX_ATTEMPTS = 100
-# Names of the dimensions of the state and the action.
-STATE_NAMES = (
-    *("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate"),
-    *("end_effector_x", "end_effector_y", "end_effector_z", "gripper_open"),
-)
-ACTION_NAMES = ("delta_x", "delta_y", "delta_z", "gripper")
 # Outside `observation.`, so that no policy takes them for an input.
 PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_container", "benchmark.seed")
 
@@ -272,8 +264,8 @@ def dataset_features(scene: SceneConfig) -> dict[str, dict[str, Any]]:
                 **changed,
             },
         },
-        "observation.state": {"dtype": "float32", "shape": [10], "names": list(STATE_NAMES)},
-        "action": {"dtype": "float32", "shape": [4], "names": list(ACTION_NAMES)},
+        "observation.state": {"dtype": "float32", "shape": [len(STATE_NAMES)], "names": STATE_NAMES},
+        "action": {"dtype": "float32", "shape": [len(ACTION_NAMES)], "names": ACTION_NAMES},
         "next.reward": {"dtype": "float32", "shape": [1], "names": None},
         "next.done": {"dtype": "bool", "shape": [1], "names": None},
         "next.success": {"dtype": "bool", "shape": [1], "names": None},
@@ -352,7 +344,7 @@ def _collect_shards(root: Path, plan: CollectionPlan, workers: int) -> float | N
 def _run(root: Path, plan: CollectionPlan, shards: Sequence[int], workers: int) -> Iterator[int]:
     """Collects shards, in this process if one is enough, and yields each when it is written."""
     if workers <= 1:
-        with closing(_make_env(plan.scene)) as env:
+        with closing(PickPlaceEnv(scene=plan.scene)) as env:
             for shard in shards:
                 yield _collect_shard(env, root, plan, shard)
         return
@@ -375,7 +367,7 @@ def _start_worker(root: Path, plan: CollectionPlan) -> None:
     # An interrupt in the terminal goes to all processes, and ends this one at once.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    _worker = _make_env(plan.scene), root, plan
+    _worker = PickPlaceEnv(scene=plan.scene), root, plan
 
 
 def _exit_with_parent() -> None:
@@ -389,15 +381,6 @@ def _exit_with_parent() -> None:
 def _collect_in_worker(shard: int) -> int:
     env, root, plan = _worker
     return _collect_shard(env, root, plan, shard)
-
-
-def _make_env(scene: SceneConfig) -> PickPlaceEnv:
-    from gym_deltaco.env import PickPlaceEnv
-
-    # ADAPTER: `return PickPlaceEnv(scene=scene)`, once the environment takes a SceneConfig.
-    settings = asdict(scene)
-    del settings["episode_length"]
-    return PickPlaceEnv(**settings)
 
 
 def _collect_shard(env: PickPlaceEnv, root: Path, plan: CollectionPlan, shard: int) -> int:

@@ -19,16 +19,15 @@ from lerobot.datasets import LeRobotDataset
 from PIL import Image
 
 from gym_deltaco import EPISODE_STEPS
+from gym_deltaco.env import ACTION_NAMES, STATE_NAMES, PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASKS
 from lerobot_deltaco import collect as collect_module
 from lerobot_deltaco.collect import (
-    ACTION_NAMES,
     DATA_SETS,
     DESCRIPTION_FILE,
-    STATE_NAMES,
     CollectionError,
     CollectionPlan,
     collect,
@@ -44,7 +43,7 @@ PLAN = CollectionPlan("90,4", 20)
 
 @pytest.fixture(scope="module")
 def env():
-    env = collect_module._make_env(SceneConfig())
+    env = PickPlaceEnv()
     yield env
     env.close()
 
