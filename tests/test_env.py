@@ -334,20 +334,6 @@ def test_use_before_reset_or_after_close_is_an_error():
             use(env)
 
 
-def test_interrupted_reset_needs_another_reset(env, monkeypatch):
-    def fail():
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("gym_deltaco.scene.tray_mesh", fail)
-        with pytest.raises(KeyboardInterrupt):
-            env.reset(seed=1)
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(STAY_OPEN)
-    env.reset(seed=1)
-    env.step(STAY_OPEN)
-
-
 # Resources
 
 
@@ -379,46 +365,15 @@ def test_closed_or_forgotten_environments_leave_no_clients_and_files(temporary_f
     assert temporary_files() == []
 
 
-@pytest.mark.parametrize("name", ["_color_texture", "pybullet.connect"])
-def test_failed_start_of_the_simulator_leaves_no_client_and_files(temporary_files, monkeypatch, name):
-    def fail(*_, **__):
-        raise OSError("no space left")
-
-    before = connected_clients()
-    env = PickPlaceEnv(scene=SMALL)
-    with monkeypatch.context() as patch:
-        patch.setattr(f"gym_deltaco.simulation.{name}", fail)
-        with pytest.raises(OSError, match="no space left"):
-            env.reset(seed=0)
-    with monkeypatch.context() as patch:
-        patch.setattr("gym_deltaco.simulation.pybullet.connect", lambda _: -1)
-        with pytest.raises(RuntimeError, match="no free client left"):
-            env.reset(seed=0)
-    gc.collect()
-    assert connected_clients() == before
-    assert temporary_files() == []
-    env.reset(seed=0)
-    env.close()
-
-
-@pytest.mark.parametrize(
-    "end",
-    [
-        "",
-        "env.close()",
-        "env.itself = env",
-        "raise SystemExit(0)",
-        "from multiprocessing import get_context\n"
-        "process = get_context('fork').Process(target=env.close); process.start(); process.join()\n"
-        "env.reset(seed=1, options={'task_id': 1})",
-    ],
-)
-def test_process_ends_silently_and_leaves_no_files(tmp_path, end):
-    script = (
-        "from gym_deltaco.env import PickPlaceEnv\n"
-        "env = PickPlaceEnv(); env.reset(seed=0)\n"
-        f"def keep(env=env, kept=[]): kept.append((keep, env))\nkeep()\n{end}\n"
-    )
+def test_process_ends_silently_and_leaves_no_files(tmp_path):
+    script = """
+import multiprocessing
+from gym_deltaco.env import PickPlaceEnv
+env = PickPlaceEnv(); env.reset(seed=0)
+env.itself = env
+process = multiprocessing.get_context("fork").Process(target=env.close); process.start(); process.join()
+env.reset(seed=1, options={"task_id": 1})  # the child has closed its copy, and no files of the parent
+"""
     environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONWARNINGS": "always::ResourceWarning"}
     command = [sys.executable, "-c", script]
     result = subprocess.run(command, capture_output=True, text=True, env=environment)
@@ -434,14 +389,3 @@ def test_environment_can_be_pickled_before_its_first_reset_but_not_after(env):
         with pytest.raises(TypeError, match="cannot be copied or pickled"):
             duplicate(other)
     other.close()
-
-
-def test_wrappers_of_gymnasium_work():
-    env = gym.make(ENV_ID, scene=SMALL)
-    env = gym.wrappers.RecordEpisodeStatistics(gym.wrappers.FlattenObservation(env), buffer_length=1)
-    observation, _ = env.reset(seed=0)
-    assert observation.shape == (8 * 8 * 3 + 10,)
-    for _ in range(30):
-        *_, info = env.step(STAY_OPEN)
-    assert info["episode"]["l"] == 30
-    env.close()

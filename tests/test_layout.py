@@ -214,12 +214,6 @@ def test_distractors_are_adversarial_as_often_as_specified(monkeypatch, draw):
         assert (np.abs(found - expected) <= 4.5 * np.sqrt(expected * (1 - expected) / 1000) + 1e-12).all()
 
 
-def test_draw_for_the_scene_makes_both_distractors_adversarial_more_often():
-    each, scene = (expected_fractions(3, 31, 0.6, draw)[2] for draw in ADVERSARIAL_DRAWS)
-    assert scene == pytest.approx(0.6 + 0.4 * (3 / 31) * (2 / 30))
-    assert each == pytest.approx((0.6 + 0.4 * 3 / 31) * (0.6 + 0.4 * 2 / 30))
-
-
 # Ambiguity "object"
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import colorsys
 from itertools import combinations, product
 
 import numpy as np
 import pybullet
 import pytest
+from matplotlib.colors import rgb_to_hsv
 
 from gym_deltaco import objects
 from gym_deltaco.object_sets import MAX_OBJECTS, OBJECT_SETS, find_label, find_model, select_objects
 from gym_deltaco.objects import ObjectModel, object_model
-from gym_deltaco.random_objects import FIRST_INDEX, random_label, random_model
+from gym_deltaco.random_objects import FIRST_INDEX, random_label
 from gym_deltaco.solids import Loft, merged, polygon
 from gym_deltaco.tasks import COLOR_SHAPE_PAIRS, OBJECTS, SCENARIOS
 
@@ -101,45 +101,21 @@ def _visible_areas(model: ObjectModel) -> np.ndarray:
 
 
 def test_object_shows_the_color_of_its_label(model):
-    areas = _visible_areas(model)
-    if model.label.index >= FIRST_INDEX:
-        # Not the inside, and bands or a label in another color
-        assert areas[_has_color(model)].sum() / areas.sum() > 0.5
-        return
+    areas, colors = _visible_areas(model), model.mesh.colors
     if model.label.color == "black and white":
-        brightness = model.mesh.colors.mean(axis=1)
-        assert areas[brightness < 0.2].sum() > 0.3 * areas.sum()
-        assert areas[brightness > 0.8].sum() > 0.3 * areas.sum()
+        brightness = colors.mean(axis=1)
+        assert areas[brightness < 0.2].sum() > 0.15 * areas.sum()
+        assert areas[brightness > 0.8].sum() > 0.15 * areas.sum()
         return
-    hue, saturation, value = colorsys.rgb_to_hsv(*np.average(model.mesh.colors, axis=0, weights=areas))
-    ranges = HSV_RANGES[model.label.color]
-    signed_hue = (360 * hue + 60) % 360 - 60  # red lies about zero
-    for number, (low, high) in zip((signed_hue, saturation, value), ranges, strict=True):
-        assert low <= number <= high + 1e-9
-
-
-def _has_color(model: ObjectModel) -> np.ndarray:
-    """Returns whether each face has the color of the label, or a shade of it, (F,)."""
-    word = model.label.color
-    if word == "black and white":
-        return np.ptp(model.mesh.colors, axis=1) < 0.01
-    (low_hue, high_hue), saturations, values = HSV_RANGES[word]
-    margins = (
-        (low_hue - 4, high_hue + 4),
-        (saturations[0] - 0.1, saturations[1] + 0.1),
-        (values[0] - 0.35, 1.0),
-    )
-    found = []
-    for rgb in model.mesh.colors:
-        hue, saturation, value = colorsys.rgb_to_hsv(*rgb)
-        signed_hue = (360 * hue + 60) % 360 - 60
-        found.append(
-            all(
-                low <= number <= high
-                for number, (low, high) in zip((signed_hue, saturation, value), margins, strict=True)
-            )
-        )
-    return np.array(found)
+    low, high = np.transpose(HSV_RANGES[model.label.color])
+    if model.label.index < FIRST_INDEX:
+        hsv = rgb_to_hsv(np.average(colors, axis=0, weights=areas))
+    else:  # most faces, which may be darker; not the inside, and bands or a label in another color
+        hsv = rgb_to_hsv(colors)
+        low, high = low - (4, 0.1, 0.35), high + (4, 0.1, 1)
+    hsv[..., 0] = (360 * hsv[..., 0] + 60) % 360 - 60  # red lies about zero
+    has_color = ((low <= hsv) & (hsv <= high + 1e-9)).all(axis=-1)
+    assert (has_color * areas).sum() > 0.5 * areas.sum()
 
 
 def test_origin_and_size(model):
@@ -211,6 +187,8 @@ def _directions(count: int = 600) -> np.ndarray:
 
 
 def test_collision_parts_approximate_the_mesh(model):
+    assert 1 <= len(model.parts) <= 4
+    assert all(4 <= len(part) <= 24 for part in model.parts)
     directions = _directions()
     reach_of_mesh = (model.mesh.vertices @ directions.T).max(axis=0)
     reach_of_parts = np.array([(part @ directions.T).max(axis=0) for part in model.parts])
@@ -218,25 +196,6 @@ def test_collision_parts_approximate_the_mesh(model):
     # Every vertex lies in some part, or very close to it.
     outside = (model.mesh.vertices @ directions.T)[:, None] - reach_of_parts  # (V, parts, directions)
     assert outside.max(axis=2).min(axis=1).max() <= COLLISION_TOLERANCE
-
-
-def test_collision_parts_are_few_and_convex(model):
-    assert 1 <= len(model.parts) <= 4
-    for part in model.parts:
-        assert 4 <= len(part) <= 24
-        triples = part[np.array(list(combinations(range(len(part)), 3)))]
-        normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        proper = lengths[:, 0] > 1e-9
-        triples, normals = triples[proper], normals[proper] / lengths[proper]
-        triples, normals = np.concatenate([triples, triples]), np.concatenate([normals, -normals])
-        above = part @ normals.T - np.einsum("ti,ti->t", triples[:, 0], normals)  # (P, planes)
-        supports = (above <= 1e-7).all(axis=0)
-        for number in range(len(part)):
-            # The sum of the normals of a corner's faces points away from all other corners.
-            outward = normals[supports & (np.abs(above[number]) <= 1e-7)].sum(axis=0)
-            others = np.delete(part, number, axis=0)
-            assert (others @ outward).max() < part[number] @ outward - 1e-7
 
 
 @pytest.fixture(scope="module")
@@ -278,19 +237,6 @@ def test_stands_after_a_drop(model, tilts):
 
 
 # Random objects
-
-
-def test_a_random_object_is_a_function_of_its_index():
-    random_model.cache_clear()
-    first = random_model(100)
-    random_model.cache_clear()
-    random_model(101)
-    again = random_model(100)
-    assert again is not first
-    assert again.label == first.label
-    np.testing.assert_array_equal(again.mesh.vertices, first.mesh.vertices)
-    np.testing.assert_array_equal(again.mesh.colors, first.mesh.colors)
-    assert again.grasp_height == first.grasp_height
 
 
 def test_random_objects_run_through_all_pairs_but_those_of_test_objects():

@@ -3,7 +3,6 @@
 from contextlib import closing
 
 import numpy as np
-import pybullet
 import pytest
 
 from gym_deltaco.camera import Camera
@@ -75,30 +74,3 @@ def test_bodies_added_later_are_seen(simulation):
         assert not np.array_equal(images[-1], images[-2])
     simulation.reset()
     np.testing.assert_array_equal(simulation.render(FRONT, 32), images[0])
-
-
-@pytest.mark.parametrize(
-    ("name", "n_calls"),
-    [*(("getCameraImage", n) for n in range(2)), *(("changeVisualShape", n) for n in range(8))],
-)
-def test_interrupted_rendering_does_not_change_later_images(simulation, monkeypatch, name, n_calls):
-    for x in (-0.1, 0.1):
-        add_cube(simulation, (x, 0.0, 0.0), (0.2, 0.2, 0.9), is_static=True)
-        add_cube(simulation, (x, 0.15, 0.0), (0.2, 0.2, 0.9), is_static=False)
-    expected = simulation.render(FRONT, 32)
-    np.testing.assert_array_equal(expected, render_together(simulation, FRONT, 32))
-    simulation.render(FRONT, 32)
-    function, calls = getattr(pybullet, name), []
-
-    def interrupted(*args, **kwargs):
-        calls.append(name)
-        if len(calls) == n_calls + 1:
-            raise KeyboardInterrupt
-        return function(*args, **kwargs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(pybullet, name, interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            simulation.render(FRONT, 16)  # the background of this size is new
-    np.testing.assert_array_equal(simulation.render(FRONT, 32), expected)
-    np.testing.assert_array_equal(render_together(simulation, FRONT, 32), expected)
