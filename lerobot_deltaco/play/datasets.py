@@ -19,12 +19,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import torch
+from gym_deltaco.sheets import enlarged
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from gym_deltaco.sheets import enlarged
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.play.demonstrations import Demonstration, check_number, demonstration_of
 from lerobot_deltaco.play.errors import PlayError

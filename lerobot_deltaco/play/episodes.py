@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from gym_deltaco.sheets import caption, down, to_image
 from lerobot.envs.utils import preprocess_observation
 from numpy.typing import NDArray
 from torch import Tensor
@@ -22,7 +23,6 @@ from gym_deltaco import CONTROL_FPS, EPISODE_STEPS
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.sheets import caption, down, to_image
 from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, TASKS, Task, get_task
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
 from lerobot_deltaco.evaluation.episodes import counterfactual_task
