@@ -18,35 +18,40 @@ from gym_deltaco.tasks import COLORS, CONTAINER_WORDS, OBJECTS, SHAPES, Containe
 _SAME_PHRASES = {
     r"black[ -](and|&)[ -]white|black[ /-]white|white[ -](and|&)[ -]black|checkered": "blackandwhite",
     r"free[ -]form(ed)?": "freeform",
-    r"half[ -]gallon": "half gallon",
 }
-_SAME_WORDS = {
-    **dict.fromkeys(("grey", "silver"), "gray"),
-    **dict.fromkeys(("mug", "teacup"), "cup"),
-    **dict.fromkeys(("goblet", "grail"), "chalice"),
-    **dict.fromkeys(("boat", "kayak"), "canoe"),
-    **dict.fromkeys(("cylindrical", "tube", "pipe"), "cylinder"),
-    **dict.fromkeys(("trapezoid", "trapezium", "prismatic"), "trapezoidal"),
-    **dict.fromkeys(("doughnut", "torus"), "donut"),
-    "ring": "hole",
-    **dict.fromkeys(("couch", "settee"), "sofa"),
-    "black": "blackandwhite",
-    "tub": "bathtub",
-    "flask": "bottle",
-    "rear": "back",
-    "leftmost": "left",
-    "rightmost": "right",
+_SYNONYMS = {
+    "blackandwhite": "black",
+    "gray": "grey silver",
+    "cup": "mug teacup",
+    "chalice": "goblet grail",
+    "canoe": "boat kayak",
+    "cylinder": "cylindrical tube pipe",
+    "trapezoidal": "trapezoid trapezium prismatic",
+    "bottle": "flask",
+    "hole": "ring",
+    "donut": "doughnut torus",
+    "sofa": "couch settee",
+    "bathtub": "tub",
+    "back": "rear",
+    "left": "leftmost",
+    "right": "rightmost",
 }
-_CONTAINER_NOUNS = {"bin", "bins", "container", "box", "basket", "bucket", "crate", "tray"}
-_PREPOSITIONS = {"in", "into", "inside", "within", "to", "onto", "on", "at", "toward", "towards", "from"}
-_BETWEEN = {"the", "a", "hand", "most", "side", "colored", "coloured", "color", "one", "far", "very", "that", "is"}
-# Words that say nothing about the object, or too little alone: those of a whole name count.
-_WEAK_WORDS = {"bin", "tray", "can", "top", "table", "half", "two", "bottom", "flat", "lid", "box", "handle", "t"}
-_IGNORED = {
-    *("put", "place", "move", "drop", "take", "pick", "grab", "bring", "carry", "set", "lift", "please", "would"),
-    *("object", "thing", "item", "shape", "shaped", "color", "colored", "colour", "coloured", "with", "like"),
-    *("that", "this", "them", "then", "there", "which", "looks", "made", "light", "dark", "small", "large", "over"),
-}
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+_SAME_WORDS = {typed: word for word, synonyms in _SYNONYMS.items() for typed in synonyms.split()}
+_CONTAINER_NOUNS = _words("bin bins container box basket bucket crate tray")
+_PREPOSITIONS = _words("in into inside within to onto on at toward towards from")
+_BETWEEN = _words("the a hand most side colored coloured color one far very that is")
+# Words that say too little about the object alone; in a whole name, they count.
+_WEAK_WORDS = _words("bin tray can top table half two bottom flat lid box handle t in round")
+_IGNORED = _words(
+    "put place move drop take pick grab bring carry set lift please would object thing item shape shaped "
+    "color colored colour coloured with like that this them then there which looks made light dark over"
+)
 _WORDS_OF_COLORS = {color.replace(" ", ""): color for color in COLORS}
 _WORDS_OF_SHAPES = {word: shape for shape in SHAPES for word in shape.split() if word != "round"}
 _NAMES = {tuple(label.name.split()): label.index for label in OBJECTS}
@@ -123,8 +128,8 @@ def _split_container(words: list[str]) -> tuple[ContainerWord | None, list[str]]
         start = position
         while start > 0 and words[start - 1] in _BETWEEN:
             start -= 1
-        begins = start > 0 and words[start - 1] in _PREPOSITIONS | (_CONTAINER_NOUNS if start < position else set())
-        return start - 1 if begins else position
+        begin = _PREPOSITIONS | _CONTAINER_NOUNS if start < position else _PREPOSITIONS
+        return start - 1 if start > 0 and words[start - 1] in begin else position
 
     candidates = [n for n, word in enumerate(words) if word in CONTAINER_WORDS]
     # "the red bin" comes before "in the red one", and that before a position anywhere. Red things without
@@ -155,9 +160,7 @@ def _find_objects(words: Sequence[str]) -> tuple[frozenset[int] | None, tuple[st
         dict.fromkeys(
             word
             for word in words
-            if word in _WORDS_OF_COLORS
-            or word in _WORDS_OF_SHAPES
-            or (word in _WORDS_OF_NAMES and word not in _WEAK_WORDS | _IGNORED | {"in", "round"})
+            if word in _WORDS_OF_COLORS or word in _WORDS_OF_SHAPES or word in _WORDS_OF_NAMES - _WEAK_WORDS
         )
     )
     if not used:
@@ -280,4 +283,6 @@ def _describe_moved(layout: Layout, placed: frozenset[tuple[int, int]], grasped:
     put = [f"the {names[item]} into the {container_name(layout, bin_)}" for item, bin_ in sorted(placed)]
     if put:
         return f"It put {' and '.join(put)}."
-    return "It grasped nothing." if grasped < 0 else f"It grasped the {names[grasped]}, but put it into no bin."
+    return (
+        "It grasped nothing." if grasped < 0 else f"It grasped the {names[grasped]}, but put it into no bin."
+    )
