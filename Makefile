@@ -9,25 +9,15 @@ INSTALLING := $(VENV)/.installing
 PYTHON ?=
 # More arguments for pytest: make test ARGS="-k tasks"
 ARGS ?=
-# An experiment, which is a file in experiments/, and the seed of its training
-EXPERIMENT ?= scenario_a/deltaco
-SEED ?= 0
-# Of the training of scenario A on a GPU, and further settings: SETTINGS="--set data.episodes_per_task=50"
-STEPS ?= 100000
-EVALUATE_EVERY ?= $(shell expr $(STEPS) / 10)
-DEVICE ?= cuda
-SETTINGS ?=
+# Minutes of the demo: 8, or 25 for the whole recipe
+MINUTES ?= 8
 # User or organization on the Hub that a release is published under, and its datasets: DATASETS="data/train data/test"
 HUB_USER ?=
 DATASETS ?=
-# Trainings at a time, of scenario A at a small scale
-JOBS ?= 2
-OUT ?= outputs/scenario_a
-REPORT ?= outputs/report_scenario_a
 
 export UV_PYTHON_DOWNLOADS := never
 
-.PHONY: help install demo play experiment gpu-scenario-a small-scenario-a test test-slow test-browser soak lint
+.PHONY: help install demo play test test-slow test-browser soak lint
 .PHONY: benchmark-env benchmark-policy benchmark-train coverage docs release
 
 help: ## List the targets
@@ -35,26 +25,11 @@ help: ## List the targets
 
 install: $(INSTALLED) ## Only set up the environment, in .venv
 
-demo: $(INSTALLED) ## Collect, train and evaluate on a few tasks, in a few minutes: outputs/demo
-	$(BIN)/deltaco-demo --out outputs/demo
+demo: $(INSTALLED) ## Collect, train and evaluate, in 8 minutes or make demo MINUTES=25: outputs/demo/index.html
+	$(BIN)/deltaco demo --minutes $(MINUTES)
 
 play: $(INSTALLED) ## Play with the trained policy in the browser: http://127.0.0.1:7860
 	$(BIN)/deltaco-play $(ARGS)
-
-experiment: $(INSTALLED) ## Run an experiment: make experiment EXPERIMENT=scenario_a/deltaco SEED=0
-	$(BIN)/deltaco-experiment $(EXPERIMENT) --seed $(SEED)
-
-gpu-scenario-a: $(INSTALLED) ## Scenario A in full, on a GPU: make gpu-scenario-a STEPS=100000 SEED="0 1 2"
-	$(BIN)/deltaco-experiment scenario_a/deltaco scenario_a/language_only scenario_a/demo_only --seed $(SEED) \
-		--set training.steps=$(STEPS) --set training.env_eval_freq=$(EVALUATE_EVERY) --set policy.device=$(DEVICE) \
-		--set policy.compile=true --set policy.demos_per_task=2 $(SETTINGS) \
-		--out $(OUT) --report $(REPORT)
-
-small-scenario-a: OUT = outputs/experiments
-small-scenario-a: REPORT = outputs/report_small_a
-small-scenario-a: $(INSTALLED) ## Scenario A at a small scale, without a GPU: make small-scenario-a JOBS=2 SEED=0
-	$(BIN)/deltaco-experiment small_a/deltaco small_a/language_only small_a/one_hot small_a/demo_only small_a/oracle \
-		--seed $(SEED) --jobs $(JOBS) $(SETTINGS) --out $(OUT) --report $(REPORT)
 
 test: $(INSTALLED) ## Run the default tests: a few minutes, no internet, no GPU
 	$(BIN)/python -m pytest $(ARGS)

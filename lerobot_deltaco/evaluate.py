@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import multiprocessing
 import random
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +25,7 @@ import torch
 from gymnasium.utils import seeding
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.utils import preprocess_observation
+from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.random_utils import seeded_context
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -34,12 +37,12 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import Task, get_task
 from lerobot_deltaco.base_config import SOURCES
 from lerobot_deltaco.base_policy import TaskConditionedPolicy
-from lerobot_deltaco.checkpoints import Checkpoint, LoadedPolicy
+from lerobot_deltaco.checkpoints import Checkpoint, LoadedPolicy, find_checkpoints, load_policy
 from lerobot_deltaco.demonstrations import Demonstration, DemonstrationBank
 from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.optimization import keep_freed_memory
 from lerobot_deltaco.paraphrases import choose_instructions
-from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord
+from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord, read_records, write_records
 
 # Most episodes that run at the same time. A policy's step costs little more for 8 than for 2, and each
 # episode needs a simulator of 50 MB, in each process.
@@ -82,12 +85,14 @@ class Outcome(NamedTuple):
     Attributes:
         episode: The episode.
         info: Info of the environment after the last step.
-        demonstrations: The demonstrations that the policy received.
+        demonstration_episodes: Episodes of the demonstrations that the policy received, in their dataset.
+        demonstrated_objects: Indices of the objects that they move.
     """
 
     episode: Episode
     info: Mapping[str, Any]
-    demonstrations: Sequence[Demonstration]
+    demonstration_episodes: list[int]
+    demonstrated_objects: list[int]
 
 
 # Called after the reset and after each step with the environments of a batch and their observations.
@@ -142,7 +147,14 @@ class Evaluation:
         check_policy_fits(policy.config, plan.scene, loaded.rename_map)
         self._conditioned = policy if isinstance(policy, TaskConditionedPolicy) else None
         self._bank = _bank_for(policy, plan)
-        self.batches = _batches(draw_episodes(plan, self._bank))
+        episodes = draw_episodes(plan, self._bank)
+        if getattr(policy.config, "method", None) == "mcil":
+            # The trials of a task use the instruction and the demonstration in turn.
+            episodes = [
+                each._replace(demonstration_task=-1) if each.trial % 2 == 0 else each._replace(instruction="")
+                for each in episodes
+            ]
+        self.batches = _batches(episodes)
         self.simulators = Simulators(plan.scene, render_size)
 
     def run(self, number: int, callback: StepCallback | None = None) -> list[Outcome]:
@@ -156,7 +168,16 @@ class Evaluation:
         demonstrations = [self._demonstrations(episode) for episode in batch]
         with self._computing(batch):
             infos = run_episodes(self.loaded, self.simulators, batch, demonstrations, callback)
-        return [Outcome(*parts) for parts in zip(batch, infos, demonstrations, strict=True)]
+        # Without the demonstrations' tensors, which are not to pass from process to process.
+        return [
+            Outcome(
+                episode,
+                info,
+                [each.episode for each in given if each.episode is not None],
+                [each.target_object for each in given if each.target_object is not None],
+            )
+            for episode, info, given in zip(batch, infos, demonstrations, strict=True)
+        ]
 
     def _demonstrations(self, episode: Episode) -> list[Demonstration]:
         """Returns the demonstrations of an episode: the trials of a task use those of the task in turn."""
@@ -352,16 +373,14 @@ def evaluate(
 def _row(outcome: Outcome) -> dict[str, Any]:
     episode, info = outcome.episode, outcome.info
     template = get_task(episode.task_id).instruction
-    objects = [each.target_object for each in outcome.demonstrations if each.target_object is not None]
-    episodes = [each.episode for each in outcome.demonstrations if each.episode is not None]
     return {
         "task_id": episode.task_id,
         "trial": episode.trial,
         "success": bool(info["is_success"]),
         "instruction": None if episode.instruction == template else episode.instruction,
         "demonstration_task": episode.demonstration_task,
-        "demonstration_episodes": episodes,
-        "demonstrated_objects": objects,
+        "demonstration_episodes": outcome.demonstration_episodes,
+        "demonstrated_objects": outcome.demonstrated_objects,
         "grasped_object": int(info["grasped_object"]),
         "object_containers": info["object_containers"].tolist(),
         "right_object": bool(info["right_object"]),
@@ -475,6 +494,116 @@ def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | None:
     return bank
 
 
-def record_path(run: Path, name: str) -> Path:
-    """Returns the file in which a run keeps a record."""
-    return run / "evaluations" / f"{name}.parquet"
+def evaluate_checkpoints(
+    path: Path,
+    plan: EvaluationPlan,
+    steps: str = "all",
+    out: Path | None = None,
+    *,
+    command: str,
+    processes: int = 1,
+    device: str | None = None,
+    demo_repo_id: str | None = None,
+    demo_root: Path | None = None,
+    experiment: str | None = None,
+    rename_map: Mapping[str, str] | None = None,
+) -> str:
+    """Evaluates the checkpoints of a training, or a policy, that have no record of the plan yet.
+
+    Args:
+        path: Output folder of a training, or folder of a policy.
+        plan: Episodes to run.
+        steps: "all", "last", or steps such as "4000,8000".
+        out: Folder of the records; None for that of the training, or outputs/evaluate/NAME.
+        command: Command line, for the records.
+        processes: Number of processes that share the episodes.
+        device: Device of the policy; None for the checkpoint's.
+        demo_repo_id: Dataset of demonstrations; None for the checkpoint's own.
+        demo_root: Folder of that dataset.
+        experiment: Name for the records; None for the job name of the training.
+        rename_map: Names under which the policy knows the environment's observations.
+
+    Returns:
+        A line for each checkpoint, with its success rate.
+
+    Raises:
+        ValueError: There is no such checkpoint, a record is of another policy, or the plan does not fit.
+    """
+    found = find_checkpoints(path)
+    is_run = (path / "checkpoints").is_dir()
+    folder = out or (path if is_run else Path("outputs/evaluate") / path.resolve().name)
+    given = {"device": device, "demo_repo_id": demo_repo_id, "demo_root": demo_root}
+    overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
+    demonstrations = None
+    if demo_repo_id is not None:
+        demonstrations = (demo_repo_id, metadata_digest(demo_repo_id, demo_root))
+    lines = []
+    for checkpoint in _chosen(found, steps):
+        sized = replace(plan, scene=_with_image_size(plan.scene, checkpoint.image_size))
+        file = folder / "evaluations" / _record_name(checkpoint, sized, demonstrations)
+        if file.exists():
+            (record,) = read_records(file)
+            if record.weights != checkpoint.weights_digest:
+                raise ValueError(
+                    f"{file} is the record of another policy: its weights are not those of "
+                    f"{checkpoint.folder}. Name another folder with --out, or move that record away."
+                )
+        else:
+            loaded = load_policy(checkpoint.folder, overrides, rename_map)
+            record = evaluate(
+                loaded,
+                sized,
+                checkpoint,
+                command=command,
+                processes=processes if str(loaded.policy.config.device) == "cpu" else 1,
+                experiment=experiment,
+                demonstrations=demonstrations,
+            )
+            write_records(file, [record])
+        lines.append(
+            f"{checkpoint.folder}, step {record.step}: {record.success_rate:.1%} of {len(record.episodes)} "
+            f"episodes of {record.plan.tasks} succeeded. Record: {file}"
+        )
+    return "\n".join(lines)
+
+
+def _chosen(found: Sequence[Checkpoint], steps: str) -> list[Checkpoint]:
+    """Returns the checkpoints that `steps` selects.
+
+    Raises:
+        ValueError: There is no checkpoint of a step.
+    """
+    if steps == "all":
+        return list(found)
+    if steps == "last":
+        return [found[-1]]
+    available = {str(checkpoint.step): checkpoint for checkpoint in found}
+    missing = [step for step in steps.split(",") if step not in available]
+    if missing:
+        raise ValueError(
+            f"There is no checkpoint of step {missing[0]!r}. Valid are all, last and {', '.join(available)}."
+        )
+    return [available[step] for step in steps.split(",")]
+
+
+def _with_image_size(scene: SceneConfig, image_size: int) -> SceneConfig:
+    """Returns settings with the image size that a policy was trained on, unless another one is asked for."""
+    return replace(scene, image_size=image_size) if scene == replace(scene, image_size=48) else scene
+
+
+def _record_name(
+    checkpoint: Checkpoint, plan: EvaluationPlan, demonstrations: tuple[str, str] | None
+) -> str:
+    """Returns the file name of a record: the step, and a digest of what else distinguishes evaluations."""
+    digest = hashlib.sha256(repr((plan, demonstrations)).encode()).hexdigest()[:8]
+    return f"{checkpoint.step:07d}_{digest}.parquet"
+
+
+def metadata_digest(repo_id: str, root: Path | None) -> str:
+    """Returns the SHA-256 of a dataset's metadata, which hold the statistics of all its frames."""
+    folder = root if root is not None else HF_LEROBOT_HOME / repo_id
+    digest = hashlib.sha256()
+    for path in sorted(path for path in (folder / "meta").rglob("*") if path.is_file()):
+        digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -56,13 +56,11 @@ class FakeHub:
     Attributes:
         url: Its address.
         repos: {("dataset" or "model", "user/name"): Repo}.
-        read_only: Whether all that writes is refused, as with a token that may only read.
         refused: A regular expression; requests in whose method and path it is found are refused.
     """
 
     def __init__(self):
         self.repos = {}
-        self.read_only = False
         self.refused = None
         self._lock = threading.Lock()
         handler = type("Handler", (_Handler,), {"hub": self})
@@ -106,7 +104,7 @@ class FakeHub:
             return _json({"errors": [], "warnings": []})
         if self.refused and re.search(self.refused, f"{method} {path}"):
             return _error(422, "This Hub does not do that")
-        if method in ("POST", "DELETE") and (token is None or self.read_only):
+        if method in ("POST", "DELETE") and token is None:
             return _error(403, "Forbidden: you do not have the required rights")
         with self._lock:
             if path == "/api/repos/create":

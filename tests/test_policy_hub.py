@@ -21,12 +21,12 @@ from small_policies import REPO_ID, TASKS, small_policy, write_dataset
 
 from gym_deltaco import ENV_ID
 from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
-from lerobot_deltaco.cards.policy_card import MAX_TASKS_LISTED, METHOD_TEXTS, policy_card
+from lerobot_deltaco.collect import CollectionPlan
 from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.data.collection_plan import CollectionPlan
 from lerobot_deltaco.envs.configuration_env import DeltacoEnv
 from lerobot_deltaco.policy.language.instruction_table import LANGUAGE_ENCODERS
 from lerobot_deltaco.policy.options import METHODS
+from lerobot_deltaco.policy_card import MAX_TASKS_LISTED, METHOD_TEXTS, policy_card
 
 POLICY_ID = f"{USER}/policy"
 

@@ -51,5 +51,5 @@ def test_the_experiments_of_the_wheel_are_listed_and_dry_run(site, tmp_path):
     assert len([line for line in lines if line.startswith("deltaco-evaluate ")]) == 2 * len(names)
     assert len(lines) == len(set(lines))
     assert list(tmp_path.iterdir()) == []
-    card = "from lerobot_deltaco.cards.templates import template_folder; print(*template_folder().iterdir())"
-    assert "policy.md" in run(site, tmp_path, "-c", card)
+    card = "from lerobot_deltaco.cards import render; print(render('citation.md'))"
+    assert "yu2023deltaco" in run(site, tmp_path, "-c", card)

@@ -1,1 +1,0 @@
-"""The cards of datasets and policies on the Hugging Face Hub."""

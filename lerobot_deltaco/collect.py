@@ -1,0 +1,460 @@
+"""Collects successful episodes of the scripted expert as a LeRobotDataset.
+
+The dataset is a function of its plan alone. Worker processes write shards, whose episodes and indices are
+known beforehand; the main process writes the dataset's metadata last. A shard is whole or absent, so that the
+same command continues an interrupted collection with the shards that are missing.
+
+A plan needs no simulator, and nothing here imports LeRobot or torch.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from gym_deltaco import CONTROL_FPS, ENV_ID, EXPERT_NOISE
+from gym_deltaco.atomic_files import write_json
+from gym_deltaco.env import ACTION_NAMES, STATE_NAMES, PickPlaceEnv
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, get_task, select_tasks
+from lerobot_deltaco import dataset_writer
+
+Split = Literal["train", "validation"]
+
+ROBOT_TYPE = "widowx_250"
+DESCRIPTION_FILE = "meta/deltaco.json"
+MAX_ATTEMPTS = 100
+# Outside `observation.`, so that no policy takes them for an input.
+PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_container", "benchmark.seed")
+
+_NOVEL_OBJECTS = tuple(task for task in SCENARIOS["a"].test_tasks if TASKS[task].kind == "name")
+# Data sets by name, with the purpose of their episodes. All but T150 and V48 are the authors'.
+DATA_SETS: dict[str, tuple[tuple[int, ...], Split]] = {
+    "T198": (SCENARIOS["a"].train_tasks, "train"),
+    "T48": (_NOVEL_OBJECTS, "train"),
+    "T54": (SCENARIOS["b"].test_tasks, "train"),
+    "E48": (_NOVEL_OBJECTS, "validation"),
+    "E54": (SCENARIOS["b"].test_tasks, "validation"),
+    "E102": (SCENARIOS["a"].test_tasks, "validation"),
+    "T150": (VALIDATION.train_tasks, "train"),
+    "V48": (VALIDATION.test_tasks, "validation"),
+}
+
+
+class CollectionError(RuntimeError):
+    """A collection that cannot begin or go on; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class CollectionPlan:
+    """Everything that a dataset depends on; equal plans give equal datasets.
+
+    Args:
+        tasks: A task set (scenario_a_train, ...), a data set of the authors (T198, T48, T54, E48, E54, E102)
+            or for choosing settings (T150, V48), or indices and ranges such as "4,50-73".
+        episodes_per_task: Number of successful episodes of each task.
+        seed: Seed of the whole dataset.
+        split: Purpose of the episodes; scenes of different splits never coincide. By default, the split of
+            the data set, "validation" for test and validation tasks, and "train" otherwise.
+        noise: Standard deviation of the Gaussian noise on the expert's motions.
+        scene: Settings of the scenes.
+
+    Raises:
+        ValueError: An argument is invalid; the message says what is valid.
+    """
+
+    tasks: str
+    episodes_per_task: int
+    seed: int = 0
+    split: Split | None = None
+    noise: float = EXPERT_NOISE
+    scene: SceneConfig = SceneConfig()
+
+    def __post_init__(self) -> None:
+        for name, lowest in (("episodes_per_task", 1), ("seed", 0), ("noise", 0)):
+            number = getattr(self, name)
+            if not lowest <= number < math.inf:
+                raise ValueError(f"`{name}` must be at least {lowest}. Got {number}.")
+        self.scene.check_tasks(self.task_ids)
+        if self.tasks.strip() == "scenario_a_clean_train" and self.scene.objects == "all":
+            raise ValueError(
+                "Scenes of scenario_a_clean_train show no test objects. Set the scene's `objects` to "
+                "scenario_a_train."
+            )
+        if self.split is None:
+            object.__setattr__(self, "split", self._default_split())
+        if self.split not in get_args(Split):
+            raise ValueError(f"`split` must be one of {', '.join(get_args(Split))}. Got {self.split!r}.")
+
+    def _default_split(self) -> Split:
+        if self.tasks in DATA_SETS:
+            return DATA_SETS[self.tasks][1]
+        for kind in ("_test", "_validation"):
+            held_out = TASK_SETS[f"scenario_a{kind}"]
+            if self.tasks.endswith(kind) and set(self.task_ids) <= set(held_out):
+                return "validation"
+        return "train"
+
+    @property
+    def task_ids(self) -> tuple[int, ...]:
+        """Indices of the tasks, in the order of the dataset."""
+        if self.tasks in DATA_SETS:
+            return DATA_SETS[self.tasks][0]
+        try:
+            return select_tasks(self.tasks)
+        except ValueError as error:
+            raise ValueError(f"{error} Also valid are the data sets {', '.join(DATA_SETS)}.") from None
+
+    @property
+    def n_episodes(self) -> int:
+        """Number of episodes of all tasks."""
+        return len(self.task_ids) * self.episodes_per_task
+
+    @property
+    def shards(self) -> list[range]:
+        """Indices of the episodes of each shard.
+
+        A shard has at most 100 episodes, about 5 MB. Small datasets have smaller shards, so that all workers
+        have something to do.
+        """
+        size = min(100, max(10, self.n_episodes // 32))
+        return [range(first, min(first + size, self.n_episodes)) for first in range(0, self.n_episodes, size)]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Result of a collection.
+
+    Attributes:
+        root: Folder of the dataset.
+        episodes: Number of successful episodes of each kind of task.
+        attempts: Number of episodes that the expert needed for them.
+        episodes_per_s: Speed of this run; None if there was nothing to do.
+    """
+
+    root: Path
+    episodes: dict[str, int]
+    attempts: dict[str, int]
+    episodes_per_s: float | None
+
+    def __str__(self) -> str:
+        speed = "nothing to do" if self.episodes_per_s is None else f"{self.episodes_per_s:.1f} episodes/s"
+        rates = ", ".join(
+            f"{kind} {n_episodes / self.attempts[kind]:.1%}" for kind, n_episodes in self.episodes.items()
+        )
+        n_episodes, n_attempts = sum(self.episodes.values()), sum(self.attempts.values())
+        return (
+            f"{self.root}: {n_episodes} episodes; {speed}.\n"
+            f"The expert succeeded in {n_episodes} of {n_attempts} attempts ({rates})."
+        )
+
+
+def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
+    """Collects a dataset, or continues an interrupted collection of the same plan.
+
+    Args:
+        root: Folder of the dataset: new, empty, or of the same plan.
+        plan: Tasks, episodes and settings.
+        workers: Number of processes; the dataset is the same with any number.
+
+    Returns:
+        Counts and speed. If the dataset is finished, there is nothing to do.
+
+    Raises:
+        CollectionError: The folder holds something else, or cannot be written to; the expert cannot do a
+            task; or a worker process was killed.
+        SimulatorMissingError: PyBullet is not installed.
+    """
+    import gym_deltaco.env  # noqa: F401  (fails here, before anything is written, if there is no simulator)
+
+    if workers < 1:
+        raise CollectionError(f"`workers` must be at least 1. Got {workers}.")
+    try:
+        _check_folder(root, plan)
+        if is_finished(root):
+            return _summary(root, None)
+        if not (root / DESCRIPTION_FILE).exists():
+            write_json(root / DESCRIPTION_FILE, _description(plan))
+        speed = _collect_shards(root, plan, workers)
+        write_json(root / DESCRIPTION_FILE, {**_description(plan), **_outcome(root, plan)})
+        instructions = [get_task(task_id).instruction for task_id in plan.task_ids]
+        dataset_writer.write_metadata(
+            root, dataset_features(plan.scene), CONTROL_FPS, ROBOT_TYPE, instructions
+        )
+    except BrokenProcessPool:
+        raise CollectionError(
+            "A worker process was killed; the memory may be full. Finished shards are kept: run the same "
+            "command again, with fewer workers."
+        ) from None
+    except OSError as error:
+        raise CollectionError(
+            f"Cannot write to {root}: {error.strerror or error}. Finished shards are kept: run the same "
+            "command again when there is space and the folder can be written to."
+        ) from None
+    return _summary(root, speed)
+
+
+# The folder
+
+
+def is_finished(root: Path) -> bool:
+    """Returns whether a folder holds a dataset whose collection is complete."""
+    return (root / DESCRIPTION_FILE).exists() and (root / dataset_writer.INFO_FILE).exists()
+
+
+def read_description(root: Path) -> dict[str, Any]:
+    """Reads the origin of a dataset.
+
+    Returns:
+        "plan", "benchmark" and "renderer"; of a finished dataset also "versions" of packages, and for each
+        kind of task the number of "episodes" and of "attempts".
+    """
+    return json.loads((root / DESCRIPTION_FILE).read_text(encoding="utf-8"))
+
+
+def read_plan(root: Path) -> CollectionPlan:
+    """Reads the plan of a dataset."""
+    plan = read_description(root)["plan"]
+    return CollectionPlan(**{**plan, "scene": SceneConfig(**plan["scene"])})
+
+
+def renderer() -> str:
+    """Returns the name of what renders the images."""
+    return f"PyBullet {version('pybullet')}, TinyRenderer"
+
+
+def dataset_features(scene: SceneConfig) -> dict[str, dict[str, Any]]:
+    """Returns the features of a dataset, as in LeRobot's info.json."""
+    number = {"dtype": "int64", "shape": [1], "names": None}
+    defaults = asdict(SceneConfig())
+    changed = {
+        name: value
+        for name, value in asdict(scene).items()
+        if name in ("objects", "adversarial_probability", "adversarial_draw") and value != defaults[name]
+    }
+    return {
+        "observation.image": {
+            "dtype": "image",
+            "shape": [scene.image_size, scene.image_size, 3],
+            "names": ["height", "width", "channels"],
+            # Policies do not transfer from one renderer's images to another's.
+            "info": {
+                "renderer": renderer(),
+                "benchmark": ENV_ID,
+                "ambiguity": scene.ambiguity,
+                **changed,
+            },
+        },
+        "observation.state": {"dtype": "float32", "shape": [len(STATE_NAMES)], "names": STATE_NAMES},
+        "action": {"dtype": "float32", "shape": [len(ACTION_NAMES)], "names": ACTION_NAMES},
+        "next.reward": {"dtype": "float32", "shape": [1], "names": None},
+        "next.done": {"dtype": "bool", "shape": [1], "names": None},
+        "next.success": {"dtype": "bool", "shape": [1], "names": None},
+        **dict.fromkeys(PRIVILEGED, number),
+        **dataset_writer.DEFAULT_FEATURES,
+    }
+
+
+def _description(plan: CollectionPlan) -> dict[str, Any]:
+    return {"plan": asdict(plan), "benchmark": ENV_ID, "renderer": renderer()}
+
+
+def _outcome(root: Path, plan: CollectionPlan) -> dict[str, Any]:
+    """Counts the attempts that the episodes took: an episode's seed tells which attempt it was."""
+    rows = pq.read_table(
+        root / "data", columns=["episode_index", "benchmark.seed"], filters=[("frame_index", "==", 0)]
+    )
+    episodes: dict[str, int] = {}
+    attempts: dict[str, int] = {}
+    for index, seed in zip(*(column.to_pylist() for column in rows.columns), strict=True):
+        task_id, number = _task_and_number(plan, index)
+        kind = get_task(task_id).kind
+        episodes[kind] = episodes.get(kind, 0) + 1
+        attempts[kind] = attempts.get(kind, 0) + 1 + list(_seeds(plan, task_id, number)).index(seed)
+    versions = {name: version(name) for name in ("lerobot_policy_deltaco", "pybullet", "numpy")}
+    return {"versions": versions, "episodes": episodes, "attempts": attempts}
+
+
+def _summary(root: Path, episodes_per_s: float | None) -> Summary:
+    description = read_description(root)
+    return Summary(root, description["episodes"], description["attempts"], episodes_per_s)
+
+
+def _check_folder(root: Path, plan: CollectionPlan) -> None:
+    if not (root / DESCRIPTION_FILE).exists():
+        found = next((path for path in root.rglob("*") if path.is_file()), None)
+        if found is not None:
+            raise CollectionError(f"{root} is not empty: it holds {found.name}. Name a new folder.")
+        return
+    begun, wanted = (_flat(description) for description in (read_description(root), _description(plan)))
+    # A finished dataset stays what it is when packages are updated.
+    ignored = ("benchmark", "renderer") if is_finished(root) else ()
+    differences = [
+        f"{name}: {begun.get(name)} there, {value} now"
+        for name, value in wanted.items()
+        if begun.get(name) != value and name not in ignored
+    ]
+    if differences:
+        raise CollectionError(
+            f"{root} holds a collection of another plan ({'; '.join(differences)}). Name a new folder, or "
+            "delete this one."
+        )
+
+
+def _flat(description: dict[str, Any]) -> dict[str, Any]:
+    plan = {**description["plan"], **description["plan"]["scene"]}
+    del plan["scene"]
+    return {**plan, "benchmark": description["benchmark"], "renderer": description["renderer"]}
+
+
+# Workers
+
+
+def _collect_shards(root: Path, plan: CollectionPlan, workers: int) -> float | None:
+    """Collects the missing shards. Returns the number of episodes per second."""
+    missing = [shard for shard in range(len(plan.shards)) if not dataset_writer.is_written(root, shard)]
+    n_missing = sum(len(plan.shards[shard]) for shard in missing)
+    n_finished = plan.n_episodes - n_missing
+    start = time.perf_counter()
+    with tqdm(total=plan.n_episodes, initial=n_finished, desc="Collecting", unit="episode") as progress:
+        for shard in _run(root, plan, missing, min(workers, len(missing))):
+            progress.update(len(plan.shards[shard]))
+    return n_missing / (time.perf_counter() - start) if n_missing else None
+
+
+def _run(root: Path, plan: CollectionPlan, shards: Sequence[int], workers: int) -> Iterator[int]:
+    """Collects shards, in this process if one is enough, and yields each when it is written."""
+    if workers <= 1:
+        with closing(PickPlaceEnv(scene=plan.scene)) as env:
+            for shard in shards:
+                yield _collect_shard(env, root, plan, shard)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, _start_worker, (root, plan)) as executor:
+        futures = [executor.submit(_collect_in_worker, shard) for shard in shards]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BaseException:
+            executor.shutdown(cancel_futures=True)
+            raise
+
+
+_worker: tuple[PickPlaceEnv, Path, CollectionPlan]
+
+
+def _start_worker(root: Path, plan: CollectionPlan) -> None:
+    global _worker
+    # An interrupt in the terminal goes to all processes, and ends this one at once.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    _worker = PickPlaceEnv(scene=plan.scene), root, plan
+
+
+def _exit_with_parent() -> None:
+    """Ends this process with the main one, even if that is killed: it would wait for work forever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _collect_in_worker(shard: int) -> int:
+    env, root, plan = _worker
+    return _collect_shard(env, root, plan, shard)
+
+
+def _collect_shard(env: PickPlaceEnv, root: Path, plan: CollectionPlan, shard: int) -> int:
+    def episodes() -> Iterator[dataset_writer.Episode]:
+        for index in plan.shards[shard]:
+            task_id, number = _task_and_number(plan, index)
+            frames = collect_episode(env, plan, task_id, number)
+            task_index = index // plan.episodes_per_task
+            yield dataset_writer.Episode(frames, get_task(task_id).instruction, task_index)
+
+    first = plan.shards[shard].start
+    dataset_writer.write_shard(
+        root,
+        shard,
+        episodes(),
+        dataset_features(plan.scene),
+        CONTROL_FPS,
+        first_episode=first,
+        first_frame=first * plan.scene.episode_length,
+    )
+    return shard
+
+
+def _task_and_number(plan: CollectionPlan, index: int) -> tuple[int, int]:
+    """Returns the task of an episode, and its number among the episodes of that task."""
+    position, number = divmod(index, plan.episodes_per_task)
+    return plan.task_ids[position], number
+
+
+def _seeds(plan: CollectionPlan, task_id: int, number: int) -> Iterator[int]:
+    """Yields the seed of each attempt at an episode."""
+    assert plan.split is not None
+    for attempt in range(MAX_ATTEMPTS):
+        yield episode_seed(plan.seed, plan.split, task_id, number, attempt)
+
+
+def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, number: int) -> dict[str, NDArray]:
+    """Runs the expert until it succeeds.
+
+    Args:
+        env: Environment with the plan's scenes.
+        plan: The collection.
+        task_id: Task of the episode.
+        number: Number of the episode among those of its task, from 0.
+
+    Returns:
+        Values of each recorded feature, (N, ...), for the N steps of the episode.
+
+    Raises:
+        CollectionError: The expert never succeeded.
+    """
+    from gym_deltaco.expert import expert_episode
+
+    for seed in _seeds(plan, task_id, number):
+        steps = list(expert_episode(env, task_id, seed, plan.noise))
+        info = steps[-1].info
+        if not info["is_success"]:
+            continue
+        n_steps = len(steps)
+        assert n_steps == plan.scene.episode_length  # on which the indices of all frames depend
+        privileged = (task_id, info["objects"][info["target_object"]], info["target_container"], seed)
+        return {
+            "observation.image": np.stack([step.observation["pixels"] for step in steps]),
+            "observation.state": np.stack([step.observation["agent_pos"] for step in steps]),
+            "action": np.stack([step.action for step in steps]),
+            "next.reward": np.array([step.reward for step in steps], dtype=np.float32),
+            "next.done": np.arange(n_steps) == n_steps - 1,
+            "next.success": np.array([step.info["is_success"] for step in steps]),
+            **{
+                name: np.full(n_steps, value, dtype=np.int64)
+                for name, value in zip(PRIVILEGED, privileged, strict=True)
+            },
+        }
+    raise CollectionError(
+        f"The expert failed {MAX_ATTEMPTS} times in a row at task {task_id}, episode {number}. A noise of "
+        f"{plan.noise} may be too much for it; the default is {EXPERT_NOISE}."
+    )

@@ -1,1 +1,0 @@
-"""What several rooms share, without LeRobot and torch."""

@@ -1,1 +1,0 @@
-"""Evaluations: how they are run, and the records that they write."""

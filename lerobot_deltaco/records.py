@@ -1,0 +1,326 @@
+"""Records of evaluations in Parquet: what is run, and what happened in every episode.
+
+One file holds any number of evaluations. A row is an episode:
+
+    evaluation              int32    index of the evaluation in the file
+    task_id                 int32    the scene's task
+    trial                   int32    number of the episode among those of its task, from 0
+    success                 bool     whether the scene's task succeeded, at any step
+    instruction             string   instruction that the policy received; null for the task's template, and
+                                     empty for none
+    demonstration_task      int32    task whose demonstrations the policy received; -1 for none
+    demonstration_episodes  list     episodes of the demonstrations in their dataset
+    demonstrated_objects    list     indices of the objects that they move
+    grasped_object          int8     number of the object that the gripper held last, 0..2; -1 for none
+    object_containers       list     container of each of the three objects at the end: 0 green, 1 red, -1 none
+    right_object            bool     whether the grasped object is the target
+    right_container         bool     whether an object lies in the target container, and none in the other one
+
+The metadata of the schema have, under the key `deltaco`, what holds for an evaluation as a whole, as JSON: the
+fields of `EvaluationRecord`. What follows from the plan is not stored: `scene_columns` computes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.tasks import get_task, select_tasks
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TEMPLATES = "templates"
+MAX_TRIALS = 1_000_000
+_KEY = b"deltaco"
+_N_OBJECTS = 3
+
+Counterfactual = Literal["none", "demonstration", "instruction"]
+
+
+class RecordError(ValueError):
+    """Raised when a file holds no valid records; the message says what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class EvaluationPlan:
+    """The episodes of an evaluation; equal plans give equal scenes, whatever the policy.
+
+    Args:
+        tasks: Tasks: a task set, or indices and ranges, such as 4,50-73.
+        trials: Number of episodes of each task.
+        seed: Seed of the scenes: trial i has the scene that `lerobot-eval` shows for its seed `seed` + i.
+        scene_set: Number of a set of scenes, for those of older records: with it, the scenes derive from the
+            seed, this number, the task and the trial.
+        scene: Settings of the scenes.
+        counterfactual: Input that is replaced by another task's: none, demonstration or instruction. That
+            task asks for another object of the scene and for the other container, if there is such a task.
+        without: Input that is left out: none, demonstration or instruction.
+        n_demonstrations: Number of demonstrations of each task that the policy combines.
+        paraphrases: CSV file with sentences for the tasks, which the trials of a task use in turn. By
+            default, the instructions are the benchmark's templates.
+        paraphrases_split: Split of that file: all; held_out, the last sentence of each task; or train, the
+            sentences that are held out for no task.
+        instruction: A sentence that replaces the instruction of every task.
+
+    Raises:
+        ValueError: An argument is invalid; the message says what is valid.
+    """
+
+    tasks: str = "scenario_a_test"
+    trials: int = 4
+    seed: int = 1000
+    scene_set: int | None = None
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    counterfactual: Counterfactual = "none"
+    without: Counterfactual = "none"
+    n_demonstrations: int = 1
+    paraphrases: str | None = None
+    paraphrases_split: str = "all"
+    instruction: str | None = None
+
+    def __post_init__(self) -> None:
+        self.scene.check_tasks(self.task_ids)
+        least = {"trials": 1, "seed": 0, "scene_set": 0, "n_demonstrations": 1}
+        for name, smallest in least.items():
+            number = getattr(self, name)
+            if number is not None and not smallest <= number < 2**63:
+                raise ValueError(f"`{name}` must be at least {smallest}. Got {number}.")
+        for name in ("counterfactual", "without"):
+            if getattr(self, name) not in get_args(Counterfactual):
+                valid = ", ".join(get_args(Counterfactual))
+                raise ValueError(f"`{name}` must be one of {valid}. Got {getattr(self, name)!r}.")
+        changed = [self.counterfactual, self.without]
+        if self.wording != TEMPLATES and "instruction" in changed:
+            raise ValueError(
+                "An instruction that is replaced or left out is not a paraphrase: leave out `paraphrases` and "
+                "`instruction`."
+            )
+
+    @property
+    def task_ids(self) -> tuple[int, ...]:
+        """Indices of the tasks."""
+        return select_tasks(self.tasks)
+
+    def scene_seed(self, task_id: int, trial: int) -> int:
+        """Returns the seed of an episode's reset."""
+        if self.scene_set is None:
+            return episode_seed(0, "evaluation", task_id, 0, self.seed + trial)
+        return episode_seed(self.seed, "evaluation", task_id, self.scene_set, trial)
+
+    @property
+    def wording(self) -> str:
+        """Source of the instructions: "templates", the sentence itself, or a file with its SHA-256."""
+        if self.instruction is not None:
+            return self.instruction
+        if self.paraphrases is None:
+            return TEMPLATES
+        path = Path(self.paraphrases)
+        digest = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "unknown"
+        return f"{path.name} ({self.paraphrases_split}), SHA-256 {digest}"
+
+
+@dataclass(frozen=True)
+class EvaluationRecord:
+    """An evaluation of one checkpoint.
+
+    Args:
+        experiment: Name of what was trained; runs of one name differ in their seeds alone.
+        policy_type: Type of the policy, such as "deltaco_match".
+        train_seed: Seed of the training.
+        step: Training step of the checkpoint.
+        plan: Episodes that were run.
+        wording: Source of the instructions, as `EvaluationPlan.wording` has it.
+        policy: The policy's configuration.
+        versions: Version of the benchmark ("benchmark": the environment's id) and of the relevant packages.
+        command: Command line of the evaluation.
+        seconds: Duration, s.
+        weights: SHA-256 of the checkpoint's weights; None if it was not recorded.
+        demonstrations: Name of the dataset of demonstrations; None for those of the checkpoint.
+        demonstrations_digest: SHA-256 of that dataset's metadata.
+        episodes: A row for each episode, with the columns of the module's table but `evaluation`.
+    """
+
+    experiment: str
+    policy_type: str
+    train_seed: int
+    step: int
+    plan: EvaluationPlan
+    wording: str
+    policy: dict[str, Any]
+    versions: dict[str, str]
+    command: str
+    seconds: float
+    weights: str | None
+    demonstrations: str | None
+    demonstrations_digest: str | None
+    episodes: pd.DataFrame
+
+    @property
+    def success_rate(self) -> float:
+        """Fraction of the episodes that succeeded, 0..1."""
+        return float(self.episodes["success"].mean())
+
+
+def write_records(path: Path, records: Sequence[EvaluationRecord]) -> None:
+    """Writes evaluations into one file, whole or not at all.
+
+    Raises:
+        RecordError: The rows of an evaluation contradict each other.
+    """
+    import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    for record in records:
+        _check(record, str(path))
+    headers = [
+        {
+            item.name: asdict(record.plan) if item.name == "plan" else getattr(record, item.name)
+            for item in fields(EvaluationRecord)
+            if item.name != "episodes"
+        }
+        for record in records
+    ]
+    rows = pd.concat([record.episodes.assign(evaluation=n) for n, record in enumerate(records)])
+    schema = _schema()
+    table = pa.Table.from_pandas(rows, schema, preserve_index=False)
+    table = table.replace_schema_metadata({_KEY: json.dumps(headers).encode()})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.part")
+    pq.write_table(table, temporary, compression="zstd", compression_level=9)
+    os.replace(temporary, path)
+
+
+def read_records(*paths: Path) -> list[EvaluationRecord]:
+    """Reads evaluations.
+
+    Args:
+        paths: Files, or folders that are searched for files.
+
+    Raises:
+        RecordError: A path has no records, or a file is not one of records.
+    """
+    records = []
+    for path in paths:
+        files = sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
+        # Datasets are Parquet, too.
+        files = [file for file in files if path.is_file() or not {"data", "meta"} & set(file.parts)]
+        found = [record for file in files for record in _read(file)]
+        if not found:
+            raise RecordError(f"{path} has no records of evaluations. `deltaco evaluate` writes them.")
+        records += found
+    return records
+
+
+def _read(path: Path) -> list[EvaluationRecord]:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path)
+        headers = json.loads((table.schema.metadata or {})[_KEY])
+        rows = table.select(_schema().names).to_pandas()
+        records = []
+        for n, header in enumerate(headers):
+            plan = dict(header.pop("plan"))
+            plan["scene"] = SceneConfig(**plan["scene"])
+            episodes = rows[rows["evaluation"] == n].drop(columns="evaluation").reset_index(drop=True)
+            records.append(EvaluationRecord(plan=EvaluationPlan(**plan), episodes=episodes, **header))
+    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
+        raise RecordError(f"{path} is not a file of evaluation records: {error}") from error
+    for record in records:
+        _check(record, str(path))
+    return records
+
+
+def _schema() -> Any:
+    import pyarrow as pa
+
+    return pa.schema(
+        [
+            ("evaluation", pa.int32()),
+            ("task_id", pa.int32()),
+            ("trial", pa.int32()),
+            ("success", pa.bool_()),
+            ("instruction", pa.string()),
+            ("demonstration_task", pa.int32()),
+            ("demonstration_episodes", pa.list_(pa.int32())),
+            ("demonstrated_objects", pa.list_(pa.int32())),
+            ("grasped_object", pa.int8()),
+            ("object_containers", pa.list_(pa.int8())),
+            ("right_object", pa.bool_()),
+            ("right_container", pa.bool_()),
+        ]
+    )
+
+
+def _check(record: EvaluationRecord, source: str) -> None:
+    """Checks that the rows of an evaluation do not contradict each other or its plan.
+
+    Raises:
+        RecordError: They do.
+    """
+    rows = record.episodes
+    containers = rows["object_containers"].map(list)
+    is_valid = {
+        "tasks and trials of the plan, each once": (
+            rows["task_id"].isin(record.plan.task_ids)
+            & rows["trial"].between(0, record.plan.trials - 1)
+            & ~rows.duplicated(["task_id", "trial"])
+        ),
+        "containers -1, 0 or 1 of three objects": containers.map(
+            lambda found: len(found) == _N_OBJECTS and set(found) <= {-1, 0, 1}
+        ),
+        "a grasped object from -1 to 2": rows["grasped_object"].between(-1, _N_OBJECTS - 1),
+        "a grasped object where it is the right one": ~rows["right_object"] | (rows["grasped_object"] >= 0),
+        "an object in a container where that is the right one": (
+            ~rows["right_container"] | containers.map(lambda found: max(found, default=-1) >= 0)
+        ),
+    }
+    if len(rows) == 0 or record.step < 0 or record.seconds < 0 or "benchmark" not in record.versions:
+        raise RecordError(f"{source} has an evaluation of {record.experiment!r} that lacks something.")
+    for name, valid in is_valid.items():
+        if not valid.all():
+            row = rows[~valid.astype(bool)].iloc[0]
+            raise RecordError(
+                f"{source} contradicts itself: every episode of {record.experiment!r} must have {name}. Task "
+                f"{row['task_id']}, trial {row['trial']} does not."
+            )
+
+
+def scene_columns(record: EvaluationRecord) -> pd.DataFrame:
+    """Computes what follows from the task, the trial and the plan of each episode, without a simulator.
+
+    Returns:
+        A row for each episode: `seed`; `template`, the task's instruction; `objects`, the indices of the three
+        objects; `container_quadrants`, (i, j) of the green and the red container; `target_object` and
+        `target_container`, their numbers in the scene.
+    """
+    import pandas as pd
+    from gymnasium.utils import seeding
+
+    from gym_deltaco.layout import sample_layout
+
+    rows = []
+    for task_id, trial in zip(record.episodes["task_id"], record.episodes["trial"], strict=True):
+        task, seed = get_task(int(task_id)), record.plan.scene_seed(int(task_id), int(trial))
+        layout = sample_layout(task, record.plan.scene, seeding.np_random(seed)[0])
+        rows.append(
+            {
+                "seed": seed,
+                "template": task.instruction,
+                "objects": [item.label.index for item in layout.objects],
+                "container_quadrants": [list(item.quadrant) for item in layout.containers],
+                "target_object": layout.target_object,
+                "target_container": layout.target_container,
+            }
+        )
+    return pd.DataFrame(rows, index=record.episodes.index)
