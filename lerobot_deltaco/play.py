@@ -14,6 +14,7 @@ from urllib.parse import urlencode
 
 import numpy as np
 from PIL import Image
+from tyro.conf import Positional
 
 from gym_deltaco.layout import Layout
 from gym_deltaco.seeding import episode_seed
@@ -345,7 +346,7 @@ def _video(name: str, **options: Any) -> gr.Video:
 
 
 def _small_button(text: str, name: str) -> gr.Button:
-    return gr.Button(text, scale=2, min_width=100, elem_id=name, elem_classes="beside")
+    return gr.Button(text, scale=2, min_width=100, size="md", elem_id=name, elem_classes="beside")
 
 
 def build_page(player: Player, name: str) -> gr.Blocks:
@@ -380,7 +381,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
                     demonstrated = gr.Dropdown(
                         names, label="Demonstration", scale=5, min_width=150, elem_id="demonstrated"
                     )
-                    record = _small_button("Record another", "record")
+                    record = _small_button("Record one", "record")
                 sentence = gr.Textbox(label="Instruction, in your own words", max_lines=3, elem_id="sentence")
                 chips = gr.Dataset(
                     components=[gr.Textbox(visible=False)], samples=[], show_label=False, elem_id="chips"
@@ -404,7 +405,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
                 grid: list[Any] = []
                 with gr.Column(visible=False) as comparison:
                     with gr.Row(equal_height=False):
-                        grid += [_image(f"ends_{n}", height=90, min_width=120) for n in range(2)]
+                        grid += [_image(f"ends_{n}", height=84, min_width=120) for n in range(2)]
                     for row in range(2):
                         with gr.Row(equal_height=False):
                             for number in (2 * row, 2 * row + 1):
@@ -520,7 +521,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
     return page
 
 
-def play(checkpoint: str | Path | None = None, port: int = 7860) -> None:
+def play(checkpoint: Positional[str | None] = None, port: int = 7860) -> None:
     """Serves the page on this machine until it is interrupted.
 
     Args:

@@ -250,7 +250,7 @@ def judge(
     if word is not None:
         containers = {n for n, item in enumerate(layout.containers) if item.satisfies(word)}
         if not sentence:
-            notes.append(f"It was placed in the {word} bin there.")
+            notes.append(f"Its task names the {word} bin.")
     if objects is not None and not objects:
         return Verdict(None, "Not judged", moved, " ".join([*notes, "No such object stands in this scene."]))
     if containers is not None and not containers:
