@@ -249,9 +249,9 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         name = _non_finite_weight(self)
         if name is not None:
             raise TrainingDivergedError(
-                f"After training step {int(self.step)}, the weight {name} is not finite, and no checkpoint is "
-                "saved. Lower --policy.optimizer_lr, or limit the gradient with --policy.grad_clip_norm=10, "
-                "and go on from the last checkpoint with --resume=true."
+                f"After training step {int(self.step)}, the weight {name} is not finite, and no checkpoint "
+                "is saved. Lower --policy.optimizer_lr, or limit the gradient with "
+                "--policy.grad_clip_norm=10, and go on from the last checkpoint with --resume=true."
             )
         # LeRobot 0.6.1 may pass a `state_dict`; later versions do not, and call this on every process.
         super()._save_pretrained(save_directory, *args, **kwargs)
@@ -285,7 +285,8 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             policy = super()._load_as_safetensor(model, model_file, map_location, strict)
         except RuntimeError as error:
             raise ValueError(
-                f"{model_file} does not have the weights of this policy: {str(error).splitlines()[-1].strip()} "
+                f"{model_file} does not have the weights of this policy: "
+                f"{str(error).splitlines()[-1].strip()} "
                 "The config.json beside it belongs to other weights, or to another version."
             ) from error
         name = _non_finite_weight(policy)

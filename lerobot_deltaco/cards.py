@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import html
 import io
 import json
+import re
 import shlex
 import textwrap
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
@@ -18,6 +21,13 @@ from gym_deltaco.atomic_files import atomic_write, write_text
 from gym_deltaco.tasks import SCENARIOS, get_task
 from lerobot_deltaco.collect import read_description, read_plan
 from lerobot_deltaco.dataset_writer import INFO_FILE
+
+if TYPE_CHECKING:
+    from huggingface_hub import ModelCard
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    from lerobot_deltaco.base_policy import TaskConditionedPolicy
 
 CARD_FILE = "README.md"
 TASKS_IMAGE = "assets/tasks.png"
@@ -90,3 +100,108 @@ def _save_tasks_image(root: Path) -> None:
         axes.set_title(textwrap.fill(instruction, 30), fontsize=8)
     with atomic_write(root / TASKS_IMAGE) as temporary:
         figure.savefig(temporary, format="png", dpi=120)
+
+
+# Policies
+
+_TAGS = ("robotics", "lerobot", "deltaco", "imitation-learning")
+_SUMMARIES = {
+    "deltaco": "It performs a task from one demonstration and one instruction, as in the paper DeL-TaCo.",
+    "language_only": "It performs a task from an instruction alone: a baseline of DeL-TaCo.",
+    "demo_only": "It performs a task from one demonstration alone: a baseline of DeL-TaCo.",
+    "one_hot": "It performs one of the tasks that it was trained on, given by its number.",
+    "bc_z": "It performs a task from one demonstration: the baseline BC-Z of DeL-TaCo.",
+    "mcil": "It performs a task from an instruction or a demonstration: the baseline MCIL of DeL-TaCo.",
+    "both": "It looks in the scene for what a demonstration moved, and places it where an instruction says.",
+    "demonstration": "It looks in the scene for what a demonstration moved, and places it as shown.",
+    "instruction": "It looks in the scene for what an instruction names, and places it where it says.",
+}
+# Options of a policy that its card does not show: LeRobot's own, and what is shown elsewhere.
+_HIDDEN = {
+    "input_features",
+    "output_features",
+    "normalization_mapping",
+    "known_words",
+    "one_hot_tasks",
+    "type",
+}
+
+
+def policy_card(
+    policy: TaskConditionedPolicy,
+    dataset_repo_id: str | None,
+    license: str | None = None,
+    tags: list[str] | None = None,
+    train_config: TrainPipelineConfig | None = None,
+    meta: LeRobotDatasetMetadata | None = None,
+) -> ModelCard:
+    """Returns the card of a policy, as far as it is known at the push: without success rates.
+
+    Args:
+        policy: The policy.
+        dataset_repo_id: Repository id of the training dataset.
+        license: License of the weights, by its name on the Hub; None for Apache 2.0.
+        tags: Additional tags.
+        train_config: Configuration of the training.
+        meta: Metadata of the training dataset.
+    """
+    import draccus
+    from huggingface_hub import ModelCard, ModelCardData
+    from lerobot.configs import PreTrainedConfig
+
+    from lerobot_deltaco.language import LANGUAGE_ENCODERS
+
+    config = policy.config
+    kind = getattr(config, "method", None) or config.inputs
+    training_tasks = [] if meta is None else list(meta.tasks.index)
+    demonstrated = [] if policy.demonstrations is None else list(policy.demonstrations.rows)
+    image = {} if meta is None else meta.features.get("observation.image", {}).get("info") or {}
+    lerobot_options = set(draccus.encode(PreTrainedConfig.get_choice_class("act")()))
+    own = {name: value for name, value in draccus.encode(config).items() if name not in lerobot_options}
+    options = {name: value for name, value in own.items() if value is not None and name not in _HIDDEN}
+    if train_config is not None:
+        options = {
+            "steps": train_config.steps,
+            "batch_size": train_config.batch_size,
+            "seed of the training": train_config.seed,
+            **options,
+        }
+    metadata = ModelCardData(
+        license=license or "apache-2.0",
+        library_name="lerobot",
+        pipeline_tag="robotics",
+        tags=list(dict.fromkeys([*_TAGS, config.type, *(tags or ())])),
+        datasets=[dataset_repo_id] if dataset_repo_id else None,
+        model_name=config.type,
+    )
+    title = config.type if dataset_repo_id is None else f"{config.type}, trained on {dataset_repo_id}"
+    text = render(
+        "policy.md",
+        metadata=metadata.to_yaml().strip(),
+        title=title,
+        lerobot_version=version("lerobot"),
+        version=version("lerobot_policy_deltaco"),
+        summary=_SUMMARIES[kind],
+        config=config,
+        license=metadata.license,
+        dataset=dataset_repo_id,
+        training_tasks=training_tasks,
+        benchmark=image if "benchmark" in image else None,
+        robot_type=None if meta is None else meta.robot_type,
+        demonstrated_tasks=[markdown(task) for task in demonstrated],
+        n_instructions=len(policy.instructions.rows),
+        language_repo_id=LANGUAGE_ENCODERS[config.language_encoder].repo_id,
+        repo_id=config.repo_id or "USER/NAME",
+        example_task=json.dumps(next(iter([*demonstrated, *training_tasks]), "the instruction"))[1:-1],
+        inputs={name: tuple(feature.shape) for name, feature in config.input_features.items()},
+        action_shape=tuple(config.action_feature.shape),
+        options={name: markdown(str(value)) for name, value in options.items()},
+        citation=render("citation.md"),
+    )
+    return ModelCard(text)
+
+
+def markdown(text: str) -> str:
+    """Escapes a string for Markdown and HTML, in one line."""
+    line = html.escape(" ".join(text.split()), quote=False)
+    return re.sub(r"([\\`*_\[\]|~])", r"\\\1", line)

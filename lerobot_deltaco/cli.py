@@ -86,7 +86,7 @@ def _collect() -> Callable[..., Any]:
         repo_id: str | None = None,
         private: bool = False,
     ) -> str:
-        """Collects successful episodes of the scripted expert. The same command continues after an interruption.
+        """Collects successful episodes of the expert. After an interruption, the same command continues.
 
         Args:
             plan: What is collected.
@@ -257,11 +257,13 @@ def _demo() -> Callable[..., Any]:
 def _overview() -> str:
     width = max(map(len, COMMANDS))
     lines = [f"  {name:{width}}  {text}" for name, text in COMMANDS.items()]
-    return "\n".join(["usage: deltaco COMMAND ...", "", *lines, "", "deltaco COMMAND --help shows its options."])
+    return "\n".join(
+        ["usage: deltaco COMMAND ...", "", *lines, "", "deltaco COMMAND --help shows its options."]
+    )
 
 
 def _training_help() -> str:
-    """Returns the help of `deltaco train`, from the source of the configurations: LeRobot takes 10 s to import."""
+    """Returns the help of `deltaco train`, from the source: importing LeRobot takes 10 s."""
     parts = [
         "usage: deltaco train --policy.type=deltaco_match --dataset.repo_id=NAME [--dataset.root=DIR] ...\n\n"
         "Takes the arguments of lerobot-train, such as --batch_size, --steps, --save_freq, --output_dir,\n"

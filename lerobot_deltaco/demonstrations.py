@@ -142,9 +142,9 @@ class DemonstrationBank(torch.nn.Module):
         if task not in self.rows:
             raise ValueError(
                 f"There is no demonstration of the task {task!r}. There are demonstrations of "
-                f"{len(self.rows)} tasks, such as {next(iter(self.rows))!r}. Name a dataset that has the task "
-                "with --policy.demo_repo_id and --policy.demo_root. If its wording differs, choose an episode "
-                "with --policy.demo_episode."
+                f"{len(self.rows)} tasks, such as {next(iter(self.rows))!r}. Name a dataset that has the "
+                "task with --policy.demo_repo_id and --policy.demo_root. If its wording differs, choose an "
+                "episode with --policy.demo_episode."
             )
         return [self[row] for row in self.rows[task]]
 
@@ -173,8 +173,8 @@ class DemonstrationBank(torch.nn.Module):
         """Draws for each sample another episode of its task.
 
         Args:
-            episodes: The samples' own episodes, (batch,), as indices of the dataset. For one that is not in
-                the bank, such as one that is held back for a validation loss, any episode of its task is drawn.
+            episodes: The samples' own episodes, (batch,), as indices of the dataset. For one that is not
+                in the bank, such as one that is held back, any episode of its task is drawn.
             tasks: Task string of each sample.
             generator: Source of the draws, on the CPU.
 
@@ -209,7 +209,7 @@ class DemonstrationBank(torch.nn.Module):
 
 
 def sample_frames(frames: Tensor, n_frames: int, generator: torch.Generator) -> Tensor:
-    """Draws frames of demonstrations in the order of time: the first, random ones between, and the last.
+    """Draws frames of demonstrations in the order of time: the first, random ones, and the last.
 
     One frame is drawn from each of as many equal parts of the time between the ends, as in the authors' code.
 
@@ -246,7 +246,7 @@ class RobotData(NamedTuple):
 
 
 def check_dataset_folder(option: str, root: str | Path | None) -> None:
-    """Checks that a folder holds a dataset, if the Hub is off. (LeRobot would make the folder.)
+    """Checks that a folder holds a dataset, if the Hub is off.
 
     Args:
         option: Command-line option that names the folder, for the error.

@@ -117,8 +117,8 @@ def imagenet_weights() -> dict[str, Tensor]:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if digest != _SHA256:
         raise PretrainedWeightsError(
-            f"The weights in the package {_PACKAGE} are not the published ones (SHA-256 {digest}). Do not use "
-            "them; install the package again."
+            f"The weights in the package {_PACKAGE} are not the published ones (SHA-256 {digest}). Do not "
+            "use them; install the package again."
         )
     return torch.load(path, map_location="cpu", weights_only=True)
 

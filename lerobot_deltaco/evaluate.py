@@ -591,9 +591,7 @@ def _with_image_size(scene: SceneConfig, image_size: int) -> SceneConfig:
     return replace(scene, image_size=image_size) if scene == replace(scene, image_size=48) else scene
 
 
-def _record_name(
-    checkpoint: Checkpoint, plan: EvaluationPlan, demonstrations: tuple[str, str] | None
-) -> str:
+def _record_name(checkpoint: Checkpoint, plan: EvaluationPlan, demonstrations: tuple[str, str] | None) -> str:
     """Returns the file name of a record: the step, and a digest of what else distinguishes evaluations."""
     digest = hashlib.sha256(repr((plan, demonstrations)).encode()).hexdigest()[:8]
     return f"{checkpoint.step:07d}_{digest}.parquet"

@@ -181,9 +181,9 @@ def _check_memory(dataset: LeRobotDataset, image_size: int | None) -> None:
     )
     if needed > allowed:
         raise MemoryError(
-            f"The {dataset.num_frames:,} frames take {needed / 1e9:.1f} GB of memory, and {allowed / 1e9:.1f} "
-            "GB may be used here. Train on fewer episodes (--dataset.episodes), or with `lerobot-train`, which "
-            "reads them from the disk."
+            f"The {dataset.num_frames:,} frames take {needed / 1e9:.1f} GB of memory, and "
+            f"{allowed / 1e9:.1f} GB may be used here. Train on fewer episodes (--dataset.episodes), or with "
+            "`lerobot-train`, which reads them from the disk."
         )
 
 

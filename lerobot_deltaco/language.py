@@ -36,7 +36,7 @@ class LanguageEncoderSpec(NamedTuple):
 
 LANGUAGE_ENCODERS = MappingProxyType(
     {
-        # The authors' "miniLM", "DistilRoBERTa", "DistilBERT" and "CLIP" (its language transformer), and ours.
+        # The authors' "miniLM", "DistilRoBERTa", "DistilBERT" and "CLIP" (its language part), and ours.
         MINILM_L3: LanguageEncoderSpec("sentence-transformers/paraphrase-MiniLM-L3-v2", 384),
         "all-distilroberta-v1": LanguageEncoderSpec("sentence-transformers/all-distilroberta-v1", 768),
         "distilbert-base-uncased": LanguageEncoderSpec("distilbert/distilbert-base-uncased", 768),
@@ -141,8 +141,8 @@ class Paraphrases:
             choice = self.sentences.get(task)
             if not choice:
                 raise ValueError(
-                    f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add some, "
-                    "choose another `paraphrases_split`, or set `paraphrases_with_templates`."
+                    f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add "
+                    "some, choose another `paraphrases_split`, or set `paraphrases_with_templates`."
                 )
             drawn.append(choice[int(draw * len(choice))])
         return drawn

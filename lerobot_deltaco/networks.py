@@ -443,8 +443,10 @@ def fuse_batch_norms(network: PolicyNetwork) -> PolicyNetwork:
 
 
 def _fuse(parent: nn.Module, convolution: str, norm: str) -> None:
-    fused = fuse_conv_bn_eval(parent.get_submodule(convolution), parent.get_submodule(norm))
-    setattr(parent, convolution, fused)
+    before, after = parent.get_submodule(convolution), parent.get_submodule(norm)
+    assert isinstance(before, nn.Conv2d)
+    assert isinstance(after, nn.BatchNorm2d)
+    setattr(parent, convolution, fuse_conv_bn_eval(before, after))
     setattr(parent, norm, nn.Identity())
 
 

@@ -12,12 +12,12 @@ One file holds any number of evaluations. A row is an episode:
     demonstration_episodes  list     episodes of the demonstrations in their dataset
     demonstrated_objects    list     indices of the objects that they move
     grasped_object          int8     number of the object that the gripper held last, 0..2; -1 for none
-    object_containers       list     container of each of the three objects at the end: 0 green, 1 red, -1 none
+    object_containers       list     container of each of the objects at the end: 0 green, 1 red, -1 none
     right_object            bool     whether the grasped object is the target
     right_container         bool     whether an object lies in the target container, and none in the other one
 
-The metadata of the schema have, under the key `deltaco`, what holds for an evaluation as a whole, as JSON: the
-fields of `EvaluationRecord`. What follows from the plan is not stored: `scene_columns` computes it.
+The metadata of the schema have, under the key `deltaco`, what holds for an evaluation as a whole, as JSON:
+the fields of `EvaluationRecord`. What follows from the plan is not stored: `scene_columns` computes it.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ class EvaluationPlan:
         changed = [self.counterfactual, self.without]
         if self.wording != TEMPLATES and "instruction" in changed:
             raise ValueError(
-                "An instruction that is replaced or left out is not a paraphrase: leave out `paraphrases` and "
-                "`instruction`."
+                "An instruction that is replaced or left out is not a paraphrase: leave out `paraphrases` "
+                "and `instruction`."
             )
 
     @property
@@ -300,8 +300,8 @@ def scene_columns(record: EvaluationRecord) -> pd.DataFrame:
     """Computes what follows from the task, the trial and the plan of each episode, without a simulator.
 
     Returns:
-        A row for each episode: `seed`; `template`, the task's instruction; `objects`, the indices of the three
-        objects; `container_quadrants`, (i, j) of the green and the red container; `target_object` and
+        A row for each episode: `seed`; `template`, the task's instruction; `objects`, the indices of the
+        three objects; `container_quadrants`, (i, j) of the green and the red container; `target_object` and
         `target_container`, their numbers in the scene.
     """
     import pandas as pd

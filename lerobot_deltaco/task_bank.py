@@ -113,7 +113,8 @@ def read_task_bank(
             raise _error(
                 path, f"it has the tensor `{name}` of {tensor.dtype} and shape {tuple(tensor.shape)}"
             )
-    names, embeddings = texts.get("instructions"), tensors.get("embeddings")
+    names: Any = texts.get("instructions")
+    embeddings = tensors.get("embeddings")
     if known.get("language_encoder") != instructions.encoder_name:
         raise _error(
             path,

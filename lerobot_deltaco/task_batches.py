@@ -142,8 +142,9 @@ def _count_upsampled_tasks(fraction: float, tasks_per_batch: int) -> int:
     if abs(n_tasks - fraction * tasks_per_batch) > _FRACTION_TOLERANCE or not 0 < n_tasks < tasks_per_batch:
         nearest = min(max(n_tasks, 1), tasks_per_batch - 1)
         raise ValueError(
-            f"`upsampled_fraction` must be the fraction of a whole number of tasks, 1 to {tasks_per_batch - 1} "
-            f"of the {tasks_per_batch} in a batch, such as {nearest / tasks_per_batch:g} for {nearest}. Got "
-            f"{fraction}, which is {fraction * tasks_per_batch:g} tasks."
+            "`upsampled_fraction` must be the fraction of a whole number of tasks, 1 to "
+            f"{tasks_per_batch - 1} of the {tasks_per_batch} in a batch, such as "
+            f"{nearest / tasks_per_batch:g} for {nearest}. Got {fraction}, which is "
+            f"{fraction * tasks_per_batch:g} tasks."
         )
     return n_tasks

@@ -58,8 +58,8 @@ class _InMemoryTraining:
         policy = config.policy
         if policy is None or config.dataset.streaming:
             raise ValueError(
-                "`deltaco train` trains policies on frames in memory. For reward models and --dataset.streaming, "
-                "use `lerobot-train`."
+                "`deltaco train` trains policies on frames in memory. For reward models and "
+                "--dataset.streaming, use `lerobot-train`."
             )
         # Fail before the slow decoding.
         check_dataset_folder("--dataset.root", config.dataset.root)

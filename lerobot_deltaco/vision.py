@@ -186,7 +186,8 @@ def _load_r3m(layers: str, weights: str | None) -> nn.Module:
         network.load_state_dict(r3m_weights(content))
     except Exception as error:  # of the network, the file, the archive, the pickle or its content
         raise PretrainedWeightsError(
-            f"The weights of R3M's ResNet-{layers} cannot be read from {source}: {str(error).splitlines()[0]} "
+            f"The weights of R3M's ResNet-{layers} cannot be read from {source}: "
+            f"{str(error).splitlines()[0]} "
             "Download them elsewhere, and name the file (.safetensors, or one that `torch.load(..., "
             "weights_only=True)` reads) with `vision_encoder_weights`."
         ) from error

@@ -28,7 +28,7 @@ from lerobot_deltaco.deltaco.demo_encoders import (
     encode_bank,
     shift_demonstrations,
 )
-from lerobot_deltaco.demonstrations import DemonstrationBank, sample_frames
+from lerobot_deltaco.demonstrations import Demonstration, DemonstrationBank, sample_frames
 from lerobot_deltaco.losses import (
     GRIPPER_LOSSES,
     contrastive_logits,
@@ -65,7 +65,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
 
     Attributes:
         model: Network that predicts actions.
-        demo_encoder: Encoder of demonstrations, or the layers after a frozen one; None without demonstrations.
+        demo_encoder: Encoder of demonstrations, or the layers after a frozen one; None without them.
         language_head: Layers after the language encoder; None for none.
     """
 
@@ -82,11 +82,10 @@ class DeltacoPolicy(TaskConditionedPolicy):
         self.config: DeltacoConfig = config
         if config.method == "one_hot" and not config.one_hot_tasks:
             config.one_hot_tasks = known_tasks(dataset_meta)
-        self._vision_encoder = None
-        if config.demo_encoder == "pretrained" and config.uses_demonstrations:
-            if config.demo_feature_dim is None:
-                config.demo_feature_dim = self._load_vision_encoder().feature_dim
-                config.check_demo_dim()
+        is_pretrained = config.demo_encoder == "pretrained" and config.uses_demonstrations
+        if is_pretrained and config.demo_feature_dim is None:
+            config.demo_feature_dim = self._load_vision_encoder().feature_dim
+            config.check_demo_dim()
         self.model = _make_network(config)
         self.demo_encoder = _make_demo_encoder(config)
         self.language_head = _make_language_head(config)
@@ -207,25 +206,48 @@ class DeltacoPolicy(TaskConditionedPolicy):
         device: torch.device,
     ) -> Episode:
         """Encodes the instructions and demonstrations of an episode."""
-        demo = language = None
-        if self.config.uses_demonstrations:
-            if demonstrations is None:
-                demonstrations = self.banked_demonstrations(instructions)
+        demo: Tensor | None = None
+        language: Tensor | None = None
+        if self.config.uses_demonstrations and demonstrations is None:
+            demonstrations = self.banked_demonstrations(instructions)
+        self._check_given(instructions, demonstrations)
+        if self.config.uses_demonstrations and demonstrations is not None:
             demo = self._embed_demonstrations(demonstrations, device)
         if self.config.method == "mcil":
-            # The samples of a batch use the instruction and the demonstration in turn, unless one is left out.
+            # The samples of a batch use the instruction and the demonstration in turn, if both are there.
             language = self._embed_instructions(instructions, device)
             by_language = [
-                bool(text) and (not shown or n % 2 == 0)
-                for n, (text, shown) in enumerate(zip(instructions, demonstrations or (), strict=True))
+                bool(text) and (not own or n % 2 == 0)
+                for n, (text, own) in enumerate(zip(instructions, demonstrations or (), strict=True))
             ]
             assert demo is not None
-            film = torch.where(torch.tensor(by_language, device=device)[:, None], language, demo)
-            return Episode(instructions, film, None, self._acting_network())
+            mixed = torch.where(torch.tensor(by_language, device=device)[:, None], language, demo)
+            return Episode(instructions, mixed, None, self._acting_network())
         if any("language" in part for part in self.config.conditioning[:2]):
             language = self._embed_instructions(instructions, device)
         film, concat = self._conditioning_inputs(instructions, demo, language, device)
         return Episode(instructions, film, concat, self._acting_network())
+
+    def _check_given(self, instructions: Sequence[str], demonstrations: DemonstrationsOfTasks | None) -> None:
+        """Checks that no input of the method is left out; MCIL takes one of both.
+
+        Raises:
+            ValueError: One is.
+        """
+        lacks_instruction = [not text for text in instructions]
+        lacks_demonstration = [not own for own in demonstrations or ()]
+        if self.config.method == "mcil":
+            missing = any(map(all, zip(lacks_instruction, lacks_demonstration, strict=True)))
+        else:
+            film, concat, _ = self.config.conditioning
+            needs_instruction = any("language" in part or part == "one_hot" for part in (film, concat))
+            missing = needs_instruction and any(lacks_instruction)
+            missing |= self.config.uses_demonstrations and any(lacks_demonstration)
+        if missing:
+            raise ValueError(
+                f"The method {self.config.method!r} needs what is left out. Pass an instruction and a "
+                "demonstration of each sample's task, as far as the method takes them."
+            )
 
     def _acting_network(self) -> PolicyNetwork:
         """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
@@ -240,31 +262,26 @@ class DeltacoPolicy(TaskConditionedPolicy):
 
     def _embed_demonstrations(self, demonstrations: DemonstrationsOfTasks, device: torch.device) -> Tensor:
         """Returns embeddings of the first demonstration of each sample, (batch, embedding)."""
-        if not all(shown for shown in demonstrations) and self.config.method != "mcil":
-            raise ValueError("This policy takes a demonstration. Pass one for each sample.")
-        first = [shown[0] if shown else None for shown in demonstrations]
-        present = [shown for shown in first if shown is not None]
-        if not present:
-            return torch.zeros(len(first), self.config.embedding_dim, device=device)
         assert self.demo_encoder is not None
+        present = [own[0] for own in demonstrations if own]
+        embeddings = torch.zeros(len(demonstrations), self.config.demo_dim or 0, device=device)
+        if not present:
+            return embeddings
         if self.config.demo_encoder == "pretrained":
-            known = [shown.features for shown in present]
-            if any(features is None for features in known):
-                bank = DemonstrationBank(
-                    torch.stack([shown.frames for shown in present]),
-                    [shown.task for shown in present],
-                    range(len(present)),
-                )
-                known = list(self._encode_bank(bank, n_variants=0)[:, 0].float())
-            embedded = self.demo_encoder(torch.stack([found.to(device) for found in known]))
+            embedded = self.demo_encoder(torch.stack([self._features(each) for each in present]).to(device))
         else:
             generator = torch.Generator().manual_seed(self.config.seed)
-            frames = torch.stack([shown.frames for shown in present]).to(device)
+            frames = torch.stack([each.frames for each in present]).to(device)
             embedded = self.demo_encoder(sample_frames(frames, self.config.n_demo_frames, generator))
-        found = iter(embedded)
-        return torch.stack(
-            [torch.zeros_like(embedded[0]) if shown is None else next(found) for shown in first]
-        )
+        embeddings[torch.tensor([bool(own) for own in demonstrations], device=device)] = embedded.float()
+        return embeddings
+
+    def _features(self, demonstration: Demonstration) -> Tensor:
+        """Returns the features of a demonstration by the frozen encoder, (features,)."""
+        if demonstration.features is not None:
+            return demonstration.features
+        bank = DemonstrationBank(demonstration.frames[None], [demonstration.task], [0])
+        return self._encode_bank(bank, n_variants=0)[0, 0].float()
 
     def _embed_training_demonstrations(
         self, episodes: Tensor, tasks: Sequence[str], generator: torch.Generator
@@ -297,20 +314,17 @@ class DeltacoPolicy(TaskConditionedPolicy):
         return encode_bank(bank, encoder, frames, rows, n_variants, padding, config.seed)
 
     def _load_vision_encoder(self) -> VisionEncoder:
-        if self._vision_encoder is None:
-            config = self.config
-            self._vision_encoder = load_vision_encoder(
-                config.vision_encoder,
-                config.vision_encoder_weights,
-                config.vision_image_size,
-                config.vision_input,
-            )
-        return self._vision_encoder
+        config = self.config
+        return load_vision_encoder(
+            config.vision_encoder,
+            config.vision_encoder_weights,
+            config.vision_image_size,
+            config.vision_input,
+        )
 
     def _read_evaluation_bank(self) -> DemonstrationBank | None:
         bank = super()._read_evaluation_bank()
         if bank is not None and self.config.demo_encoder == "pretrained":
-            self._vision_encoder = None
             bank.features = self._encode_bank(bank, n_variants=0)
         return bank
 

@@ -1,4 +1,4 @@
-"""`--policy.type=deltaco_match`: the defaults are the recipe of the checkpoint that comes with the project."""
+"""`--policy.type=deltaco_match`: its defaults are the recipe of the project's own checkpoint."""
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
@@ -32,7 +32,7 @@ TASK_INPUTS = MappingProxyType(
 @PreTrainedConfig.register_subclass("deltaco_match")
 @dataclass
 class DeltacoMatchConfig(TaskConditionedConfig):
-    """A policy that looks in the scene for what a demonstration moved, and places it where an instruction says.
+    """A policy that finds what a demonstration moved, and places it where an instruction says.
 
     It needs a camera that does not move, a robot state, and a gripper among the action's dimensions.
 
@@ -91,8 +91,8 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         )
         if self.p_drop_demonstration + self.p_drop_instruction >= 1:
             raise ValueError(
-                "`p_drop_demonstration` and `p_drop_instruction` must sum to less than 1, so that some samples "
-                f"have both. Got {self.p_drop_demonstration} and {self.p_drop_instruction}."
+                "`p_drop_demonstration` and `p_drop_instruction` must sum to less than 1, so that some "
+                f"samples have both. Got {self.p_drop_demonstration} and {self.p_drop_instruction}."
             )
         if self.frames_after_release is not None and self.frames_after_release < 0:
             raise ValueError(f"`frames_after_release` must be at least 0. Got {self.frames_after_release}.")
@@ -112,9 +112,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         super().validate_features()
         if self.gripper_index is None or not self.state_dim:
             raise ValueError(
-                "`deltaco_match` learns where objects are from when the gripper closes and opens: it needs the "
-                "feature 'observation.state' and a gripper among the action's dimensions, which `gripper` "
-                "names. Without them, train --policy.type=deltaco."
+                "`deltaco_match` learns where objects are from when the gripper closes and opens: it needs "
+                "the feature 'observation.state' and a gripper among the action's dimensions, which "
+                "`gripper` names. Without them, train --policy.type=deltaco."
             )
 
     @property

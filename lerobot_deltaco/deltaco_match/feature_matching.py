@@ -99,8 +99,8 @@ class FeatureMatching(nn.Module):
     def __init__(self, n_words: int = 0) -> None:
         super().__init__()
         self.encoder = EfficientNetLite0(_COARSE_BLOCKS)
-        self.shown = ComparedFeatures()
-        self.named = ComparedFeatures() if n_words else None
+        self.by_demonstration = ComparedFeatures()
+        self.by_words = ComparedFeatures() if n_words else None
         if n_words:
             # With a bias, which stands for no word.
             self.words = nn.Parameter(torch.zeros(n_words + 1, _DESCRIPTOR_DIM))
@@ -144,10 +144,10 @@ class FeatureMatching(nn.Module):
                 first = self._normalized(self._encode(ends[:, :, 0].flatten(0, 1)))
                 each = F.normalize(self._describe(first, locations.flatten(0, 1)), dim=1)
                 descriptors = each.unflatten(0, (-1, ends.shape[1])).mean(dim=1)
-                found = self.shown.similarity(self.shown(maps), descriptors)
+                found = self.by_demonstration.similarity(self.by_demonstration(maps), descriptors)
                 total = total + log_probabilities(_resized(found, shape))
-            if words is not None and self.named is not None:
-                found = self._find_named(maps, words.present)
+            if words is not None and self.by_words is not None:
+                found = self._find_by_words(maps, words.present)
                 counts = words.present.any(dim=1) & (words.is_known | (ends is None))
                 named = _WORD_WEIGHT * log_probabilities(_resized(found, shape))
                 total = total + torch.where(counts[:, None, None], named, 0.0)
@@ -199,14 +199,14 @@ class FeatureMatching(nn.Module):
                 optimizer, _LEARNING_RATE, steps, pct_start=_WARMUP_FRACTION
             )
             for _ in tqdm(range(steps), desc="Fitting the feature matching", unit="step", leave=False):
-                scenes, shown = (rows.to(device) for rows in pairs.draw(_PAIRS_PER_STEP, generator))
+                scenes, others = (rows.to(device) for rows in pairs.draw(_PAIRS_PER_STEP, generator))
                 here, scene_maps = locations[scenes][:, None], self._normalized(maps.rows(scenes))
-                descriptors = self._describe(self._normalized(maps.rows(shown)), locations[shown])
-                found = self.shown.similarity(self.shown(scene_maps), descriptors)
+                descriptors = self._describe(self._normalized(maps.rows(others)), locations[others])
+                found = self.by_demonstration.similarity(self.by_demonstration(scene_maps), descriptors)
                 loss = location_loss(found[:, None], here).mean()
                 if present is not None:
                     kept = torch.rand(_PAIRS_PER_STEP, present.shape[1], generator=generator) >= _P_DROP_WORD
-                    found = self._find_named(scene_maps, present[scenes] * kept.to(present))
+                    found = self._find_by_words(scene_maps, present[scenes] * kept.to(present))
                     loss = loss + location_loss(found[:, None], here).mean()
                 optimizer.zero_grad()
                 loss.backward()
@@ -267,13 +267,13 @@ class FeatureMatching(nn.Module):
     @torch.no_grad()
     def _initialize(self, generator: torch.Generator) -> None:
         """Draws initial weights as PyTorch's layers do, but from a generator."""
-        for network in (self.shown, self.named):
+        for network in (self.by_demonstration, self.by_words):
             for layer in [] if network is None else network.modules():
                 if isinstance(layer, nn.Conv2d):
                     bound = layer.weight[0].numel() ** -0.5
                     for weights in layer.parameters():
                         weights.copy_(bound * (2 * torch.rand(weights.shape, generator=generator) - 1))
-        if self.named is not None:
+        if self.by_words is not None:
             self.words.copy_(_WORD_STD * torch.randn(self.words.shape, generator=generator))
             self.words[-1] = 0
 
@@ -286,18 +286,18 @@ class FeatureMatching(nn.Module):
 
     def _describe(self, maps: FeatureMaps, locations: Tensor) -> Tensor:
         """Returns descriptors of what was grasped at locations (batch, 2), (batch, descriptor)."""
-        features = self.shown(maps)
+        features = self.by_demonstration(maps)
         height, width = features.shape[-2:]
         std = 2 * _POOLING_STD / torch.tensor([width, height], device=features.device)
         weights = gaussian_maps(locations[:, None], height, width, std)  # (batch, 1, h, w)
         weights = weights / weights.sum(dim=(2, 3), keepdim=True).clamp_min(1e-6)
         return (features * weights).sum(dim=(2, 3))
 
-    def _find_named(self, maps: FeatureMaps, present: Tensor) -> Tensor:
+    def _find_by_words(self, maps: FeatureMaps, present: Tensor) -> Tensor:
         """Returns where scenes look like what words (batch, words) name, as logits (batch, h, w)."""
-        assert self.named is not None
+        assert self.by_words is not None
         descriptors = present @ self.words[:-1] + self.words[-1]
-        return self.named.similarity(self.named(maps), descriptors)
+        return self.by_words.similarity(self.by_words(maps), descriptors)
 
 
 class ComparedFeatures(nn.Module):
@@ -346,9 +346,9 @@ class _Pairs:
         self._rows = [torch.tensor(found) for found in rows.values() if len(found) > 1]
         if not self._rows:
             raise ValueError(
-                "Feature matching needs tasks with at least two episodes in which the gripper closes on an "
-                f"object. The {len(tasks)} such episodes are of {len(rows)} different tasks. Add episodes, or "
-                "set --policy.feature_matching=false."
+                "Feature matching needs tasks with at least two episodes in which the gripper closes on "
+                f"an object. The {len(tasks)} such episodes are of {len(rows)} different tasks. Add "
+                "episodes, or set --policy.feature_matching=false."
             )
 
     def draw(self, n_pairs: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

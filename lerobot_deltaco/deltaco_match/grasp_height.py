@@ -3,8 +3,8 @@
 If the demonstration moved the same object, its height is the right one. If it moved another object of that
 color or shape, the appearance of the object in the scene is a better guide. So two estimates are averaged,
 weighted by the inverse of their variances. The variance of the estimate from the demonstration is learned,
-from the kind of instruction and from how similar both objects look. The variance of the other is not: training
-objects have hardly any error to learn it from.
+from the kind of instruction and from how similar both objects look. The variance of the other is not:
+training objects have hardly any error to learn it from.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Hue augmentation: one random change of color for all images of a sample, to make new objects of known ones."""
+"""Hue augmentation: one random change of color for all images of a sample makes new objects of known ones."""
 
 from __future__ import annotations
 

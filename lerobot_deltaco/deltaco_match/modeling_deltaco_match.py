@@ -91,7 +91,7 @@ class Episode(NamedTuple):
     network: PolicyNetwork
 
 
-class Shown(NamedTuple):
+class StackedDemonstrations(NamedTuple):
     """Demonstrations of a batch of tasks.
 
     Attributes:
@@ -357,31 +357,31 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         Args:
             scenes: First images of episodes, (batch, 3, H, W) in 0..1.
             instructions: Instruction of each sample; an empty string leaves it out.
-            demonstrations: Demonstrations of each sample, as many of each; an empty list leaves them out. None
-                for a policy that takes none.
+            demonstrations: Demonstrations of each sample, as many of each; an empty list leaves them out.
+                None for a policy that takes none.
 
         Raises:
             ValueError: Something is left out that the policy has not learned to do without.
         """
         device, inputs = scenes.device, self.config.task_inputs
-        shown = self._stacked(demonstrations, device)
+        stacked = self._stacked(demonstrations, device)
         says = torch.tensor([bool(text) for text in instructions], device=device)
-        self._check_given(says, shown)
+        self._check_given(says, stacked)
         condition, given, description, heights = self._condition(instructions, device), None, None, None
-        if shown is not None:
-            n_each = shown.ends.shape[1]
-            each = self.correspondence.describe(shown.ends.flatten(0, 1))
+        if stacked is not None:
+            n_each = stacked.ends.shape[1]
+            each = self.correspondence.describe(stacked.ends.flatten(0, 1))
             moved = F.normalize(each.moved, dim=1).unflatten(0, (-1, n_each)).mean(dim=1)
             target = each.target
             if target is not None:
                 target = target.unflatten(0, (-1, n_each)).mean(dim=1)
             description = Description(moved, target, each.attention[::n_each])
-            states = shown.pick_states.flatten(0, 1)
+            states = stacked.pick_states.flatten(0, 1)
             heights = self.robot_states.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
         if self.config.takes_either:
             assert condition is not None
             condition = torch.where(says[:, None], condition, 0.0)
-            given = Given(torch.full_like(says, shown is not None), says)
+            given = Given(torch.full_like(says, stacked is not None), says)
             if description is None:
                 description = self.correspondence.no_description(len(scenes), device)
                 heights = torch.full((len(scenes),), torch.nan, device=device)
@@ -391,25 +391,25 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             if self.config.known_words and bool(says.any()):
                 words = bag_of_words(self.config.known_words, instructions)
                 words = type(words)(*(part.to(device) for part in words))
-            if shown is not None:
+            if stacked is not None:
                 # Where a grasp is not known, the attention stands in for its location.
                 attended = peak_locations(each.attention.clamp_min(_MIN_ATTENTION).log())[:, 0]
                 by_state = self.robot_states.pick_locations(states)
                 picks = torch.where(by_state.isnan(), attended, by_state).unflatten(0, (-1, n_each))
-                ends = shown.ends
+                ends = stacked.ends
             pick = self.feature_matching.pick_map(maps[:, 0], scenes, ends, picks, words)
             maps = torch.stack([pick, maps[:, 1]], dim=1)
         locations = peak_locations(maps)
         descriptors = None if description is None else description.moved
         found_heights = self.grasp_height(features, locations[:, 0], descriptors, heights, condition)
-        attention = None if shown is None or description is None else description.attention
+        attention = None if stacked is None or description is None else description.attention
         places = inputs.places_by_demonstration or not bool(says.all())
-        by_demonstration = (shown is not None, shown is not None and places)
+        by_demonstration = (stacked is not None, stacked is not None and places)
         return Found(
             locations, found_heights + self.config.grasp_height_bias, maps, attention, by_demonstration
         )
 
-    def _check_given(self, says: Tensor, shown: Shown | None) -> None:
+    def _check_given(self, says: Tensor, stacked: StackedDemonstrations | None) -> None:
         """Checks that nothing is left out that the policy has not learned to do without.
 
         Raises:
@@ -417,7 +417,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """
         config = self.config
         missing = {
-            "demonstration": config.uses_demonstrations and shown is None,
+            "demonstration": config.uses_demonstrations and stacked is None,
             "instruction": config.task_inputs.uses_language and not bool(says.all()),
         }
         if all(missing.values()):
@@ -432,7 +432,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     # Inputs
 
-    def _stacked(self, demonstrations: DemonstrationsOfTasks | None, device: torch.device) -> Shown | None:
+    def _stacked(
+        self, demonstrations: DemonstrationsOfTasks | None, device: torch.device
+    ) -> StackedDemonstrations | None:
         """Stacks the demonstrations of a batch; None if they are left out.
 
         Raises:
@@ -440,7 +442,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """
         if not self.config.uses_demonstrations or demonstrations is None:
             return None
-        counts = {len(shown) for shown in demonstrations}
+        counts = {len(own) for own in demonstrations}
         if len(counts) != 1:
             raise ValueError(
                 f"The samples of a batch must have as many demonstrations each. Got {sorted(counts)}."
@@ -449,12 +451,14 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             return None
         unknown = torch.full((self.config.state_dim,), torch.nan)
         ends, states = [], []
-        for shown in demonstrations:
-            ends.append(torch.stack([each.frames[[0, -1]] for each in shown]))
+        for own in demonstrations:
+            ends.append(torch.stack([each.frames[[0, -1]] for each in own]))
             states.append(
-                torch.stack([unknown if each.pick_state is None else each.pick_state.cpu() for each in shown])
+                torch.stack([unknown if each.pick_state is None else each.pick_state.cpu() for each in own])
             )
-        return Shown(torch.stack(ends).to(device).float() / 255, torch.stack(states).to(device))
+        return StackedDemonstrations(
+            torch.stack(ends).to(device).float() / 255, torch.stack(states).to(device)
+        )
 
     def _condition(self, instructions: Sequence[str], device: torch.device) -> Tensor | None:
         """Returns embeddings of instructions, or one-hot tasks, (batch, condition); None without either."""
@@ -523,8 +527,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     def _read_evaluation_bank(self) -> DemonstrationBank | None:
         bank = super()._read_evaluation_bank()
-        if bank is not None:
-            dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
+        repo_id = self.config.demo_repo_id
+        if bank is not None and repo_id is not None:
+            dataset = open_dataset("--policy.demo_root", repo_id, self.config.demo_root)
             data = read_robot_data(dataset, bank.episodes.tolist())
             self._check_robot(data)
             gripper = self.config.gripper_opening(data.actions)

@@ -1,8 +1,8 @@
 """The robot's states at the pick and place locations, and the height offset of a grasp.
 
 A location in an image leaves one number open: how far along the camera's ray it is. At a grasp, that depends
-on the object, and a flat object of an unknown kind looks like a tall one that is farther away. A demonstration
-tells: by the robot's state when its gripper closed.
+on the object, and a flat object of an unknown kind looks like a tall one that is farther away. A
+demonstration tells: by the robot's state when its gripper closed.
 
 Grasp height offset: how far the state at a grasp is along the direction in which the robot approaches, beyond
 what the location predicts; in standard deviations over the training episodes, 0 on average. In the benchmark,
@@ -130,7 +130,7 @@ class RobotStates(nn.Module):
         return self._project(rest, features)
 
     def pick_locations(self, pick_states: Tensor) -> Tensor:
-        """Returns the locations of grasps, (grasps, 2), by the robot's states there, as `heights` takes them."""
+        """Returns the locations of grasps, (grasps, 2), by the robot's states there."""
         return self.to_image(pick_states).clamp(-1, 1)
 
     def _project(self, rest: Tensor, features: Tensor) -> Tensor:
