@@ -228,7 +228,7 @@ class Player:
         meant = parse_instruction(get_task(choice.demonstrated).instruction).objects or frozenset()
         shown = [n for n, label in enumerate(labels) if label.index in meant]
         demonstrations = [(choice.demonstrated, choice.recorded)]
-        if not shown:  # the present demonstration fits no object here
+        if len(shown) != 1:  # the present demonstration does not single out an object here
             shown = [layout.target_object]
             demonstrations = [(choice.task_id, self.default_source(choice.task_id))]
         others = [label for n, label in enumerate(labels) if n not in shown]
@@ -363,14 +363,21 @@ def build_page(player: Player, name: str) -> gr.Blocks:
             f"demonstration shows; which bin, the sentence says. Policy: `{name}`",
             elem_id="title",
         )
-        recorded, suggested = gr.State(_FROM_CHECKPOINT), gr.State([])
+        recorded = gr.State(_FROM_CHECKPOINT)
+        shown = gr.State((-1, -1, []))  # task and seed of the scene, and the sentences suggested in it
         address = gr.Textbox(visible="hidden")
         with gr.Row(equal_height=False):
             with gr.Column(scale=4, min_width=340):
                 with gr.Row(equal_height=False):
                     task = gr.Dropdown(names, label="Scene of task", scale=5, min_width=150, elem_id="task")
                     seed = gr.Number(
-                        label="Seed", precision=0, minimum=0, maximum=_MAX_SEED, scale=2, min_width=70
+                        label="Seed",
+                        precision=0,
+                        minimum=0,
+                        maximum=_MAX_SEED,
+                        scale=2,
+                        min_width=70,
+                        elem_id="seed",
                     )
                     new_scene = _small_button("New scene", "new_scene")
                 with gr.Row(equal_height=True):
@@ -414,7 +421,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
                                     grid.append(gr.HTML(elem_id=f"verdict_{number}"))
 
         inputs = [task, seed, demonstrated, recorded, sentence, use]
-        outputs = [*inputs, scene, objects, ends, chips, suggested, address]
+        outputs = [*inputs, scene, objects, ends, chips, shown, address]
 
         def show(choice: Choice) -> dict[Any, Any]:
             """Shows a choice on all components that hold it."""
@@ -429,24 +436,26 @@ def build_page(player: Player, name: str) -> gr.Blocks:
                 objects: f"In the scene: {names_there}. The demonstration {source}.",
                 ends: _ends_image(demonstration),
                 chips: gr.Dataset(samples=[[text] for text in sentences]),
-                suggested: sentences,
+                shown: (choice.task_id, choice.seed, sentences),
                 address: choice.query,
             }
 
         def begin(request: gr.Request) -> dict[Any, Any]:
             return show(player.parse_choice(dict(request.query_params)))
 
-        def change_scene(known: list[str], *values: Any) -> dict[Any, Any]:
+        def change_scene(known: tuple[int, int, list[str]], *values: Any) -> dict[Any, Any]:
             """Shows another scene, with what fits it in place of what was not made by the user."""
             choice = Choice(*values)
+            if (choice.task_id, choice.seed) == known[:2]:
+                return {}
             fitting = player.default_choice(choice.task_id, choice.seed or 0)
             if choice.recorded > 0:
                 fitting = fitting._replace(demonstrated=choice.demonstrated, recorded=choice.recorded)
-            if choice.sentence.strip() and choice.sentence not in known:
+            if choice.sentence.strip() and choice.sentence not in known[2]:
                 fitting = fitting._replace(sentence=choice.sentence)
             return show(fitting._replace(use=choice.use))
 
-        def draw_scene(known: list[str], *values: Any) -> dict[Any, Any]:
+        def draw_scene(known: tuple[int, int, list[str]], *values: Any) -> dict[Any, Any]:
             task_id, seed = random.randrange(len(TASKS)), random.randint(0, _MAX_SEED)
             return change_scene(known, task_id, seed, *values[2:])
 
@@ -476,18 +485,18 @@ def build_page(player: Player, name: str) -> gr.Blocks:
 
         def run_four(*values: Any, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
             choice, n_steps = Choice(*values), player.n_steps
-            shown: list[Any] = []
+            cells: list[Any] = []
             n_right = 0
             try:
                 four = player.comparison(choice)
                 for each in four[:2]:
                     demonstration = player.demonstration(each.demonstrated, each.recorded)
                     meant = parse_instruction(demonstration.task).phrase
-                    shown.append(gr.Image(_ends_image(demonstration), label=f"Shows {meant}"))
+                    cells.append(gr.Image(_ends_image(demonstration), label=f"Shows {meant}"))
                 for n, each in enumerate(four):
                     done = player.run(each, _reporter(progress, n * n_steps, 4 * n_steps))
                     n_right += bool(done.verdict.is_success)
-                    shown += [
+                    cells += [
                         gr.Video(str(done.video), label=f"“{each.sentence}”"),
                         _verdict_html(done.verdict._replace(headline="", asked="")),
                     ]
@@ -498,7 +507,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
                 verdict: _message_html(f"{n_right} of 4 as asked", text),
                 single: gr.Row(visible=False),
                 comparison: gr.Column(visible=True),
-                **dict(zip(grid, shown, strict=True)),
+                **dict(zip(grid, cells, strict=True)),
                 address: choice.query,
             }
 
@@ -509,8 +518,8 @@ def build_page(player: Player, name: str) -> gr.Blocks:
         quiet = {"show_progress": "hidden"}
         on(page.load, begin, None, outputs, **quiet)
         for trigger in (task.input, seed.submit, seed.blur):
-            on(trigger, change_scene, [suggested, *inputs], outputs, **quiet)
-        on(new_scene.click, draw_scene, [suggested, *inputs], outputs, **quiet)
+            on(trigger, change_scene, [shown, *inputs], outputs, **quiet)
+        on(new_scene.click, draw_scene, [shown, *inputs], outputs, **quiet)
         on(demonstrated.input, change_demonstration, inputs, outputs, **quiet)
         on(record.click, record_another, inputs, outputs, show_progress_on=[ends])
         for trigger in (run.click, sentence.submit):

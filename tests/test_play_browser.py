@@ -113,11 +113,14 @@ def test_the_verdict_is_about_the_typed_sentence_and_the_address_keeps_it(page):
     assert "asks for the blue cup in the red bin" in text
     assert "“mug” as “cup”" in text
     assert "The scene's task 26" in text
-    address = page.url
+    address = page.url.replace("demonstrated=26", "demonstrated=4")
     page.goto("about:blank")
     page.goto(address)
     page.wait_for_function("document.querySelector('#sentence textarea')?.value.includes('blue mug')")
+    page.focus("#seed input")
+    page.keyboard.press("Tab")  # changes nothing
     assert "Not judged" in run_sentence(page, "wave at me")
+    assert "task_id=26&seed=7&demonstrated=4&" in page.url
     page.fill("#sentence textarea", "")
     page.click("#run")
     assert "Type an instruction first" in await_text(page, "#verdict", "cannot be run")
