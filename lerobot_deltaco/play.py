@@ -285,7 +285,6 @@ def suggest_sentences(choice: Choice, layout: Layout) -> list[str]:
 
 # The page
 
-
 _CSS = """
 .gradio-container { max-width: 1280px !important; margin: 0 auto !important; }
 #title h1 { font-size: 1.4rem; margin: 0; }
@@ -338,7 +337,7 @@ def _reporter(progress: gr.Progress, n_before: int, n_steps: int) -> Callable[[i
 
 
 def _image(name: str, **options: Any) -> gr.Image:
-    return gr.Image(interactive=False, buttons=[], elem_id=name, **options)
+    return gr.Image(interactive=False, elem_id=name, **{"buttons": [], **options})
 
 
 def _video(name: str, **options: Any) -> gr.Video:
@@ -408,7 +407,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
                 verdict = gr.HTML(start, elem_id="verdict")
                 with gr.Row(equal_height=False) as single:
                     video = _video("video", label="Episode")
-                    picture = _image("picture", label="Where the policy looked")
+                    picture = _image("picture", label="Where the policy looked", buttons=["fullscreen"])
                 grid: list[Any] = []
                 with gr.Column(visible=False) as comparison:
                     with gr.Row(equal_height=False):
@@ -467,11 +466,9 @@ def build_page(player: Player, name: str) -> gr.Blocks:
             return show(Choice(*values)._replace(recorded=random.randint(1, _MAX_SEED)))
 
         def run_one(*values: Any, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
-            choice, n_steps = Choice(*values), player.n_steps
+            choice = Choice(*values)
             try:
-                done = player.run(
-                    choice, lambda step: progress((step, n_steps), desc="Running", unit="steps")
-                )
+                done = player.run(choice, _reporter(progress, 0, player.n_steps))
             except (ValueError, RuntimeError) as error:
                 return {verdict: _message_html("This cannot be run", str(error))}
             return {
@@ -542,8 +539,8 @@ def play(checkpoint: Positional[str | None] = None, port: int = 7860) -> None:
         ValueError: There is no checkpoint, its policy is not one for the benchmark, or the port is taken.
     """
     with tempfile.TemporaryDirectory(prefix="deltaco-play-") as folder:
-        chosen = checkpoint or shipped_checkpoint()
-        page = build_page(Player(chosen, Path(folder)), Path(chosen).name)
+        chosen = Path(checkpoint) if checkpoint else shipped_checkpoint()
+        page = build_page(Player(chosen, Path(folder)), checkpoint or chosen.name)
         # Fonts of the system, so that the page needs no other server.
         theme = gr.themes.Default(
             font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"], primary_hue="orange"
@@ -558,4 +555,4 @@ def play(checkpoint: Positional[str | None] = None, port: int = 7860) -> None:
                 footer_links=[],
             )
         except OSError as error:
-            raise ValueError(f"The page cannot be served at port {port}: {error}") from error
+            raise ValueError(f"Port {port} is taken. Choose another one with --port.") from error
