@@ -5,21 +5,17 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import av
-import numpy as np
 import pytest
-from PIL import Image
 
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.commands import evaluate as evaluate_command
 from lerobot_deltaco.common.run_folder import RunError, checkpoints
 from lerobot_deltaco.evaluation import processes
 from lerobot_deltaco.evaluation.checkpoint_policy import load_policy
-from lerobot_deltaco.evaluation.episode_videos import KINDS, check_explainable, kind_of, write_videos
 from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
 from lerobot_deltaco.evaluation.plan import EvaluationPlan
 from lerobot_deltaco.evaluation.processes import EvaluationError, default_processes, run_batches
-from lerobot_deltaco.evaluation.record import EpisodeResult, read_record, record_path
+from lerobot_deltaco.evaluation.record import read_record, record_path
 
 CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "pick_place"
 STEP = 8_000
@@ -217,132 +213,3 @@ def test_several_demonstrations_are_taken_from_a_dataset(tmp_path):
     )
     assert record.policy["n_demonstrations"] == 3
     assert [episode.demonstration_episodes for episode in record.episodes] == [[0, 1, 2]] * 2
-
-
-# Images and videos
-
-
-@pytest.fixture(scope="module")
-def rendered(evaluated):
-    """A folder with two explanations and a video of each kind of outcome, and the record beside it."""
-    out, record = evaluated
-    evaluate_command.main(
-        [
-            str(CHECKPOINT),
-            "--tasks",
-            TASKS,
-            "--trials",
-            "2",
-            "--out",
-            str(out),
-            "--explain",
-            "2",
-            "--videos",
-            "1",
-        ]
-    )
-    assert read_record(record_path(out, STEP)) == record  # which was there, and is not made again
-    return out / "evaluations" / f"{STEP:07d}", record
-
-
-def test_explanations_are_images_of_episodes_spread_over_the_set(rendered):
-    folder, record = rendered
-    images = sorted((folder / "explanations").iterdir())
-    assert [path.name[:16] for path in images] == ["task_024_trial_0", "task_035_trial_1"]
-    for path in images:
-        pixels = np.asarray(Image.open(path))
-        assert pixels.shape[1] == 688  # the demonstration's two images, and the scene
-        for color in ((255, 0, 200), (0, 220, 255)):  # rings at the grasp and at the release
-            assert (pixels[-150:] == color).all(axis=-1).any()
-
-
-def test_a_map_that_was_not_learned_is_not_drawn(rendered, loaded):
-    # The release is the instruction's: the attention for it is untrained.
-    assert loaded.policy.goals.locator.release_source != "demo"
-    folder, _ = rendered
-    pixels = np.asarray(Image.open(next((folder / "explanations").iterdir()))).astype(int)
-    last_of_demonstration = pixels[40:240, 240:448]
-    bluish = last_of_demonstration[..., 2] - last_of_demonstration[..., 0]
-    assert np.median(bluish) < 20
-
-
-def test_videos_are_sorted_by_outcome_with_an_index(rendered):
-    folder, record = rendered
-    index = json.loads((folder / "videos" / "index.json").read_text())
-    counts = {kind: sum(kind_of(item) == kind for item in record.episodes) for kind in KINDS}
-    assert index["episodes_by_outcome"] == counts
-    assert len(index["videos"]) == sum(count > 0 for count in counts.values())
-    page = (folder / "videos" / "index.html").read_text()
-    sheet = Image.open(folder / "videos" / "sheet.png")
-    assert sheet.height > 300 * len(index["videos"])  # a row for each outcome
-    recorded = {(item.task_id, item.trial): item for item in record.episodes}
-    for item in index["videos"]:
-        assert item["ends_as_recorded"]
-        assert kind_of(recorded[item["task_id"], item["trial"]]) == item["outcome"]
-        assert item["file"].startswith(f"{item['outcome']}/task_{item['task_id']:03d}")
-        assert item["file"] in page
-        with av.open(str(folder / "videos" / item["file"])) as video:
-            frames = list(video.decode(video=0))
-        assert len(frames) == 31 + 10
-        assert frames[0].width > frames[0].height  # the demonstration beside the scene
-
-
-def test_a_run_that_ends_otherwise_is_said_to(rendered, loaded, tmp_path):
-    _, record = rendered
-    other = [replace(episode, success=not episode.success) for episode in record.episodes]
-    record = replace(record, episodes=other)
-    page = write_videos(tmp_path, loaded, EvaluationPlan(TASKS, trials=2), record, 1)
-    assert "Ended otherwise than recorded" in page.read_text()
-    index = json.loads(page.with_name("index.json").read_text())
-    assert not any(item["ends_as_recorded"] for item in index["videos"])
-
-
-def test_what_is_typed_is_no_markup(rendered, loaded, tmp_path):
-    _, record = rendered
-    sentence = "<script>alert(1)</script> & more"
-    episodes = [replace(item, instruction=sentence) for item in record.episodes[:1]]
-    page = write_videos(
-        tmp_path, loaded, EvaluationPlan(TASKS, trials=2), replace(record, episodes=episodes), 1
-    ).read_text()
-    assert "<script>" not in page
-    assert "&lt;script&gt;" in page
-
-
-def test_a_policy_without_goals_is_not_explained(loaded, monkeypatch):
-    monkeypatch.setattr(loaded.policy.config, "demo_encoder", "attention")
-    with pytest.raises(ValueError, match=r"`demo_encoder=attention`\) finds no places"):
-        check_explainable(loaded)
-
-
-def episode(**changes):
-    plain = EpisodeResult(
-        task_id=24,
-        trial=0,
-        seed=0,
-        instruction="",
-        demonstration=None,
-        success=False,
-        objects=[24, 1, 2],
-        object_containers=[-1, -1, -1],
-        container_quadrants=[[0, 0], [1, 1]],
-        target_object=0,
-        target_container=0,
-        grasped_object=0,
-        right_object=True,
-        right_container=False,
-    )
-    return replace(plain, **changes)
-
-
-@pytest.mark.parametrize(
-    ("changes", "kind"),
-    [
-        ({"success": True, "object_containers": [0, -1, -1]}, "success"),
-        ({"grasped_object": -1, "right_object": False}, "nothing_grasped"),
-        ({"grasped_object": 1, "right_object": False}, "wrong_object"),
-        ({"object_containers": [1, -1, -1]}, "wrong_container"),
-        ({}, "dropped"),
-    ],
-)
-def test_episodes_are_sorted_by_what_came_of_them(changes, kind):
-    assert kind_of(episode(**changes)) == kind
