@@ -14,9 +14,9 @@ import numpy as np
 import pandas as pd
 
 from lerobot_deltaco import report_tables
-from lerobot_deltaco.paper_results import CHANCE, LEVELS, label_of, paper_result, title_of
+from lerobot_deltaco.paper_results import CHANCE, LEVELS, paper_result, title_of
 from lerobot_deltaco.records import read_records
-from lerobot_deltaco.report_tables import Series, make_series
+from lerobot_deltaco.report_tables import Series, make_series, name_of
 from lerobot_deltaco.statistics import N_BEST_SETS
 
 if TYPE_CHECKING:
@@ -81,7 +81,11 @@ TABLES: dict[str, tuple[Callable[[Sequence[Series]], pd.DataFrame], str, str]] =
         "chooses its sets by what it averages, which flatters. The authors' rates were measured in "
         "another simulation, with other objects: compare the order, not the values.",
     ),
-    "curves": (report_tables.curves_table, "Learning curves", ""),
+    "curves": (
+        report_tables.curves_table,
+        "Learning curves",
+        "Success of every evaluation. Lines are means over seeds, bands one standard deviation.",
+    ),
 }
 
 
@@ -137,12 +141,9 @@ def _page(everything: Sequence[Series], tables: Mapping[str, pd.DataFrame], figu
     for name, (_, title, text) in TABLES.items():
         if name not in tables:
             continue
-        parts.append(f"## {title}\n\n{text}\n" if text else f"## {title}\n")
+        parts.append(f"## {title}\n\n{text} [CSV]({name}.csv)\n")
         if name == "curves":
-            parts.append(
-                f"![Success over training steps]({CURVES_FIGURE})\n\nLines are means over seeds, bands one "
-                "standard deviation. The numbers are in `curves.csv`.\n"
-            )
+            parts.append(f"![Success over training steps]({CURVES_FIGURE})\n")
             continue
         if name == "success" and SUCCESS_FIGURE in figures:
             parts.append(f"![Success with intervals, beside the paper's]({SUCCESS_FIGURE})\n")
@@ -165,8 +166,8 @@ def _group_text(group: str, everything: Sequence[Series]) -> str:
     is_drawn_once = settings["adversarial_draw"] == "scene"
     return (
         f"**{escape(title_of(group))}**: {n_tasks} tasks (`{settings['tasks']}`), {settings['trials']} "
-        f"trials of each; evaluation seed {settings['seed']}; ambiguity scheme `{settings['ambiguity']}`; objects "
-        f"`{settings['objects']}`, with adversarial distractors at a probability of "
+        f"trials of each; evaluation seed {settings['seed']}; ambiguity scheme `{settings['ambiguity']}`; "
+        f"objects `{settings['objects']}`, with adversarial distractors at a probability of "
         f"{settings['adversarial_probability']:g}{', drawn once a scene' if is_drawn_once else ''}. Names of "
         "rows say what differs.\n"
     )
@@ -210,7 +211,7 @@ def _origin_text(everything: Sequence[Series]) -> str:
     records = [record for series in everything for record in series.last]
     versions = sorted({f"{name} {value}" for record in records for name, value in record.versions.items()})
     commands = [
-        f"    # {', '.join(filter(None, (series.experiment, series.variant)))}: {series.last[0].policy_type}\n"
+        f"    # {series.experiment}{', ' if series.variant else ''}{series.variant}\n"
         + "".join(f"    {line}\n" for line in series.last[0].command.splitlines())
         for series in everything
     ]
@@ -255,10 +256,7 @@ _SUFFIXES = ("low", "high", "sd", "episodes")
 
 def _names(table: pd.DataFrame, experiment: str, variant: str) -> list[str]:
     variants = table[variant] if variant in table else [""] * len(table)
-    return [
-        escape(label_of(name) + (f" ({text})" if text else ""))
-        for name, text in zip(table[experiment], variants, strict=True)
-    ]
+    return [escape(name_of(name, text)) for name, text in zip(table[experiment], variants, strict=True)]
 
 
 def _cell(row: pd.Series, name: str) -> str:
@@ -302,7 +300,7 @@ _DOTTED = (0, (1, 3))
 
 def success_figure(everything: Sequence[Series]) -> Figure:
     """Draws the success at the last step with its intervals, beside the paper's."""
-    figure, panels = _panels(everything, width=8.0, frame=0.8, line=0.3)
+    figure, panels = _panels(everything, frame=0.8, line=0.4)
     for ax, group in panels:
         rows = np.arange(len(group))
         ours = [series.success for series in group]
@@ -312,16 +310,17 @@ def success_figure(everything: Sequence[Series]) -> Figure:
         )
         ax.errorbar(values, rows - 0.15, xerr=errors, fmt="o", color="#c8102e", label="ours [95 %]")
         published = [
-            (n, paper_result(item.experiment)) for n, item in enumerate(group) if not item.departures
+            (n + 0.15, result.rate, result.sd)
+            for n, series in enumerate(group)
+            if not series.departures and (result := paper_result(series.experiment)) is not None
         ]
-        published = [(n + 0.15, result.rate, result.sd) for n, result in published if result is not None]
         if published:
             places, rates, sds = zip(*published, strict=True)
             label = "authors (SD), another simulation"
             ax.errorbar(rates, places, xerr=sds, fmt="s", color="0.45", markersize=4, label=label)
         for level in LEVELS.values():
             ax.axvline(level, color="0.8", linewidth=1, linestyle=_DOTTED)
-        ax.set_yticks(rows, [_plain(series.name) for series in group], fontsize=9)
+        ax.set_yticks(rows, [_plain(series.name) for series in group], fontsize=8)
         ax.set_ylim(len(group) - 0.5, -0.5)
         ax.set_xlim(0, 1)
         ax.xaxis.set_major_formatter(lambda rate, _: f"{100 * rate:g} %")
@@ -334,7 +333,7 @@ def success_figure(everything: Sequence[Series]) -> Figure:
 def curves_figure(everything: Sequence[Series]) -> Figure:
     """Draws the success over the steps of the training: means over seeds, with a band of one SD."""
     everything = [series for series in everything if len(series.steps) > 1]
-    figure, panels = _panels(everything, width=9.0, frame=2.4, line=0.205)
+    figure, panels = _panels(everything, frame=2.4, line=0.205)
     for ax, group in panels:
         styles = cycle(product(("-", "--", "-.", ":"), _OTHER_COLORS))
         for series in sorted(group, key=lambda item: -item.rates[-1].mean()):
@@ -361,7 +360,7 @@ def curves_figure(everything: Sequence[Series]) -> Figure:
 
 
 def _panels(
-    everything: Sequence[Series], width: float, frame: float, line: float
+    everything: Sequence[Series], frame: float, line: float
 ) -> tuple[Figure, list[tuple[Axes, list[Series]]]]:
     """Makes a figure with one panel for each group; `frame` and `line` are heights, inches."""
     from matplotlib.figure import Figure  # without pyplot, which would look for a screen
@@ -370,15 +369,17 @@ def _panels(
     for series in everything:
         groups[series.group].append(series)
     heights = [frame + line * len(group) for group in groups.values()]
+    # Names stand beside the axes.
+    width = 6.0 + 0.06 * max(len(line) for series in everything for line in _plain(series.name).split("\n"))
     figure = Figure(figsize=(width, sum(heights)), dpi=140, layout="constrained")
     axes = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
     for ax, name in zip(axes, groups, strict=True):
-        ax.set_title(_plain(title_of(name)), loc="left", fontsize=11)
+        ax.set_title(title_of(name), loc="left", fontsize=11, parse_math=False)
         ax.set_axisbelow(True)
         ax.spines[["top", "right"]].set_visible(False)
     return figure, list(zip(axes, groups.values(), strict=True))
 
 
 def _plain(text: str) -> str:
-    """Returns a text that matplotlib does not read as a formula."""
-    return text.replace("$", r"\$")
+    """Returns a name on one or two lines, without what matplotlib would read as a formula."""
+    return text.replace("$", r"\$").replace(": ", ":\n", 1)

@@ -1,9 +1,9 @@
 """Tables of a report, each a `pandas.DataFrame` made from records of evaluations.
 
 Rates are fractions, 0..1. A row is an experiment: trainings of one name, which differ in their seeds.
-Experiments whose names begin alike, such as small_a/deltaco and small_a/one_hot, are a group. Evaluations with
-other settings than most of their group, with a counterfactual, with an input left out or in other words have
-rows of their own.
+Experiments whose names begin alike, such as small_a/deltaco and small_a/one_hot, are a group. Evaluations
+with other settings than most of their group, with a counterfactual, with an input left out or in other words
+have rows of their own.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Series:
     @property
     def name(self) -> str:
         """Name in the page and in figures."""
-        return label_of(self.experiment) + (f" ({self.variant})" if self.variant else "")
+        return name_of(self.experiment, self.variant)
 
     @property
     def is_counterfactual(self) -> bool:
@@ -111,6 +111,11 @@ class Series:
     def columns(self) -> dict[str, str]:
         """The first columns of every table."""
         return {"experiment": self.experiment, "variant": self.variant}
+
+
+def name_of(experiment: str, variant: str) -> str:
+    """Returns the name of a row, such as "DeL-TaCo: without the demonstration"."""
+    return f"{label_of(experiment)}: {variant}" if variant else label_of(experiment)
 
 
 def make_series(records: Sequence[EvaluationRecord]) -> list[Series]:
@@ -171,18 +176,22 @@ def _departure_texts(settings: Mapping[str, Any], departures: frozenset[str]) ->
         value = settings[name]
         if name == "tasks":
             yield f"on {value}"
-        elif name == "trials" and "tasks" in departures:
-            continue
+        elif name in ("trials", "demonstrations") and "tasks" in departures:
+            continue  # as they must
         elif name == "counterfactual":
             yield f"another task's {value}"
         elif name == "without":
             yield f"without the {value}"
         elif name == "wording":
             yield wording_label(value)
+        elif name == "demonstrations":
+            yield f"dataset {value}" if value else "demonstrations of the checkpoint"
         elif name == "n_demonstrations":
             yield f"{value} demonstration{'s' * (value > 1)}"
-        elif name == "demonstrations":
-            yield f"demonstrations of {value or 'the checkpoint'}"
+        elif name == "seed":
+            yield f"evaluation seed {value}"
+        elif isinstance(value, float):
+            yield f"{name.replace('_', ' ')} {value:g}"
         else:
             yield f"{name.replace('_', ' ')} {value}"
 
@@ -261,7 +270,7 @@ def outcomes_table(everything: Sequence[Series]) -> pd.DataFrame:
 def differences_table(everything: Sequence[Series]) -> pd.DataFrame:
     """Makes differences of success, paired by task.
 
-    An evaluation with other settings is compared with the same policy's in the main ones, or in the nearest
+    An evaluation with other settings is compared with the same trainings' in the main ones, or in the nearest
     to them; all others with the first experiment of their group in the same settings.
     """
     rows = []
@@ -269,7 +278,9 @@ def differences_table(everything: Sequence[Series]) -> pd.DataFrame:
         reference = _reference(series, everything)
         if reference is None:
             continue
-        difference = paired_difference(series.episodes, reference.episodes)
+        same_runs = reference.runs if reference.experiment == series.experiment else {}
+        last = [runs[reference.steps[-1]].episodes for seed, runs in same_runs.items() if seed in series.runs]
+        difference = paired_difference(series.episodes, pd.concat(last) if last else reference.episodes)
         if difference is not None:
             rows.append(
                 {
