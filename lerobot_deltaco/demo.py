@@ -31,6 +31,7 @@ from lerobot_deltaco import experiments
 from lerobot_deltaco.experiments import Run, available_cores, last_checkpoint, last_step, read_run_records
 from lerobot_deltaco.recipes import read_recipe
 from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord
+from lerobot_deltaco.statistics import followed, success_interval
 
 Minutes = Literal[8, 25]
 
@@ -220,27 +221,15 @@ def _record(run: Run, plan: EvaluationPlan) -> EvaluationRecord:
     )
 
 
-# MERGE: the two functions below are to call the statistics of the report.
-
-
 def _rate(record: EvaluationRecord) -> tuple[float, float, float]:
     """Returns the success rate and its 95 % interval by bootstrap over tasks, in %."""
-    rates = record.episodes.groupby("task_id")["success"].mean().to_numpy()
-    draws = np.random.default_rng(0).choice(rates, (10_000, len(rates))).mean(axis=1)
-    low, high = np.quantile(draws, (0.025, 0.975))
-    return 100 * float(rates.mean()), 100 * float(low), 100 * float(high)
+    rate, low, high = success_interval(record.episodes)
+    return 100 * rate, 100 * low, 100 * high
 
 
 def _followed(record: EvaluationRecord) -> list[dict[str, Any]]:
-    """Counts what behavior followed where demonstration and instruction ask for different things.
-
-    Returns:
-        A row for the object and one for the container: "aspect", the numbers of episodes that followed the
-        "demonstration", the "instruction" and "neither", and of all "episodes".
-    """
-    from lerobot_deltaco.statistics import followed
-
-    return followed(record)
+    """Counts which input behavior followed, of the object and of the container."""
+    return followed([record]).to_dict("records")
 
 
 # The scene with two demonstrations and two sentences

@@ -118,7 +118,6 @@ FORBIDDEN = {
         "lerobot_deltaco.training",
     },
     "lerobot_deltaco/modeling": {"lerobot_deltaco.modeling_deltaco", "gym_deltaco", "pybullet"},
-    "lerobot_deltaco/evaluation": {"lerobot_deltaco.reporting", "lerobot_deltaco.training"},
     "lerobot_deltaco/policy/networks.py": {"lerobot", "lerobot_deltaco"},
     "lerobot_deltaco/policy/losses.py": {"lerobot", "lerobot_deltaco"},
     "lerobot_deltaco/policy/demo_encoders.py": {"lerobot", "lerobot_deltaco.modeling_deltaco"},
@@ -127,8 +126,8 @@ FORBIDDEN = {
     "lerobot_deltaco/policy/goals/words.py": {"lerobot", "lerobot_deltaco"},
     # Reports are quick, and need no machine that could train.
     **{
-        part: {"torch", "lerobot", "pybullet", "lerobot_deltaco.evaluation.evaluate"}
-        for part in ("lerobot_deltaco/reporting", "lerobot_deltaco/evaluation/record.py")
+        f"lerobot_deltaco/{part}.py": {"torch", "lerobot", "pybullet", "lerobot_deltaco.evaluate"}
+        for part in ("records", "statistics", "report_tables", "report", "paper_results", "leaderboard")
     },
 }
 

@@ -86,7 +86,8 @@ def grasp_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[tupl
     ranges = [np.diff(np.quantile(course, [_OUTLIERS, 1 - _OUTLIERS])).item() for course in courses]
     usual = float(np.median(ranges))
     found = [
-        _last_valley(course) if size > _MIN_RANGE * usual else None for course, size in zip(courses, ranges)
+        _last_valley(course) if size > _MIN_RANGE * usual else None
+        for course, size in zip(courses, ranges, strict=True)
     ]
     return [
         None if valley is None else (first + valley[0], first + valley[1])
@@ -103,9 +104,9 @@ def _last_valley(course: NDArray[np.float64]) -> tuple[int, int] | None:
     for frame in range(len(course) - 1, -1, -1):
         if level is None and course[frame] > after:
             after = course[frame]
-        elif level is None and after - course[frame] >= depth > 0:
-            level, bottom = course[frame], frame
-        elif level is not None and course[frame] < level:
+        elif (level is None and after - course[frame] >= depth > 0) or (
+            level is not None and course[frame] < level
+        ):
             level, bottom = course[frame], frame
         elif level is not None and course[frame] - level >= depth:
             break
@@ -137,8 +138,8 @@ def warn_if_inverted(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> None:
     n_inverted = sum(found is not None for found in grasp_frames(-gripper, spans))
     if n_inverted > n_found:
         logger.warning(
-            "%d of %d episodes have a grasp, and %d would have one if the gripper's values meant the opposite: "
-            "then set --policy.gripper_closed to the other of low and high.",
+            "%d of %d episodes have a grasp, and %d would have one if the gripper's values meant the "
+            "opposite. Then set --policy.gripper_closed to the other of low and high.",
             n_found,
             len(spans),
             n_inverted,
