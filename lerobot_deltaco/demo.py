@@ -27,6 +27,7 @@ import numpy as np
 import pandas as pd
 
 from gym_deltaco.atomic_files import write_json, write_text
+from gym_deltaco.tasks import get_task
 from lerobot_deltaco import experiments
 from lerobot_deltaco.experiments import Run, available_cores, last_checkpoint, last_step, read_run_records
 from lerobot_deltaco.recipes import read_recipe
@@ -68,6 +69,7 @@ LONGER = 77.0  # the recipe of this demo in full, three seeds
 SCENE_TASK, SCENE_TRIAL = 25, 2
 DEMONSTRATION_TASKS = MappingProxyType({"the gray ring": (25, 1), "the yellow lampshade": (29, 2)})
 SENTENCES = ("Put it in green bin.", "Put it in red bin.")  # containers 0 and 1 of the scene
+VIDEO_SIZE = 256  # px
 
 CALIBRATION_SIZE, CALIBRATION_REPEATS = 1024, 20
 STEP_NAMES = MappingProxyType(
@@ -259,17 +261,19 @@ def record_episode(
     Returns:
         Container of each of the three objects at the end: 0 green, 1 red, -1 none.
     """
-    from lerobot_deltaco import look  # MERGE: the only call of `look`
+    # Only here, since LeRobot takes seconds to import.
+    from lerobot_deltaco.pictures import demonstration_ends, draw_found, write_video
+    from lerobot_deltaco.recording import benchmark_scene, load_conditioned
+    from lerobot_deltaco.recording import record_episode as record
 
-    return look.record_episode(
-        checkpoint,
-        task_id=task_id,
-        seed=seed,
-        demonstration_task=demonstration_task,
-        instruction=instruction,
-        video=video,
-        maps=maps,
-    )
+    loaded = load_conditioned(checkpoint)
+    bank = loaded.policy.demonstrations
+    demonstrations = bank.of_task(get_task(demonstration_task).instruction)[:1]
+    scene = benchmark_scene(loaded.policy.config)
+    recording = record(loaded, task_id, seed, instruction, demonstrations, scene, VIDEO_SIZE)
+    write_video(recording.frames, video)
+    draw_found(recording.frames[0], demonstration_ends(demonstrations[0]), recording.found).save(maps)
+    return recording.info["object_containers"].tolist()
 
 
 def _record_scene(run: Run) -> None:
