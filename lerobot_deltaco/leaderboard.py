@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
@@ -90,7 +91,7 @@ def paper_tables(root: Path) -> str:
     experiments = {name: small_scale_experiment(name) for name in PAPER_RESULTS}
     folders = {experiment.rpartition("/")[0] for experiment in experiments.values()}
     files = [root / "results" / folder / "records.parquet" for folder in folders]
-    measured = {series.experiment: series for series in _main(files)}
+    measured = {series.experiment: series for file in files for series in _read(file)}
     sections = []
     for group, reference in _REFERENCES.items():
         rows = [
@@ -117,12 +118,13 @@ def _paper_row(name: str, reference: str, series: Series | None, deltaco: Series
     }
 
 
-def _main(files: list[Path]) -> list[Series]:
-    return [series for series in make_series(read_records(*files)) if not series.is_counterfactual]
+@cache
+def _read(file: Path) -> tuple[Series, ...]:
+    return tuple(series for series in make_series(read_records(file)) if not series.is_counterfactual)
 
 
 def _find(file: Path, experiment: str) -> Series:
-    found = [series for series in _main([file]) if series.experiment == experiment]
+    found = [series for series in _read(file) if series.experiment == experiment]
     if len(found) != 1:
         raise ReportError(f"{file} must have {experiment!r} in one setting. It has {len(found)}.")
     return found[0]

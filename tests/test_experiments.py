@@ -101,7 +101,7 @@ def make_record(experiment, seed, step, plan):
         *(experiment, "deltaco", seed, step, plan),
         wording="templates",
         policy={},
-        versions={},
+        versions={"benchmark": "gym_deltaco/PickPlace-v0"},
         command="",
         seconds=1.0,
         weights=None,
