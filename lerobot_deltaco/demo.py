@@ -271,6 +271,7 @@ def record_episode(
     demonstrations = bank.of_task(get_task(demonstration_task).instruction)[:1]
     scene = benchmark_scene(loaded.policy.config)
     recording = record(loaded, task_id, seed, instruction, demonstrations, scene, VIDEO_SIZE)
+    assert recording.found is not None
     write_video(recording.frames, video)
     draw_found(recording.frames[0], demonstration_ends(demonstrations[0]), recording.found).save(maps)
     return recording.info["object_containers"].tolist()

@@ -22,7 +22,8 @@ from lerobot_deltaco.checkpoints import LoadedPolicy, find_checkpoints, load_pol
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
 from lerobot_deltaco.demonstrations import Demonstration, kept_frames, resize_images
-from lerobot_deltaco.evaluate import Episode, Simulators, run_episodes
+from lerobot_deltaco.episodes import Episode
+from lerobot_deltaco.evaluate import Simulators, run_episodes
 from lerobot_deltaco.lerobot_env import check_policy_fits
 
 _EXPERT_ATTEMPTS = 20

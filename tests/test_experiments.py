@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import stand_ins  # noqa: F401  (MERGE: delete this line)
 
 from lerobot_deltaco import experiments, records
 from lerobot_deltaco.checkpoints import find_checkpoints
