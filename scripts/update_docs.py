@@ -1,8 +1,4 @@
-"""Writes what the documentation's pages have from the records and from the code anew.
-
-These are the tables of docs/leaderboard.md and docs/paper.md, from the committed records, and the
-specification, options and tables of docs/benchmark.md and docs/policy.md, from the code.
-"""
+"""Writes the tables of docs/leaderboard.md and docs/paper.md anew from the committed records."""
 
 from __future__ import annotations
 
@@ -15,21 +11,13 @@ from lerobot_deltaco.reporting.leaderboard import PAGE, updated
 from lerobot_deltaco.reporting.paper_table import PAPER_PAGE, updated_paper_page
 
 ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
-sys.path.insert(0, str(DOCS))
-
-import generated_sections  # noqa: E402
 
 
 def main() -> None:
-    """Writes the tables and sections into the pages."""
+    """Writes the tables into the pages."""
     updates = {
         ROOT / PAGE: partial(updated, root=ROOT),
         ROOT / PAPER_PAGE: partial(updated_paper_page, root=ROOT),
-        **{
-            DOCS / name: partial(generated_sections.updated, name=name)
-            for name in generated_sections.SECTIONS
-        },
     }
     for path, update in updates.items():
         write_text(path, update(path.read_text(encoding="utf-8")))
