@@ -83,7 +83,7 @@ def draccus_parser(configuration):
     return ArgumentParser(configuration)
 
 
-def parse_lerobot(command: str, arguments: list[str]) -> None:
+def parse_lerobot(command: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Parses a command's configuration with draccus, as LeRobot does, but reads no checkpoint."""
     from lerobot.configs import PreTrainedConfig
 
@@ -102,24 +102,25 @@ def parse_lerobot(command: str, arguments: list[str]) -> None:
     arguments = [word for word in arguments if not word.startswith("--config_path=")]
     if "--resume=true" in arguments:
         arguments.append("--dataset.repo_id=USER/NAME")
+    # Some configurations look for the policy's path in the command line.
+    monkeypatch.setattr(sys, "argv", [command, *arguments])
     draccus_parser(configuration).parse_args(arguments)
 
 
 def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Checks that a command parses."""
     command, *arguments = words
-    monkeypatch.setattr(sys, "argv", words)
     if command == "deltaco":
         name, *arguments = arguments
         if name == "train":
-            parse_lerobot("lerobot-train", arguments)
+            parse_lerobot("lerobot-train", arguments, monkeypatch)
             return
         parsed = parse_deltaco(name, arguments)
         if name == "experiment":
             for experiment in parsed["names"]:
                 read_recipe(experiment, parsed.get("scale", "small"), parsed.get("set", ()))
     elif command in LEROBOT_CONFIGURATIONS and arguments != ["--help"]:
-        parse_lerobot(command, arguments)
+        parse_lerobot(command, arguments, monkeypatch)
     elif command == "make":
         makefile = (ROOT / "Makefile").read_text()
         for word in arguments:
