@@ -124,11 +124,11 @@ def state_at(location):
     return np.array([3 + 0.4 * x + 0.1 * y, -1 - 0.1 * x + 0.5 * y, 7.0], np.float32)
 
 
-def write_table(root, episodes, draw=draw_table, gripper=GRIPPER):
+def write_table(root, episodes, n_joints=3):
     """Writes episodes of `random_moves`: grasped in frame 3, released in frame 5."""
     features = {
-        "observation.image": _image_feature(draw(*episodes[0][:3]).shape),
-        "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "c"]},
+        "observation.image": _image_feature((TABLE_SIZE, TABLE_SIZE, 3)),
+        "observation.state": {"dtype": "float32", "shape": (n_joints,), "names": list("abcde"[:n_joints])},
         "action": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "gripper"]},
     }
     dataset = LeRobotDataset.create(TABLE_ID, 10, features, root=root, use_videos=False)
@@ -138,9 +138,9 @@ def write_table(root, episodes, draw=draw_table, gripper=GRIPPER):
             location = (home, start, start, start, end, end, home)[step]
             dataset.add_frame(
                 {
-                    "observation.image": draw(task, start if step < 4 else end, other),
-                    "observation.state": state_at(location),
-                    "action": np.array([*(location - home), gripper[step]], np.float32),
+                    "observation.image": draw_table(task, start if step < 4 else end, other),
+                    "observation.state": np.resize(state_at(location), n_joints),
+                    "action": np.array([*(location - home), GRIPPER[step]], np.float32),
                     "task": task,
                 }
             )
