@@ -243,9 +243,9 @@ def test_one_episode_demonstrates_every_instruction(run):
     policy = load_policy(find_checkpoints(run)[-1].folder, ["--demo_episode=13"])
     found = outcomes_of(policy, short_plan("4,14", trials=1))
     assert [each.demonstration_episodes for each in found] == [[13], [13]]
+    policy = load_policy(find_checkpoints(run)[-1].folder, ["--demo_episode=99"])
     with pytest.raises(ValueError, match="`demo_episode` is 99, which is not among the demonstrations"):
-        load = load_policy(find_checkpoints(run)[-1].folder, ["--demo_episode=99"])
-        outcomes_of(load, short_plan("4", trials=1))
+        outcomes_of(policy, short_plan("4", trials=1))
 
 
 @pytest.mark.parametrize("changed", ["demonstration", "instruction"])
