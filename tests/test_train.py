@@ -1,7 +1,9 @@
 """`deltaco train`: LeRobot's loop over frames in memory, from the command line to the checkpoints."""
 
 import json
+import os
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -115,6 +117,38 @@ def test_an_epoch_has_every_frame_once_in_an_order_of_its_own(train, seen):
     assert indices[:3] != indices[3:]
     for epoch in (indices[:3], indices[3:]):
         assert len(set(sum(epoch, []))) == 120
+
+
+@pytest.mark.parametrize(("policy", "in_memory"), [("deltaco", False), ("deltaco_match", True)])
+def test_a_training_evaluates_itself(train, policy, in_memory, capfd):
+    options = {**POLICIES[policy], "env.type": "deltaco", "env.task": "4", "env.scene.episode_length": 2}
+    train({**options, "eval.n_episodes": 1, "eval.batch_size": 1, "env_eval_freq": 2}, in_memory=in_memory)
+    assert "".join(capfd.readouterr()).count("'pc_success': 0.0") >= 2
+
+
+@pytest.mark.slow
+def test_two_processes_train_alike_from_the_disk_and_from_memory(root, tmp_path):
+    """Both end with the same weights, by gloo on a CPU, and other ones than a process alone."""
+    # The one-hot policy needs no language encoder.
+    options = {**DELTACO, "policy.method": "one_hot", "policy.tasks_per_batch": 0}
+    options |= {"policy.device": "cpu", "dataset.repo_id": "test/small", "dataset.root": root, "batch_size": 6}
+    options |= {"steps": 3, "save_freq": 3, "num_workers": 0}
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    programs = {
+        "disk": [*launch, "-m", "lerobot.scripts.lerobot_train"],
+        "memory": [*launch, "-m", "lerobot_deltaco.cli", "train"],
+        "alone": ["-m", "lerobot_deltaco.cli", "train"],
+    }
+    for name, words in programs.items():
+        arguments = [f"--{key}={value}" for key, value in {**options, "output_dir": tmp_path / name}.items()]
+        environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo"}
+        result = subprocess.run(
+            [sys.executable, *words, *arguments], env=environment, capture_output=True, text=True
+        )
+        assert result.returncode == 0, result.stderr[-3000:]
+    disk, memory, alone = (state_of(tmp_path / name / "checkpoints", 3) for name in programs)
+    assert_same(disk, memory)
+    assert any(not torch.equal(alone[name], tensor) for name, tensor in memory.items())
 
 
 # What is trained on
