@@ -29,7 +29,7 @@ demo: $(INSTALLED) ## Collect, train and evaluate, in 8 minutes or make demo MIN
 	$(BIN)/deltaco demo --minutes $(MINUTES)
 
 play: $(INSTALLED) ## Play with the trained policy in the browser: http://127.0.0.1:7860
-	$(BIN)/deltaco-play $(ARGS)
+	$(BIN)/deltaco play $(ARGS)
 
 test: $(INSTALLED) ## Run the default tests: a few minutes, no internet, no GPU
 	$(BIN)/python -m pytest $(ARGS)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gym_deltaco.tasks import COLORS, OBJECTS, SCENARIOS, SHAPES, TASK_SETS, TASKS, get_task
-from lerobot_deltaco.reporting.page_tables import replaced
+from lerobot_deltaco.leaderboard import replace_section
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = "PickPlaceEnv"
@@ -42,10 +42,12 @@ def updated(page: str, name: str) -> str:
         name: Its name, one of `SECTIONS`.
 
     Raises:
-        PageTableError: The page has no place for one of them.
+        ValueError: The page has no place for one of them.
     """
     for section, make in SECTIONS[name].items():
-        page = replaced(page, f"<!-- From the code: {section}. -->", f"<!-- End of {section}. -->", make())
+        page = replace_section(
+            page, f"<!-- From the code: {section}. -->", f"<!-- End of {section}. -->", make()
+        )
     return page
 
 

@@ -309,6 +309,35 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         return policy_card(self, dataset_repo_id, license, tags, cfg, dataset_meta)
 
 
+def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) -> Tensor:
+    """Returns one-hot vectors of tasks, (batch, known tasks).
+
+    Raises:
+        ValueError: A task is not known.
+    """
+    unknown = next((task for task in tasks if task not in known), None)
+    if unknown is not None:
+        raise ValueError(
+            f"This one-hot policy does not know the task {unknown!r}. It knows the {len(known)} tasks of its "
+            f"training dataset, such as {known[0]!r}."
+        )
+    index = {task: n for n, task in enumerate(known)}
+    return F.one_hot(torch.tensor([index[task] for task in tasks], device=device), len(known)).float()
+
+
+def known_tasks(meta: LeRobotDatasetMetadata | None) -> list[str]:
+    """Returns the task strings of the training dataset, which a one-hot policy knows.
+
+    Raises:
+        ValueError: There are no metadata.
+    """
+    if meta is None:
+        raise ValueError(
+            "A one-hot policy knows the tasks of its dataset. Pass the metadata as `dataset_meta`."
+        )
+    return list(meta.tasks.index)
+
+
 def _read_paraphrases(config: TaskConditionedConfig) -> Paraphrases | None:
     """Reads the sentences that training draws from, by task string."""
     if config.paraphrases is None:

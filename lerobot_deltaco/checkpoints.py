@@ -78,10 +78,9 @@ def _read_checkpoint(folder: Path) -> Checkpoint:
         if (folder / TRAIN_CONFIG).is_file():
             run = json.loads((folder / TRAIN_CONFIG).read_text(encoding="utf-8"))
         images = [item["shape"] for item in policy["input_features"].values() if item["type"] == "VISUAL"]
-        parent = folder.resolve().parent.name
         return Checkpoint(
             folder,
-            int(parent) if parent.isdecimal() else int(run.get("steps", 0)),
+            _step(folder),
             run.get("job_name") or folder.resolve().name,
             run.get("seed") or policy.get("seed") or 0,
             policy["type"],
@@ -89,6 +88,17 @@ def _read_checkpoint(folder: Path) -> Checkpoint:
         )
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise ValueError(f"The configuration of the policy in {folder} cannot be read: {error!r}.") from error
+
+
+def _step(folder: Path) -> int:
+    """Returns the training step of a policy: of its folder in a run, or of its weights; else 0."""
+    from safetensors import safe_open
+
+    parent = folder.resolve().parent.name
+    if parent.isdecimal():
+        return int(parent)
+    with safe_open(folder / WEIGHTS, framework="numpy") as file:
+        return int(file.get_tensor("step")) if "step" in file.keys() else 0  # noqa: SIM118
 
 
 class LoadedPolicy(NamedTuple):

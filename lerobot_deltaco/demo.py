@@ -27,10 +27,12 @@ import numpy as np
 import pandas as pd
 
 from gym_deltaco.atomic_files import write_json, write_text
+from gym_deltaco.tasks import get_task
 from lerobot_deltaco import experiments
 from lerobot_deltaco.experiments import Run, available_cores, last_checkpoint, last_step, read_run_records
 from lerobot_deltaco.recipes import read_recipe
 from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord
+from lerobot_deltaco.statistics import followed, success_interval
 
 Minutes = Literal[8, 25]
 
@@ -67,6 +69,7 @@ LONGER = 77.0  # the recipe of this demo in full, three seeds
 SCENE_TASK, SCENE_TRIAL = 25, 2
 DEMONSTRATION_TASKS = MappingProxyType({"the gray ring": (25, 1), "the yellow lampshade": (29, 2)})
 SENTENCES = ("Put it in green bin.", "Put it in red bin.")  # containers 0 and 1 of the scene
+VIDEO_SIZE = 256  # px
 
 CALIBRATION_SIZE, CALIBRATION_REPEATS = 1024, 20
 STEP_NAMES = MappingProxyType(
@@ -220,27 +223,15 @@ def _record(run: Run, plan: EvaluationPlan) -> EvaluationRecord:
     )
 
 
-# MERGE: the two functions below are to call the statistics of the report.
-
-
 def _rate(record: EvaluationRecord) -> tuple[float, float, float]:
     """Returns the success rate and its 95 % interval by bootstrap over tasks, in %."""
-    rates = record.episodes.groupby("task_id")["success"].mean().to_numpy()
-    draws = np.random.default_rng(0).choice(rates, (10_000, len(rates))).mean(axis=1)
-    low, high = np.quantile(draws, (0.025, 0.975))
-    return 100 * float(rates.mean()), 100 * float(low), 100 * float(high)
+    rate, low, high = success_interval(record.episodes)
+    return 100 * rate, 100 * low, 100 * high
 
 
 def _followed(record: EvaluationRecord) -> list[dict[str, Any]]:
-    """Counts what behavior followed where demonstration and instruction ask for different things.
-
-    Returns:
-        A row for the object and one for the container: "aspect", the numbers of episodes that followed the
-        "demonstration", the "instruction" and "neither", and of all "episodes".
-    """
-    from lerobot_deltaco.statistics import followed
-
-    return followed(record)
+    """Counts which input behavior followed, of the object and of the container."""
+    return followed([record]).to_dict("records")
 
 
 # The scene with two demonstrations and two sentences
@@ -270,17 +261,20 @@ def record_episode(
     Returns:
         Container of each of the three objects at the end: 0 green, 1 red, -1 none.
     """
-    from lerobot_deltaco import look  # MERGE: the only call of `look`
+    # Only here, since LeRobot takes seconds to import.
+    from lerobot_deltaco.pictures import demonstration_ends, draw_found, write_video
+    from lerobot_deltaco.recording import benchmark_scene, load_conditioned
+    from lerobot_deltaco.recording import record_episode as record
 
-    return look.record_episode(
-        checkpoint,
-        task_id=task_id,
-        seed=seed,
-        demonstration_task=demonstration_task,
-        instruction=instruction,
-        video=video,
-        maps=maps,
-    )
+    loaded = load_conditioned(checkpoint)
+    bank = loaded.policy.demonstrations
+    demonstrations = bank.of_task(get_task(demonstration_task).instruction)[:1]
+    scene = benchmark_scene(loaded.policy.config)
+    recording = record(loaded, task_id, seed, instruction, demonstrations, scene, VIDEO_SIZE)
+    assert recording.found is not None
+    write_video(recording.frames, video)
+    draw_found(recording.frames[0], demonstration_ends(demonstrations[0]), recording.found).save(maps)
+    return recording.info["object_containers"].tolist()
 
 
 def _record_scene(run: Run) -> None:

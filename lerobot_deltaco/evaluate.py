@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import multiprocessing
-import random
 import signal
 import time
 import warnings
@@ -22,7 +21,6 @@ import draccus
 import numpy as np
 import pandas as pd
 import torch
-from gymnasium.utils import seeding
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.utils import preprocess_observation
 from lerobot.utils.constants import HF_LEROBOT_HOME
@@ -32,16 +30,15 @@ from tqdm import tqdm
 
 from gym_deltaco import ENV_ID
 from gym_deltaco.env import PickPlaceEnv
-from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene_config import SceneConfig
-from gym_deltaco.tasks import Task, get_task
+from gym_deltaco.tasks import get_task
 from lerobot_deltaco.base_config import SOURCES
 from lerobot_deltaco.base_policy import TaskConditionedPolicy
 from lerobot_deltaco.checkpoints import Checkpoint, LoadedPolicy, find_checkpoints, load_policy
 from lerobot_deltaco.demonstrations import Demonstration, DemonstrationBank
+from lerobot_deltaco.episodes import Episode, draw_episodes
 from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.optimization import keep_freed_memory
-from lerobot_deltaco.paraphrases import choose_instructions
 from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord, read_records, write_records
 
 # Most episodes that run at the same time. A policy's step costs little more for 8 than for 2, and each
@@ -59,24 +56,6 @@ _NOT_RECORDED = (
     "demo_episodes",
     *SOURCES,
 )
-
-
-class Episode(NamedTuple):
-    """An episode before it is run.
-
-    Attributes:
-        task_id: Index of the scene's task.
-        trial: Number of the episode among those of its task, from 0.
-        seed: Seed of the environment's reset.
-        instruction: Instruction that the policy receives; empty without one.
-        demonstration_task: Index of the task whose demonstrations the policy receives; -1 without any.
-    """
-
-    task_id: int
-    trial: int
-    seed: int
-    instruction: str
-    demonstration_task: int
 
 
 class Outcome(NamedTuple):
@@ -388,76 +367,10 @@ def _row(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-# The episodes of an evaluation
-
-
-def draw_episodes(plan: EvaluationPlan, bank: DemonstrationBank | None = None) -> list[Episode]:
-    """Draws the episodes of an evaluation: the first trial of each task, then the second ones, and so on.
-
-    Args:
-        plan: Plan of the evaluation.
-        bank: Demonstrations that the policy receives; None if it takes none.
-
-    Raises:
-        ValueError: There is no other task for a counterfactual demonstration or instruction.
-    """
-    tasks = [get_task(task_id) for task_id in plan.task_ids]
-    sentences = choose_instructions(plan.task_ids, plan.paraphrases, plan.paraphrases_split, plan.instruction)
-    candidates = tasks
-    if plan.counterfactual == "demonstration" and bank is not None:
-        candidates = [task for task in tasks if task.instruction in bank.rows]
-    episodes = []
-    for trial in range(plan.trials):
-        for task in tasks:
-            seed = plan.scene_seed(task.index, trial)
-            own = (task.instruction,) if sentences is None else sentences[task.index]
-            instruction, shown = own[trial % len(own)], task.index if bank is not None else -1
-            if plan.counterfactual != "none":
-                other = _counterfactual_task(candidates, plan.scene, task, seed)
-                if plan.counterfactual == "demonstration":
-                    shown = other.index
-                else:
-                    instruction = other.instruction
-            if plan.without == "instruction":
-                instruction = ""
-            elif plan.without == "demonstration":
-                shown = -1
-            episodes.append(Episode(task.index, trial, seed, instruction, shown))
-    return episodes
-
-
 def _batches(episodes: Sequence[Episode]) -> list[list[Episode]]:
     """Splits episodes into batches that run at the same time, in their order."""
     size = min(_MAX_BATCH, math.ceil(len(episodes) / _MIN_BATCHES))
     return [list(episodes[start : start + size]) for start in range(0, len(episodes), size)]
-
-
-def _counterfactual_task(candidates: Sequence[Task], scene: SceneConfig, task: Task, seed: int) -> Task:
-    """Returns another task whose demonstration or instruction fits a scene.
-
-    If there is one, it asks for another object that stands there, and for the other container; else, at least
-    for the other container.
-
-    Raises:
-        ValueError: There is no other task.
-    """
-    others = [other for other in candidates if other.index != task.index]
-    if not others:
-        raise ValueError(
-            "A counterfactual evaluation needs at least two tasks that the policy can perform. Evaluate more "
-            "tasks, and give demonstrations of them."
-        )
-    layout = sample_layout(task, scene, seeding.np_random(seed)[0])
-
-    def fits(other: Task) -> tuple[bool, bool]:
-        objects = [n for n, item in enumerate(layout.objects) if other.describes(item.label)]
-        containers = [n for n, item in enumerate(layout.containers) if item.satisfies(other.container)]
-        is_other_container = containers == [1 - layout.target_container]
-        return is_other_container, len(objects) == 1 and objects != [layout.target_object]
-
-    ranked = [(fits(other), other) for other in others]
-    best = max(rank for rank, _ in ranked)
-    return random.Random(seed).choice([other for rank, other in ranked if rank == best])
 
 
 def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | None:

@@ -12,7 +12,7 @@ One file holds any number of evaluations. A row is an episode:
     demonstration_episodes  list     episodes of the demonstrations in their dataset
     demonstrated_objects    list     indices of the objects that they move
     grasped_object          int8     number of the object that the gripper held last, 0..2; -1 for none
-    object_containers       list     container of each of the objects at the end: 0 green, 1 red, -1 none
+    object_containers       list     container of each of the three objects at the end: 0 green, 1 red, or -1
     right_object            bool     whether the grasped object is the target
     right_container         bool     whether an object lies in the target container, and none in the other one
 
@@ -27,6 +27,7 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -300,27 +301,32 @@ def scene_columns(record: EvaluationRecord) -> pd.DataFrame:
     """Computes what follows from the task, the trial and the plan of each episode, without a simulator.
 
     Returns:
-        A row for each episode: `seed`; `template`, the task's instruction; `objects`, the indices of the
-        three objects; `container_quadrants`, (i, j) of the green and the red container; `target_object` and
+        A row for each episode: `seed`; `template`, the task's instruction; `objects`, indices of the three
+        objects; `container_quadrants`, (i, j) of the green and the red container; `target_object` and
         `target_container`, their numbers in the scene.
     """
     import pandas as pd
+
+    rows = [
+        _scene(int(task_id), record.plan.scene_seed(int(task_id), int(trial)), record.plan.scene)
+        for task_id, trial in zip(record.episodes["task_id"], record.episodes["trial"], strict=True)
+    ]
+    return pd.DataFrame(rows, index=record.episodes.index)
+
+
+@cache  # Many evaluations have the same scenes, of which each takes a millisecond.
+def _scene(task_id: int, seed: int, scene: SceneConfig) -> dict[str, Any]:
     from gymnasium.utils import seeding
 
     from gym_deltaco.layout import sample_layout
 
-    rows = []
-    for task_id, trial in zip(record.episodes["task_id"], record.episodes["trial"], strict=True):
-        task, seed = get_task(int(task_id)), record.plan.scene_seed(int(task_id), int(trial))
-        layout = sample_layout(task, record.plan.scene, seeding.np_random(seed)[0])
-        rows.append(
-            {
-                "seed": seed,
-                "template": task.instruction,
-                "objects": [item.label.index for item in layout.objects],
-                "container_quadrants": [list(item.quadrant) for item in layout.containers],
-                "target_object": layout.target_object,
-                "target_container": layout.target_container,
-            }
-        )
-    return pd.DataFrame(rows, index=record.episodes.index)
+    task = get_task(task_id)
+    layout = sample_layout(task, scene, seeding.np_random(seed)[0])
+    return {
+        "seed": seed,
+        "template": task.instruction,
+        "objects": [item.label.index for item in layout.objects],
+        "container_quadrants": [list(item.quadrant) for item in layout.containers],
+        "target_object": layout.target_object,
+        "target_container": layout.target_container,
+    }

@@ -20,7 +20,7 @@ from lerobot.utils.constants import ACTION
 from numpy.typing import NDArray
 
 from lerobot_deltaco.base_config import TaskConditionedConfig
-from lerobot_deltaco.deltaco_match.keyframes import release_frames
+from lerobot_deltaco.deltaco_match.keyframes import grasp_frames
 from lerobot_deltaco.demonstrations import check_dataset_folder
 from lerobot_deltaco.frames import FramesInMemory
 from lerobot_deltaco.optimization import keep_freed_memory
@@ -128,9 +128,9 @@ def _until_release(frames: FramesInMemory, policy: TaskConditionedConfig) -> NDA
         return use
     spans = list(frames.spans.values())
     gripper = policy.gripper_opening(frames.columns[ACTION])
-    for release, (_, last) in zip(release_frames(gripper, spans), spans, strict=True):
-        if release is not None:
-            use[release + 1 + n_after : last + 1] = False
+    for keyframes, (_, last) in zip(grasp_frames(gripper, spans), spans, strict=True):
+        if keyframes is not None:
+            use[keyframes[1] + 1 + n_after : last + 1] = False
     return use
 
 

@@ -30,7 +30,8 @@ from lerobot_deltaco.base_policy import TaskConditionedPolicy
 from lerobot_deltaco.checkpoints import find_checkpoints, load_policy
 from lerobot_deltaco.collect import CollectionPlan, collect
 from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.evaluate import Evaluation, draw_episodes, evaluate_checkpoints, run_evaluation
+from lerobot_deltaco.episodes import draw_episodes
+from lerobot_deltaco.evaluate import Evaluation, evaluate_checkpoints, run_evaluation
 from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.records import EvaluationPlan, read_records, scene_columns
 

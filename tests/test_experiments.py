@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import stand_ins  # noqa: F401  (MERGE: delete this line)
 
 from lerobot_deltaco import experiments, records
 from lerobot_deltaco.checkpoints import find_checkpoints
@@ -101,7 +100,7 @@ def make_record(experiment, seed, step, plan):
         *(experiment, "deltaco", seed, step, plan),
         wording="templates",
         policy={},
-        versions={},
+        versions={"benchmark": "gym_deltaco/PickPlace-v0"},
         command="",
         seconds=1.0,
         weights=None,

@@ -65,7 +65,7 @@ def test_imports_go_one_way(files, forbidden):
             assert parents.isdisjoint(forbidden), f"{path} imports {name}"
 
 
-@pytest.mark.parametrize("name", ["records", "collect", "paraphrases", "report"])
+@pytest.mark.parametrize("name", ["records", "collect", "paraphrases", "report", "leaderboard"])
 def test_what_needs_no_policy_imports_neither_torch_nor_lerobot(name):
     seen, todo = set(), [f"lerobot_deltaco.{name}"]
     files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in LEROBOT_FILES}
@@ -83,26 +83,41 @@ def test_lerobot_finds_the_distribution():
     assert PROJECT["scripts"] == {"deltaco": "lerobot_deltaco.cli:main"}
 
 
+# One process imports LeRobot, which takes seconds, and nothing of this project; each command runs in a fork.
 LEROBOT = """
 import os, sys
+
 os.dup2(1, 2)  # errors stand among the output
 from lerobot.scripts import lerobot_train
-if len(sys.argv) > 2:
-    sys.modules[sys.argv.pop()] = None
-lerobot_train.main()
+
+for words, missing in ((["--help"], None), (["--env.type=deltaco"], "lerobot_deltaco.optimization")):
+    if os.fork():
+        os.wait()
+        print("END", flush=True)
+        continue
+    if missing is not None:
+        sys.modules[missing] = None
+    sys.argv = ["lerobot-train", *words]
+    lerobot_train.main()
+    sys.exit()
 """
 
 
-def test_lerobots_help_lists_the_policies_and_the_environment():
-    output = run_python(LEROBOT, "--help").stdout
+@pytest.fixture(scope="module")
+def lerobot_outputs():
+    """What `lerobot-train --help` prints, and what it does where a module is missing."""
+    return run_python(LEROBOT).stdout.split("\nEND\n")
+
+
+def test_lerobots_help_lists_the_policies_and_the_environment(lerobot_outputs):
+    output = lerobot_outputs[0]
     for option, names in (("--env.type", {"deltaco"}), ("--policy.type", {"deltaco", "deltaco_match"})):
         choices = output[output.index(option) :].split("{", 1)[1].split("}")[0]
         assert names <= set(choices.replace("\n", "").replace(" ", "").split(","))
 
 
-def test_a_broken_import_ends_in_one_clear_sentence():
-    result = run_python(LEROBOT, "--env.type=deltaco", "lerobot_deltaco.optimization")
-    last_line = result.stdout.strip().splitlines()[-1]
+def test_a_broken_import_ends_in_one_clear_sentence(lerobot_outputs):
+    last_line = lerobot_outputs[1].strip().splitlines()[-1]
     assert "lerobot_policy_deltaco could not be imported, so LeRobot does not know its types" in last_line
     assert "lerobot_deltaco.optimization" in last_line
 

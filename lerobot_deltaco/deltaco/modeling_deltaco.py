@@ -15,12 +15,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
+from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy, known_tasks, one_hot
 from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.deltaco.demo_encoders import (
     AttentionEncoder,
@@ -360,35 +359,6 @@ class DeltacoPolicy(TaskConditionedPolicy):
         if self.config.state_dim:
             parts.append(batch[OBS_STATE])
         return torch.cat(parts, dim=-1) if parts else None
-
-
-def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) -> Tensor:
-    """Returns one-hot vectors of tasks, (batch, known tasks).
-
-    Raises:
-        ValueError: A task is not known.
-    """
-    unknown = next((task for task in tasks if task not in known), None)
-    if unknown is not None:
-        raise ValueError(
-            f"This one-hot policy does not know the task {unknown!r}. It knows the {len(known)} tasks of its "
-            f"training dataset, such as {known[0]!r}."
-        )
-    index = {task: n for n, task in enumerate(known)}
-    return F.one_hot(torch.tensor([index[task] for task in tasks], device=device), len(known)).float()
-
-
-def known_tasks(meta: LeRobotDatasetMetadata | None) -> list[str]:
-    """Returns the task strings of the training dataset, which a one-hot policy knows.
-
-    Raises:
-        ValueError: There are no metadata.
-    """
-    if meta is None:
-        raise ValueError(
-            "A one-hot policy knows the tasks of its dataset. Pass the metadata as `dataset_meta`."
-        )
-    return list(meta.tasks.index)
 
 
 def _make_network(config: DeltacoConfig) -> PolicyNetwork:

@@ -1,4 +1,8 @@
-"""Keyframes of an episode: where the gripper closes around an object, and where it opens again."""
+"""Keyframes of an episode: where the gripper closes around an object, and where it opens again.
+
+Each episode is judged by its own course: a gripper may rest open or closed, and open by different amounts. A
+grasp is a valley of the course between two openings; a rest with a closed gripper at either end is none.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,17 @@ import logging
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
+_OUTLIERS = 0.02  # fraction of an episode's frames at either end of the range that do not count
+_MIN_RANGE = 0.2  # of an episode, as a fraction of the usual range: less is a tremble
+_MIN_DEPTH = 0.25  # of a valley below the openings at its sides, as a fraction of the episode's range
+_CLOSED = 0.2  # fraction of the way up from the valley to an opening below which the gripper counts as closed
 _APPROACH_FRAMES = 2  # before the gripper closes
 _GRIPPER_CORRELATION = 0.8  # of a state with the gripper's command, above which it is the gripper's
 
@@ -36,28 +46,19 @@ class Keyframes(NamedTuple):
 
 
 def find_keyframes(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Keyframes:
-    """Finds the last closing of the gripper that is followed by an opening, and that opening.
-
-    A gripper counts as closed where its command is below the middle of the commands' range. If an object
-    slips and is grasped again, the last grasp counts.
+    """Finds the grasp and the release of episodes. If an object slips, the last grasp counts.
 
     Args:
         states: Robot states of all frames, (frames, state).
         gripper: Commands to the gripper in all frames, greater for more open, (frames,).
         spans: First and last frame of each episode.
     """
-    closed = _is_closed(gripper)
     found, frames = [], []
-    for span in spans:
-        opening = closing = _last_opening(closed, span)
-        found.append(opening is not None)
-        if opening is None or closing is None:
-            frames.append((span[0], span[0], span[0]))
-            continue
-        while closing > span[0] and closed[closing - 1]:
-            closing -= 1
+    for (first, _), keyframes in zip(spans, grasp_frames(gripper, spans), strict=True):
+        found.append(keyframes is not None)
+        grasp, release = (first, first) if keyframes is None else keyframes
         # One step later, the command to close has been carried out.
-        frames.append((min(closing + 1, opening), opening, max(closing - _APPROACH_FRAMES, span[0])))
+        frames.append((min(grasp + 1, release), release, max(grasp - _APPROACH_FRAMES, first)))
     if not all(found):
         logger.warning(
             "The gripper does not close and open again in %d of %d episodes; they are not trained on.",
@@ -70,28 +71,78 @@ def find_keyframes(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, i
     return Keyframes(at[:, :2], at[:, 2], is_found)
 
 
-def release_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[int | None]:
-    """Returns the frame of each episode in which the gripper opens for the last time; None without any."""
-    closed = _is_closed(gripper)
-    return [_last_opening(closed, span) for span in spans]
+def grasp_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[tuple[int, int] | None]:
+    """Finds the frames in which the gripper has closed around an object, and in which it opens again.
+
+    Args:
+        gripper: Commands to the gripper in all frames, greater for more open, (frames,).
+        spans: First and last frame of each episode.
+
+    Returns:
+        Frame of the grasp and of the release of each episode; None where there is no grasp.
+    """
+    commands = gripper.cpu().double().numpy()
+    courses = [commands[first : last + 1] for first, last in spans]
+    ranges = [np.diff(np.quantile(course, [_OUTLIERS, 1 - _OUTLIERS])).item() for course in courses]
+    usual = float(np.median(ranges))
+    found = [
+        _last_valley(course) if size > _MIN_RANGE * usual else None
+        for course, size in zip(courses, ranges, strict=True)
+    ]
+    return [
+        None if valley is None else (first + valley[0], first + valley[1])
+        for (first, _), valley in zip(spans, found, strict=True)
+    ]
+
+
+def _last_valley(course: NDArray[np.float64]) -> tuple[int, int] | None:
+    """Returns the first frame of the last valley between two openings, and the first frame after it."""
+    low, high = np.quantile(course, [_OUTLIERS, 1 - _OUTLIERS])
+    course, depth = np.clip(course, low, high), _MIN_DEPTH * (high - low)
+    # Backwards: from the last opening down into the valley, and up to the opening before it.
+    after, bottom, level = course[-1], 0, None
+    for frame in range(len(course) - 1, -1, -1):
+        if level is None and course[frame] > after:
+            after = course[frame]
+        elif (level is None and after - course[frame] >= depth > 0) or (
+            level is not None and course[frame] < level
+        ):
+            level, bottom = course[frame], frame
+        elif level is not None and course[frame] - level >= depth:
+            break
+    else:
+        return None
+    before = _opening(course[frame::-1], level + depth / 2)
+    # The opening that ends the valley may be another one than the last.
+    rise = bottom + int(np.argmax(course[bottom:] - level >= depth))
+    after = _opening(course[rise:], level + depth / 2)
+    grasp = frame + int(np.argmax(course[frame:] <= level + _CLOSED * (before - level)))
+    is_closed = course[: rise + 1] <= level + _CLOSED * (after - level)
+    return grasp, int(np.flatnonzero(is_closed)[-1]) + 1
+
+
+def _opening(course: NDArray[np.float64], least: float) -> float:
+    """Returns the greatest value before a course falls to a level for the first time."""
+    ends = np.flatnonzero(course <= least)
+    return float(course[: ends[0] if len(ends) else None].max())
 
 
 def warn_if_inverted(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> None:
-    """Warns if most episodes begin with a closed gripper: then grasps may be taken for releases.
+    """Warns if more episodes have a grasp when low and high are exchanged.
 
     Args:
         gripper: Commands to the gripper in all frames, greater for more open, (frames,).
         spans: First and last frame of each episode.
     """
-    closed = _is_closed(gripper)
-    n_closed = sum(closed[first] for first, _ in spans)
-    if n_closed > len(spans) / 2:
+    n_found = sum(found is not None for found in grasp_frames(gripper, spans))
+    n_inverted = sum(found is not None for found in grasp_frames(-gripper, spans))
+    if n_inverted > n_found:
         logger.warning(
-            "The gripper is closed at the beginning of %d of %d episodes. If these values mean that it is "
-            "open, grasps and releases are mistaken for each other: set --policy.gripper_closed to the other "
-            "of low and high.",
-            n_closed,
+            "%d of %d episodes have a grasp, and %d would have one if the gripper's values meant the "
+            "opposite. Then set --policy.gripper_closed to the other of low and high.",
+            n_found,
             len(spans),
+            n_inverted,
         )
 
 
@@ -111,15 +162,3 @@ def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, 
     covariance = (after * command).mean(dim=0)
     scale = after.square().mean(dim=0).sqrt() * command.square().mean().sqrt()
     return covariance.abs() > _GRIPPER_CORRELATION * scale.clamp_min(1e-12)
-
-
-def _is_closed(gripper: Tensor) -> list[bool]:
-    return (gripper < (gripper.min() + gripper.max()) / 2).tolist()
-
-
-def _last_opening(closed: Sequence[bool], span: tuple[int, int]) -> int | None:
-    first, last = span
-    for frame in range(last, first, -1):
-        if closed[frame - 1] and not closed[frame]:
-            return frame
-    return None

@@ -30,8 +30,7 @@ from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_tra
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
-from lerobot_deltaco.deltaco.modeling_deltaco import known_tasks, one_hot
+from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy, known_tasks, one_hot
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.correspondence import (
     DESCRIPTOR_DIM,

@@ -1,0 +1,176 @@
+"""Episodes of the benchmark, recorded to be shown: a policy's, and the expert's demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.expert import expert_episode
+from gym_deltaco.layout import Layout
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.seeding import episode_seed
+from gym_deltaco.tasks import Task
+from lerobot_deltaco.base_config import TaskConditionedConfig
+from lerobot_deltaco.base_policy import TaskConditionedPolicy
+from lerobot_deltaco.checkpoints import LoadedPolicy, find_checkpoints, load_policy
+from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
+from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
+from lerobot_deltaco.demonstrations import Demonstration, kept_frames, resize_images
+from lerobot_deltaco.episodes import Episode
+from lerobot_deltaco.evaluate import Simulators, run_episodes
+from lerobot_deltaco.lerobot_env import check_policy_fits
+
+_EXPERT_ATTEMPTS = 20
+
+
+class Recording(NamedTuple):
+    """A recorded episode of the benchmark.
+
+    Attributes:
+        frames: Rendered images before the first step and after each, (render_size, render_size, 3).
+        observed: First image that the policy received, (H, W, 3).
+        found: Locations that the policy found in it; None for policies that find none.
+        info: Info of the environment after the last step.
+        layout: Objects and containers of the scene.
+        placed: Pairs of an object and a container in which it has come to rest.
+    """
+
+    frames: list[NDArray[np.uint8]]
+    observed: NDArray[np.uint8]
+    found: Found | None
+    info: dict[str, Any]
+    layout: Layout
+    placed: frozenset[tuple[int, int]]
+
+
+def record_episode(
+    loaded: LoadedPolicy,
+    task_id: int,
+    seed: int,
+    instruction: str,
+    demonstrations: Sequence[Demonstration],
+    scene: SceneConfig = SceneConfig(),  # noqa: B008
+    render_size: int = 320,
+    on_step: Callable[[int], None] | None = None,
+    simulators: Simulators | None = None,
+) -> Recording:
+    """Runs an episode of the benchmark and records it.
+
+    Args:
+        loaded: The policy and its processors.
+        task_id: Index of the task that the scene is drawn for.
+        seed: Seed of the environment's reset.
+        instruction: Instruction that the policy receives; empty for none.
+        demonstrations: Demonstrations that the policy receives; empty for none.
+        scene: Settings of the scene.
+        render_size: Height and width of the frames, px.
+        on_step: Called with the number of steps that have been run.
+        simulators: Environments with the same scene and render size to use; None makes one.
+    """
+    frames: list[NDArray[np.uint8]] = []
+    first: dict[str, Any] = {}
+    placed: set[tuple[int, int]] = set()
+
+    def record(envs: Sequence[PickPlaceEnv], observations: Sequence[Any]) -> None:
+        env = envs[0]
+        if not first:
+            first.update(observed=observations[0]["pixels"], layout=env.scene.layout)
+        image = env.render()
+        assert image is not None
+        frames.append(image)
+        placed.update((n, env.scene.container_of(n)) for n in range(len(env.scene.bodies)))
+        if on_step is not None:
+            on_step(len(frames) - 1)
+
+    own = simulators or Simulators(scene, render_size)
+    try:
+        with torch.inference_mode():
+            episode = Episode(task_id, 0, seed, instruction, task_id if demonstrations else -1)
+            (info,) = run_episodes(loaded, own, [episode], [demonstrations], record)
+    finally:
+        if simulators is None:
+            own.close()
+    in_containers = frozenset(pair for pair in placed if pair[1] >= 0)
+    found = getattr(loaded.policy, "found", None)
+    return Recording(frames, first["observed"], found, info, first["layout"], in_containers)
+
+
+def record_demonstration(
+    config: TaskConditionedConfig, task: Task, number: int = 0, scene: SceneConfig | None = None
+) -> Demonstration:
+    """Records a demonstration of a task by the scripted expert.
+
+    Args:
+        config: Configuration of the policy that the demonstration is for.
+        task: The task.
+        number: Number of the demonstration, which draws its scene.
+        scene: Settings of the scene; None for the benchmark's with the policy's image size.
+
+    Raises:
+        RuntimeError: The expert has failed too often.
+    """
+    env = PickPlaceEnv(task.index, scene or benchmark_scene(config))
+    try:
+        for attempt in range(_EXPERT_ATTEMPTS):
+            seed = episode_seed(0, "validation", task.index, number, attempt)
+            steps = list(expert_episode(env, task.index, seed))
+            if steps[-1].info["is_success"]:
+                break
+        else:
+            raise RuntimeError(f"The expert failed {_EXPERT_ATTEMPTS} times at: {task.instruction}")
+    finally:
+        env.close()
+    images = np.stack([step.observation["pixels"] for step in steps])
+    frames = torch.from_numpy(images).permute(0, 3, 1, 2)
+    pick_state = None
+    if config.gripper_index is not None and config.state_dim:
+        states = torch.from_numpy(np.stack([step.observation["agent_pos"] for step in steps]))
+        gripper = config.gripper_opening(torch.from_numpy(np.stack([step.action for step in steps])))
+        pick_state = find_keyframes(states, gripper, [(0, len(steps) - 1)]).pick_states[0]
+    info = steps[-1].info
+    return Demonstration(
+        task.instruction,
+        resize_images(frames[kept_frames(0, len(frames) - 1, config.n_demo_frames)], config.image_size),
+        pick_state,
+        target_object=int(info["objects"][info["target_object"]]),
+    )
+
+
+def benchmark_scene(config: Any) -> SceneConfig:
+    """Returns the benchmark's scene with the image size that a policy was trained on.
+
+    Raises:
+        ValueError: The policy is not one for the benchmark.
+    """
+    sizes = [feature.shape[-1] for feature in config.image_features.values()]
+    scene = SceneConfig(image_size=sizes[0]) if sizes else SceneConfig()
+    check_policy_fits(config, scene)
+    return scene
+
+
+def load_conditioned(checkpoint: str | Path) -> LoadedPolicy:
+    """Loads a policy that takes a demonstration or an instruction.
+
+    Args:
+        checkpoint: Folder of a policy or of a training run, of which the last checkpoint is loaded; or id of
+            a repository on the Hugging Face Hub.
+
+    Raises:
+        ValueError: There is no checkpoint, or its policy is of another kind.
+    """
+    folder = Path(checkpoint)
+    if folder.exists() or len(folder.parts) != 2:
+        folder = find_checkpoints(folder)[-1].folder
+    loaded = load_policy(folder)
+    if not isinstance(loaded.policy, TaskConditionedPolicy):
+        raise ValueError(
+            f"{checkpoint} holds a policy of the type {loaded.policy.config.type!r}, which takes no "
+            "demonstrations. Name one of the type deltaco or deltaco_match."
+        )
+    return loaded

@@ -1,1 +1,0 @@
-"""Reports on evaluations: their statistics, tables, curves and notes."""

@@ -1,0 +1,163 @@
+"""Pictures, videos and the page of `deltaco look`."""
+
+import av
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from tiny_policy import load_tiny_policy, save_tiny_policy
+
+from gym_deltaco.env import ACTION_NAMES, STATE_NAMES, PickPlaceEnv
+from gym_deltaco.expert import expert_episode
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.tasks import OBJECTS, TASKS, get_task
+from lerobot_deltaco import look as room
+from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
+from lerobot_deltaco.look import DatasetSource, look
+from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_found, write_video
+from lerobot_deltaco.recording import load_conditioned, record_demonstration, record_episode
+
+
+def found_at(pick, place, by_demonstration=(True, True), size=24):
+    """Found locations with maps that peak there, at (column, row) of size x size."""
+    maps = torch.full((1, 2, size, size), -20.0)
+    for n, (column, row) in enumerate((pick, place)):
+        maps[0, n, row, column] = 20
+    locations = (torch.tensor([[pick, place]]) + 0.5) / size * 2 - 1
+    return Found(locations, torch.zeros(1), maps, maps.flatten(2).softmax(2).view_as(maps), by_demonstration)
+
+
+def closeness(image, color, x, y):
+    """How close a pixel is to a color, 0..1."""
+    return 1 - np.abs(np.asarray(image)[y, x].astype(float) - color).mean() / 255
+
+
+def test_maps_are_drawn_at_the_scenes_own_resolution():
+    scene = np.full((480, 640, 3), 128, np.uint8)
+    image = draw_found(scene, None, found_at((6, 18), (18, 6)))
+    assert image.size == (640, 480)
+    x, y = 640 * 6.5 / 24, 480 * 18.5 / 24
+    assert closeness(image, PICK_COLOR, int(x), int(y)) > closeness(image, PICK_COLOR, 600, 400) + 0.1
+    x, y = 640 * 18.5 / 24, 480 * 6.5 / 24
+    assert closeness(image, PLACE_COLOR, int(x), int(y)) > closeness(image, PLACE_COLOR, 40, 40) + 0.1
+    assert (np.asarray(image)[240, 320] == 128).all()
+
+
+def test_attention_is_drawn_only_where_the_demonstration_tells():
+    scene = np.full((320, 320, 3), 128, np.uint8)
+    ends = np.full((2, 48, 48, 3), 128, np.uint8)
+    image = np.asarray(draw_found(scene, ends, found_at((6, 18), (18, 6), (True, False))))
+    first, last = image[:150, :150], image[-150:, :150]
+    assert not (first == 128).all()
+    assert (last == 128).all()
+
+
+def test_a_video_is_one_that_browsers_play_and_its_end_stays(tmp_path):
+    frames = [np.full((65, 48, 3), 20 * n, np.uint8) for n in range(10)]
+    write_video(frames, tmp_path / "video.mp4", fps=8)
+    with av.open(str(tmp_path / "video.mp4")) as video:
+        stream = video.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert (stream.width, stream.height) == (48, 64)
+        images = [frame.to_ndarray(format="rgb24") for frame in video.decode(stream)]
+    assert len(images) == 10 + 8
+    assert abs(int(images[-1].mean()) - 180) < 5
+    assert [path.name for path in tmp_path.iterdir()] == ["video.mp4"]
+
+
+def test_an_episode_is_recorded(tmp_path):
+    loaded = load_tiny_policy(tmp_path)
+    scene = SceneConfig(episode_length=4)
+    demonstration = loaded.policy.demonstrations.of_task(TASKS[4].instruction)[0]
+    steps = []
+    recording = record_episode(
+        loaded, 4, 7, "Put it in the red bin.", [demonstration], scene, 64, on_step=steps.append
+    )
+    assert steps == [0, 1, 2, 3, 4]
+    assert [frame.shape for frame in recording.frames] == [(64, 64, 3)] * 5
+    assert recording.observed.shape == (48, 48, 3)
+    assert recording.found.locations.shape == (1, 2, 2)
+    env = PickPlaceEnv(4, scene)
+    observation, info = env.reset(seed=7)
+    assert (recording.observed == observation["pixels"]).all()
+    assert [item.label.index for item in recording.layout.objects] == info["objects"].tolist()
+
+
+def test_the_expert_records_a_demonstration_of_any_task(tmp_path):
+    config = load_tiny_policy(tmp_path).policy.config
+    for task_id in (0, 134, 299):
+        one, same, other = (record_demonstration(config, get_task(task_id), n) for n in (0, 0, 1))
+        assert one.task == TASKS[task_id].instruction
+        assert TASKS[task_id].describes(OBJECTS[one.target_object])
+        assert one.frames.shape == (2, 3, 48, 48)
+        assert one.pick_state.isfinite().all()
+        assert (one.frames == same.frames).all()
+        assert (one.frames != other.frames).any()
+
+
+def write_robot_dataset(root, task_ids, size=96):
+    """Episodes of the expert in scenes of the benchmark, as a dataset of any robot."""
+    features = {
+        "observation.image": {
+            "dtype": "image",
+            "shape": (size, size, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
+        "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": ACTION_NAMES},
+    }
+    dataset = LeRobotDataset.create("test/robot", 24, features, root=root, use_videos=False)
+    env = PickPlaceEnv(0, SceneConfig(image_size=size))
+    for seed, task_id in enumerate(task_ids):
+        for step in expert_episode(env, task_id, seed):
+            dataset.add_frame(
+                {
+                    "observation.image": step.observation["pixels"],
+                    "observation.state": step.observation["agent_pos"],
+                    "action": step.action,
+                    "task": TASKS[task_id].instruction,
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    env.close()
+
+
+def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeypatch):
+    write_robot_dataset(tmp_path / "data", [4, 4, 9])
+    folder = save_tiny_policy(tmp_path / "policy")
+    drawn = []
+    monkeypatch.setattr(room, "draw_found", lambda *args: drawn.append(args) or draw_found(*args))
+    page = look(str(folder), DatasetSource(root=tmp_path / "data"), 3, tmp_path / "out")
+    text = page.read_text()
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["index.html"]
+    assert text.count("data:image/jpeg;base64") == 3
+    # The first two demonstrate each other, the third itself; the scenes have the dataset's own size.
+    assert [text.count(f"by {who}") for who in ("episode 1", "episode 0", "itself")] == [1, 1, 1]
+    assert [args[0].shape for args in drawn] == [(96, 96, 3)] * 3
+    right = [bool((args[2].locations[0, 0] - args[4][0]).norm() < room.TOLERANCE) for args in drawn]
+    assert f"Episodes with the right pick location: <b>{sum(right)} of 3</b>" in text
+
+
+def test_without_a_dataset_episodes_of_the_benchmark_are_run(tmp_path):
+    page = look(str(save_tiny_policy(tmp_path / "policy")), episodes=2, out=tmp_path / "out")
+    text = page.read_text()
+    assert text.count("data:image/jpeg;base64") == text.count("data:video/mp4;base64") == 2
+    assert "of 2</b>" in text
+
+
+def test_what_does_not_fit_is_an_error_that_says_so(tmp_path):
+    folder = save_tiny_policy(tmp_path / "policy")
+    with pytest.raises(ValueError, match="`episodes` must be at least 1"):
+        look(str(folder), episodes=0)
+    with pytest.raises(ValueError, match="has no checkpoints"):
+        load_conditioned(tmp_path / "nothing")
+    features = {"observation.images.top": {"dtype": "image", "shape": (32, 32, 3), "names": ["h", "w", "c"]}}
+    features["action"] = {"dtype": "float32", "shape": (4,), "names": ACTION_NAMES}
+    other = LeRobotDataset.create("test/other", 24, features, root=tmp_path / "other", use_videos=False)
+    frame = {"observation.images.top": np.zeros((32, 32, 3), np.uint8), "action": np.zeros(4, np.float32)}
+    other.add_frame({**frame, "task": "wave"})
+    other.save_episode()
+    other.finalize()
+    with pytest.raises(ValueError, match=r"needs 'observation.image'.*observation.images.top"):
+        look(str(folder), DatasetSource(root=tmp_path / "other"), out=tmp_path / "out")

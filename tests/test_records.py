@@ -1,0 +1,133 @@
+"""Records of evaluations: what is read is what was written, and contradictions are refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import pytest
+from example_records import make_record
+
+from gym_deltaco import ENV_ID
+from gym_deltaco.scene_config import SceneConfig
+from lerobot_deltaco import records
+from lerobot_deltaco.records import EvaluationPlan, RecordError, read_records, scene_columns, write_records
+
+ROOT = Path(__file__).parents[1]
+
+
+def lists(episodes):
+    """Episodes with lists instead of arrays, which can be compared."""
+    return episodes.map(lambda value: list(value) if isinstance(value, np.ndarray | list) else value)
+
+
+def test_read_is_the_inverse_of_write(tmp_path):
+    scene = SceneConfig(ambiguity="object", adversarial_probability=0.25, image_size=64)
+    plan = {"scene": scene, "scene_set": 3, "seed": 7, "counterfactual": "instruction", "n_demonstrations": 2}
+    written = [
+        make_record(),
+        make_record("a/b", 3, 5, plan=plan, columns={"instruction": "put it there"}, weights="0123"),
+        make_record("a/b", 4, 5, plan={"without": "demonstration"}, columns={"demonstration_task": -1}),
+    ]
+    write_records(tmp_path / "new" / "some.parquet", written)
+    found = read_records(tmp_path / "new" / "some.parquet")
+    for before, after in zip(written, found, strict=True):
+        assert replace(after, episodes=None) == replace(before, episodes=None)
+        pd.testing.assert_frame_equal(lists(after.episodes), lists(before.episodes), check_dtype=False)
+        assert after.success_rate == before.success_rate == 0.5
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["some.parquet"]
+
+
+def test_a_folder_is_searched(tmp_path):
+    write_records(tmp_path / "run" / "evaluations" / "a.parquet", [make_record()])
+    write_records(tmp_path / "b.parquet", [make_record("b/c"), make_record("b/d")])
+    # A dataset's files are Parquet, too.
+    (tmp_path / "run" / "data").mkdir()
+    pd.DataFrame({"a": [1]}).to_parquet(tmp_path / "run" / "data" / "file.parquet")
+    names = sorted(record.experiment for record in read_records(tmp_path))
+    assert names == ["b/c", "b/d", "scenario_a/deltaco"]
+    assert len(read_records(tmp_path / "run", tmp_path / "b.parquet")) == 3
+
+
+CONTRADICTIONS = {
+    "tasks and trials of the plan": {"trial": 0},
+    "containers -1, 0 or 1 of three objects": {"object_containers": [[2, -1, -1]] * 12},
+    "a grasped object from -1 to 2": {"grasped_object": 3},
+    "a grasped object where it is the right one": {"grasped_object": -1},
+    "an object in a container where": {"object_containers": [[-1, -1, -1]] * 12},
+}
+
+
+@pytest.mark.parametrize("message", CONTRADICTIONS)
+def test_contradictions_are_refused(tmp_path, monkeypatch, message):
+    record = make_record(columns=CONTRADICTIONS[message])
+    with pytest.raises(RecordError, match=message):
+        write_records(tmp_path / "some.parquet", [make_record(), record])
+    assert not list(tmp_path.iterdir())
+    # As if another program had written it.
+    with monkeypatch.context() as patch:
+        patch.setattr(records, "_check", lambda record, source: None)
+        write_records(tmp_path / "some.parquet", [make_record(), record])
+    with pytest.raises(RecordError, match=message):
+        read_records(tmp_path / "some.parquet")
+
+
+def test_what_is_no_file_of_records_is_named(tmp_path):
+    pd.DataFrame({"task_id": [4]}).to_parquet(tmp_path / "other.parquet")
+    (tmp_path / "text.parquet").write_text("{}")
+    (tmp_path / "empty").mkdir()
+    for name, message in {
+        "other.parquet": "is not a file of evaluation records",
+        "text.parquet": "is not a file of evaluation records",
+        "missing.parquet": "is not a file of evaluation records",
+        "empty": "has no records of evaluations. `deltaco evaluate` writes them",
+    }.items():
+        with pytest.raises(RecordError, match=f"{name}.*{message}"):
+            read_records(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"trials": 0}, "`trials` must be at least 1. Got 0."),
+        ({"counterfactual": "demo"}, "must be one of none, demonstration, instruction. Got 'demo'"),
+        ({"without": "instruction", "instruction": "put it there"}, "is not a paraphrase"),
+    ],
+)
+def test_invalid_plans_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        EvaluationPlan(**changes)
+
+
+def test_trial_i_has_the_scene_of_the_seed_plus_i():
+    plan = EvaluationPlan(seed=1000)
+    assert plan.scene_seed(4, 3) == EvaluationPlan(seed=1003).scene_seed(4, 0)
+    seeds = {plan.scene_seed(task_id, trial) for task_id in range(300) for trial in range(4)}
+    assert len(seeds) == 1200
+    sets = {replace(plan, scene_set=number).scene_seed(4, 0) for number in (0, 1, 8000)}
+    assert len(sets) == 3
+
+
+@pytest.mark.parametrize("scene", [SceneConfig(), SceneConfig(ambiguity="object")])
+def test_scene_columns_are_those_of_the_environment(scene):
+    record = make_record(plan={"scene": scene, "tasks": "24,132,145", "trials": 1})
+    for row, scenes in zip(record.episodes.itertuples(), scene_columns(record).itertuples(), strict=True):
+        env = gymnasium.make("gym_deltaco:" + ENV_ID, task_id=row.task_id, scene=scene)
+        _, info = env.reset(seed=scenes.seed)
+        for name in ("objects", "container_quadrants", "target_object", "target_container"):
+            np.testing.assert_array_equal(getattr(scenes, name), info[name])
+        assert scenes.template == env.unwrapped.task.instruction
+        env.close()
+
+
+def test_the_page_documents_the_schema(monkeypatch, capsys):
+    page = (ROOT / "docs" / "records.md").read_text(encoding="utf-8")
+    columns = [line for line in records.__doc__.splitlines() if line.startswith("    ")]
+    assert "\n".join(columns) in page
+    assert [line.split()[0] for line in columns if line[4] != " "] == records._schema().names
+    example = page.split("```python\n")[1].split("```")[0]
+    output = page.split("```text\n")[1].split("```")[0]
+    monkeypatch.chdir(ROOT)
+    exec(example, {})
+    assert capsys.readouterr().out.split() == output.split()
