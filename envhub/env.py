@@ -1,4 +1,4 @@
-"""DeL-TaCo for LeRobot's EnvHub: scenario A's 102 test tasks, whose objects, colors and shapes are novel."""
+"""DeL-TaCo for LeRobot's EnvHub; `cfg` chooses the tasks, which are scenario A's test tasks by default."""
 
 from lerobot_deltaco.lerobot_env import DeltacoEnv
 
@@ -8,8 +8,8 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
 
     Args:
         n_envs: Number of environments for each task.
-        use_async_envs: Ignored: the environments of a task run in one process.
-        cfg: Configuration with which LeRobot loads the environment, if any; its `task` selects other tasks.
+        use_async_envs: Ignored: the environments of a task run in this process.
+        cfg: A `DeltacoEnv`, for other tasks or scenes.
     """
-    task = getattr(cfg, "task", None) or "scenario_a_test"
-    return DeltacoEnv(task=task).create_envs(n_envs)
+    config = cfg if isinstance(cfg, DeltacoEnv) else DeltacoEnv()
+    return config.create_envs(n_envs, use_async_envs)

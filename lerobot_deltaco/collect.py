@@ -182,7 +182,7 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
     Raises:
         CollectionError: The folder holds something else, or cannot be written to; the expert cannot do a
             task; or a worker process was killed.
-        SimulatorMissingError: PyBullet is not installed.
+        ImportError: PyBullet is not installed.
     """
     import gym_deltaco.env  # noqa: F401  (fails here, before anything is written, if there is no simulator)
 

@@ -149,8 +149,20 @@ class EvaluationEnv(PickPlaceEnv):
         super().close()
 
 
+class _FrozenAfterEpisodeEnd(FreezeAfterEpisodeEnd):
+    """LeRobot's wrapper, which begins a new episode also where a caller resets with a seed."""
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Draws a new scene, unless it is Gymnasium that resets an episode which has ended."""
+        if seed is not None:
+            self._frozen = None
+        return super().reset(seed=seed, options=options)
+
+
 def _make_env(**arguments: Any) -> gym.Env:
-    return FreezeAfterEpisodeEnd(EvaluationEnv(**arguments))
+    return _FrozenAfterEpisodeEnd(EvaluationEnv(**arguments))
 
 
 def check_policy_fits(

@@ -2,11 +2,8 @@
 
 import functools
 import os
-import tempfile
-from pathlib import Path
 
 import pytest
-from fresh_python import start_server, stop_server
 
 # Before anything imports huggingface_hub, which reads it once. `HF_HUB_OFFLINE=0 pytest -m hub` goes online.
 for name in ("HF_HUB_OFFLINE", "HF_DATASETS_OFFLINE", "TRANSFORMERS_OFFLINE"):
@@ -14,16 +11,6 @@ for name in ("HF_HUB_OFFLINE", "HF_DATASETS_OFFLINE", "TRANSFORMERS_OFFLINE"):
 os.environ.setdefault("WANDB_MODE", "disabled")
 # Before anything imports torch. The tests run in several processes, and so do the commands that they start.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-
-def pytest_configure(config):
-    """Starts the process that `fresh_python` forks, in the process that starts those of the tests."""
-    if hasattr(config, "workerinput"):
-        return
-    folder = tempfile.TemporaryDirectory()
-    server = start_server(Path(folder.name))
-    config.add_cleanup(folder.cleanup)
-    config.add_cleanup(lambda: stop_server(server))
 
 
 # Small policies. Their module is imported where it is used: it imports LeRobot, which takes 10 s.

@@ -1,164 +1,199 @@
-"""LeRobot finds the installed project, and imports within it go one way."""
+"""LeRobot finds the project, imports within it go one way, and the wheel holds all that it needs."""
 
 import ast
-import re
+import os
 import subprocess
 import sys
-from importlib.metadata import distribution
+import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
 from fresh_python import run_python
 
-from lerobot_deltaco.common import shipped
-
 ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 GYM_FILES = sorted((ROOT / "envs" / "gym_deltaco").rglob("*.py"))
 LEROBOT_FILES = [*sorted((ROOT / "lerobot_deltaco").rglob("*.py")), ROOT / "lerobot_policy_deltaco.py"]
-DISTRIBUTION = "lerobot_policy_deltaco"
 
 
-# One process imports LeRobot, which takes 10 s, and nothing of this project. Each command runs in a fork.
-PROGRAM = """
-import os, sys
+def imported_modules(path, at_import=False):
+    """Yields the absolute names of the modules that a file imports, `from package import module` included.
 
-os.dup2(1, 2)  # errors stand among the output
-from lerobot.scripts import lerobot_eval, lerobot_train
-
-MISSING = "lerobot_deltaco.policy.optimization"
-
-for name, main, words, missing in (
-    ("train --help", lerobot_train.main, ["--help"], None),
-    ("eval --help", lerobot_eval.main, ["--help"], None),
-    ("eval without a module", lerobot_eval.main, ["--env.type=deltaco"], MISSING),
-):
-    print(f"OUTPUT OF {name}", flush=True)
-    if os.fork():
-        os.wait()
-        continue
-    if missing is not None:
-        sys.modules[missing] = None
-    sys.argv = [name, *words]
-    main()
-    sys.exit()
-"""
-
-
-@pytest.fixture(scope="module")
-def lerobot_outputs():
-    """What LeRobot's commands print, by command."""
-    result = run_python(PROGRAM)
-    _, *parts = re.split("^OUTPUT OF (.+)$", result.stdout, flags=re.MULTILINE)
-    return dict(zip(parts[::2], parts[1::2], strict=True))
-
-
-def test_lerobot_requires_the_distribution_name_to_have_underscores():
-    assert distribution(DISTRIBUTION).metadata["Name"] == DISTRIBUTION
-
-
-@pytest.mark.parametrize("command", ["train", "eval"])
-def test_lerobot_help_lists_the_environment(lerobot_outputs, command):
-    output = lerobot_outputs[f"{command} --help"]
-    type_choices = output[output.index("--env.type") :].split("}")[0]
-    assert "deltaco" in type_choices
-
-
-def test_a_broken_import_ends_in_one_clear_sentence(lerobot_outputs):
-    last_line = lerobot_outputs["eval without a module"].strip().splitlines()[-1]
-    assert "LeRobot does not know the type 'deltaco'" in last_line
-    assert "lerobot_deltaco.policy.optimization" in last_line
-    assert "README" in last_line
-
-
-def test_what_is_shipped_lies_in_the_package_or_beside_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(shipped, "__file__", str(tmp_path / "clone/package/common/shipped.py"))
-    assert shipped.shipped_folder("inside", "beside") == tmp_path / "clone/beside"
-    installed = tmp_path / "clone/package/inside"
-    installed.mkdir(parents=True)
-    assert shipped.shipped_folder("inside", "beside") == installed
-
-
-def imported_modules(path):
-    """Absolute names of the modules that a file imports anywhere, `from package import module` included."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    Args:
+        path: The file.
+        at_import: Whether only those that it imports when it is imported itself.
+    """
+    todo = [ast.parse(path.read_text())]
+    while todo:
+        node = todo.pop()
+        is_function = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+        is_for_types = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        if at_import and (is_function or is_for_types):
+            continue
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path.name} has a relative import"
+            assert node.level == 0, f"{path} has a relative import"
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        todo += ast.iter_child_nodes(node)
 
 
-@pytest.mark.parametrize("path", GYM_FILES, ids=lambda path: path.name)
-def test_the_benchmark_knows_nothing_of_torch_and_lerobot(path):
-    packages = {name.split(".")[0] for name in imported_modules(path)}
-    assert packages.isdisjoint({"torch", "lerobot", "lerobot_deltaco", "lerobot_policy_deltaco"})
-
-
-# What each part may not import, so that imports go one way.
-FORBIDDEN = {
-    "lerobot_deltaco/data": {"torch", "lerobot_deltaco.policy", "lerobot_deltaco.modeling_deltaco"},
-    "lerobot_deltaco/policy": {
-        "gym_deltaco",
-        "pybullet",
-        "lerobot_deltaco.configuration_deltaco",
-        "lerobot_deltaco.modeling_deltaco",
-        "lerobot_deltaco.cards",
-        "lerobot_deltaco.data",
-        "lerobot_deltaco.training",
-    },
-    "lerobot_deltaco/policy/language": {"lerobot_deltaco.policy.goals"},
-    "lerobot_deltaco/policy/language/encoder_names.py": {"torch", "lerobot", "lerobot_deltaco"},
-    "lerobot_deltaco/policy/vision_encoders.py": {"torch", "lerobot", "lerobot_deltaco"},
-    "lerobot_deltaco/policy/options.py": {"torch", "lerobot", "lerobot_deltaco"},
-    "lerobot_deltaco/configuration_deltaco.py": {
-        "torch",
-        "lerobot_deltaco.modeling_deltaco",
-        "lerobot_deltaco.policy.language.instruction_table",
-        "lerobot_deltaco.training",
-    },
-    "lerobot_deltaco/modeling": {"lerobot_deltaco.modeling_deltaco", "gym_deltaco", "pybullet"},
-    "lerobot_deltaco/policy/networks.py": {"lerobot", "lerobot_deltaco"},
-    "lerobot_deltaco/policy/losses.py": {"lerobot", "lerobot_deltaco"},
-    "lerobot_deltaco/policy/demo_encoders.py": {"lerobot", "lerobot_deltaco.modeling_deltaco"},
-    "lerobot_deltaco/policy/memory.py": {"lerobot", "lerobot_deltaco"},
-    "lerobot_deltaco/policy/goals/efficientnet_lite.py": {"lerobot", "lerobot_deltaco"},
-    "lerobot_deltaco/policy/goals/words.py": {"lerobot", "lerobot_deltaco"},
-    # Reports are quick, and need no machine that could train.
-    **{
-        f"lerobot_deltaco/{part}.py": {"torch", "lerobot", "pybullet", "lerobot_deltaco.evaluate"}
-        for part in ("records", "statistics", "report_tables", "report", "paper_results", "leaderboard")
-    },
-}
-
-
-@pytest.mark.parametrize("part", FORBIDDEN)
-def test_imports_go_one_way(part):
-    path = ROOT / part
-    paths = [path] if path.suffix else sorted(path.rglob("*.py"))
-    assert paths
-    for path in paths:
-        for name in imported_modules(path):
-            parents = {name, *(name.rsplit(".", n)[0] for n in range(1, name.count(".") + 1))}
-            assert parents.isdisjoint(FORBIDDEN[part]), f"{path.name} imports {name}"
+# Imports
 
 
 @pytest.mark.parametrize(
-    ("name", "importers"),
-    [("pybullet", {"pybullet_import.py"}), ("gym_deltaco.pybullet_import", {"simulation.py"})],
+    ("files", "forbidden"),
+    [
+        (GYM_FILES, {"torch", "lerobot", "lerobot_deltaco", "lerobot_policy_deltaco"}),
+        ([*GYM_FILES, *LEROBOT_FILES], {"lerobot_deltaco.cli"}),
+        (LEROBOT_FILES, {"pybullet"}),
+        # Networks and losses take plain numbers.
+        (
+            [ROOT / "lerobot_deltaco" / name for name in ("networks.py", "losses.py")],
+            {"lerobot", "lerobot_deltaco.base_config", "lerobot_deltaco.base_policy"},
+        ),
+    ],
+    ids=["benchmark", "command line", "simulator", "networks"],
 )
-def test_one_file_imports_the_simulator(name, importers):
-    assert {path.name for path in GYM_FILES if name in imported_modules(path)} == importers
-    assert not any(name in imported_modules(path) for path in LEROBOT_FILES)
+def test_imports_go_one_way(files, forbidden):
+    assert files
+    for path in files:
+        for name in imported_modules(path):
+            parents = {".".join(name.split(".")[:n]) for n in range(1, name.count(".") + 2)}
+            assert parents.isdisjoint(forbidden), f"{path} imports {name}"
 
 
-def test_importing_the_benchmark_loads_neither_torch_nor_lerobot():
-    check = "import sys, gym_deltaco; print({'torch', 'lerobot', 'lerobot_deltaco'} & set(sys.modules))"
-    result = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)
-    assert result.stdout.splitlines()[-1] == "set()"
+@pytest.mark.parametrize("name", ["records", "collect", "paraphrases", "report", "leaderboard"])
+def test_what_needs_no_policy_imports_neither_torch_nor_lerobot(name):
+    seen, todo = set(), [f"lerobot_deltaco.{name}"]
+    files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in LEROBOT_FILES}
+    while todo:
+        module = todo.pop()
+        if module not in seen and module in files:
+            todo += imported_modules(files[module], at_import=True)
+        seen.add(module)
+    assert {found.split(".")[0] for found in seen}.isdisjoint({"torch", "lerobot", "transformers"})
 
 
-@pytest.mark.parametrize("path", [*GYM_FILES, *LEROBOT_FILES], ids=lambda path: path.name)
-def test_nothing_imports_the_command_line(path):
-    command_line = {script.module for script in distribution(DISTRIBUTION).entry_points}
-    assert command_line.isdisjoint(imported_modules(path))
+def test_lerobot_finds_the_distribution():
+    # With hyphens, it would silently not be found.
+    assert PROJECT["name"] == "lerobot_policy_deltaco"
+    assert PROJECT["scripts"] == {"deltaco": "lerobot_deltaco.cli:main"}
+
+
+def test_lerobot_knows_the_policies_and_the_environment():
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.envs import EnvConfig
+    from lerobot.policies import get_policy_class
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    assert {"deltaco", "deltaco_match"} <= set(PreTrainedConfig.get_known_choices())
+    assert "deltaco" in EnvConfig.get_known_choices()
+    assert get_policy_class("deltaco_match").name == "deltaco_match"
+
+
+def test_a_broken_import_ends_in_one_clear_sentence():
+    program = "import sys; sys.modules['lerobot_deltaco.optimization'] = None; import lerobot_policy_deltaco"
+    result = run_python(program)
+    assert result.returncode != 0
+    last_line = result.stderr.strip().splitlines()[-1]
+    assert "lerobot_policy_deltaco could not be imported, so LeRobot does not know its types" in last_line
+    assert "lerobot_deltaco.optimization" in last_line
+
+
+WITHOUT_SIMULATOR = """
+import sys
+{before}
+import gymnasium, gym_deltaco
+from gym_deltaco import chance, layout, object_sets, scene_config, seeding, tasks, workspace
+assert not {{"torch", "lerobot", "pybullet"}} & {{name for name, module in sys.modules.items() if module}}
+try:
+    gymnasium.make(gym_deltaco.ENV_ID)
+except ImportError as error:
+    assert error.name == "pybullet", error.name
+    print(error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "message"),
+    [
+        ("sys.modules['pybullet'] = None", '`pip install "lerobot_policy_deltaco[sim]"`'),
+        ("", "is installed, but does not load: libfoo.so is missing. Build it again"),
+    ],
+    ids=["missing", "broken"],
+)
+def test_without_pybullet_the_environment_says_what_to_install(tmp_path, before, message):
+    (tmp_path / "pybullet.py").write_text("raise ImportError('libfoo.so is missing')")
+    paths = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    result = run_python(WITHOUT_SIMULATOR.format(before=before), env=environment)
+    assert result.returncode == 0, result.stderr
+    assert message in result.stdout
+
+
+# The wheel
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def test_the_wheel_holds_all_that_the_clone_has(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    expected = {name.removeprefix("envs/") for name in tracked.splitlines() if (ROOT / name).is_file()}
+    for folder in ("lerobot_deltaco/", "gym_deltaco/"):
+        assert {name for name in expected if name.startswith(folder)} <= names
+    for folder in ("datasets_cards/", "checkpoints/"):
+        assert {f"lerobot_deltaco/{name}" for name in expected if name.startswith(folder)} <= names
+    assert "lerobot_policy_deltaco.py" in names
+    assert not {name for name in names if name.startswith(("tests/", "docs/", "results/", "envs/"))}
+
+
+@pytest.mark.slow
+def test_the_wheel_works_in_a_fresh_environment(wheel, tmp_path):
+    """Its own folder comes first; other packages are those of this environment."""
+    site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--no-deps",
+        "--no-index",
+        "--quiet",
+        "--target",
+        str(site),
+    ]
+    subprocess.run([*install, str(wheel)], check=True)
+
+    def run(*words):
+        environment = {**os.environ, "PYTHONPATH": str(site)}
+        command = [sys.executable, *map(str, words)]
+        result = subprocess.run(command, cwd=elsewhere, env=environment, capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr[-3000:]
+        return result.stdout
+
+    places = run("-c", "import lerobot_deltaco, gym_deltaco; print(lerobot_deltaco, gym_deltaco)")
+    assert places.count(str(site)) == 2
+    deltaco = (site / "bin" / "deltaco",)
+    assert "collect" in run(*deltaco, "--help")
+    assert len(run(*deltaco, "experiment", "--list").split()) > 10
+    assert "1 episodes" in run(
+        *deltaco, "collect", "--tasks", "4", "--episodes-per-task", "1", "--root", "data"
+    )
+    checkpoint = site / "lerobot_deltaco" / "checkpoints" / "pick_place"
+    found = run(*deltaco, "evaluate", checkpoint, "--tasks", "24", "--trials", "2", "--out", "run")
+    assert "of 2 episodes of 24 succeeded" in found
+    card = "import pathlib, lerobot_deltaco.cards as c; print(c.dataset_card(pathlib.Path('data')))"
+    assert "yu2023deltaco" in run("-c", card)

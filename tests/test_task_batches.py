@@ -6,8 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from lerobot_deltaco.policy.upsampling import count_upsampled_tasks
-from lerobot_deltaco.training.task_batches import TaskBatchSampler
+from lerobot_deltaco.task_batches import TaskBatchSampler, _count_upsampled_tasks
 
 # 7 tasks of 10, 20, ... 70 frames.
 TASKS = np.repeat(np.arange(7), np.arange(10, 80, 10))
@@ -23,30 +22,26 @@ def test_a_batch_has_as_many_samples_of_each_of_its_tasks(tasks_per_batch):
     drawn = batches(sampler)
     assert drawn.size == len(sampler)
     for batch in drawn:
-        counts = Counter(TASKS[batch].tolist())
-        assert list(counts.values()) == [5] * tasks_per_batch
+        assert list(Counter(TASKS[batch].tolist()).values()) == [5] * tasks_per_batch
 
 
-def test_every_task_is_in_as_many_batches_and_every_frame_of_it_drawn_as_often():
-    sampler = TaskBatchSampler(TASKS, 20, 4)
-    drawn = batches(sampler).ravel()
+def test_tasks_are_in_as_many_batches_and_their_frames_drawn_as_often():
+    drawn = batches(TaskBatchSampler(TASKS, 20, 4)).ravel()
     per_task = Counter(TASKS[drawn].tolist())
     assert set(per_task) == set(range(7))
     assert max(per_task.values()) - min(per_task.values()) <= 5  # the samples of one visit
     per_frame = np.bincount(drawn, minlength=len(TASKS))
     for task in range(7):
-        counts = per_frame[task == TASKS]
-        assert counts.max() - counts.min() <= 1
+        assert np.ptp(per_frame[task == TASKS]) <= 1
 
 
-def test_no_frame_is_drawn_twice_before_all_of_its_task_were():
+def test_a_frame_is_drawn_again_when_all_others_of_its_task_were():
     drawn = batches(TaskBatchSampler(np.zeros(30, dtype=int), 10, 1)).ravel()
     assert sorted(drawn) == list(range(30))
 
 
-def test_upsampled_tasks_get_their_share_of_each_batch():
-    sampler = TaskBatchSampler(TASKS, 24, 4, upsampled=[0, 1], upsampled_share=0.5)
-    for batch in batches(sampler):
+def test_upsampled_tasks_get_their_fraction_of_each_batch():
+    for batch in batches(TaskBatchSampler(TASKS, 24, 4, upsampled=[0, 1], upsampled_fraction=0.5)):
         assert np.isin(TASKS[batch], [0, 1]).mean() == 0.5
         assert len(set(TASKS[batch])) == 4
 
@@ -60,7 +55,7 @@ def test_the_order_is_a_function_of_seed_and_epoch():
     np.testing.assert_array_equal(batches(again).ravel(), first.order(1))
 
 
-def test_a_resumed_epoch_goes_on_where_it_was():
+def test_a_resumed_epoch_continues():
     sampler = TaskBatchSampler(TASKS, 12, 3)
     whole = batches(sampler).ravel()
     sampler.load_state_dict({"epoch": 0, "start_index": 36})
@@ -68,7 +63,7 @@ def test_a_resumed_epoch_goes_on_where_it_was():
     np.testing.assert_array_equal(batches(sampler).ravel(), sampler.order(1))
 
 
-def test_frames_that_are_not_used_are_not_drawn():
+def test_unused_frames_are_not_drawn():
     use = np.arange(len(TASKS)) % 2 == 0
     drawn = batches(TaskBatchSampler(TASKS, 12, 3, use=use)).ravel()
     assert use[drawn].all()
@@ -81,11 +76,11 @@ def test_frames_that_are_not_used_are_not_drawn():
         ({"batch_size": 10, "tasks_per_batch": 4}, "10 samples cannot hold 4 tasks.*such as 8"),
         ({"batch_size": 16, "tasks_per_batch": 8}, "8 different tasks, but the dataset has only 7"),
         (
-            {"batch_size": 8, "tasks_per_batch": 4, "upsampled": [0], "upsampled_share": 0.5},
+            {"batch_size": 8, "tasks_per_batch": 4, "upsampled": [0], "upsampled_fraction": 0.5},
             "2 different upsampled tasks, but the dataset has only 1",
         ),
         (
-            {"batch_size": 8, "tasks_per_batch": 4, "upsampled": [0, 1], "upsampled_share": 0.4},
+            {"batch_size": 8, "tasks_per_batch": 4, "upsampled": [0, 1], "upsampled_fraction": 0.4},
             "1 to 3 of the 4 in a batch, such as 0.5 for 2. Got 0.4, which is 1.6 tasks",
         ),
     ],
@@ -95,11 +90,11 @@ def test_numbers_that_do_not_fit_are_refused(arguments, message):
         TaskBatchSampler(TASKS, **arguments)
 
 
-@pytest.mark.parametrize("n_tasks", range(2, 25))
-def test_the_share_that_an_error_suggests_is_accepted(n_tasks):
-    for share in (0.01, 0.31, 0.99):
-        try:
-            count_upsampled_tasks(share, n_tasks)
-        except ValueError as error:
-            suggested = float(re.search(r"such as ([0-9.]+) for", str(error))[1])
-            assert 1 <= count_upsampled_tasks(suggested, n_tasks) < n_tasks
+def test_a_suggested_fraction_is_valid():
+    for n_tasks in range(2, 25):
+        for fraction in (0.01, 0.31, 0.99):
+            try:
+                _count_upsampled_tasks(fraction, n_tasks)
+            except ValueError as error:
+                suggested = float(re.search(r"such as ([0-9.]+) for", str(error))[1])
+                assert 1 <= _count_upsampled_tasks(suggested, n_tasks) < n_tasks

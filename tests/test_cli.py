@@ -1,0 +1,158 @@
+"""The command `deltaco`: quick help that lists everything, and errors in one line."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from fresh_python import run_python
+
+from lerobot_deltaco import cli
+
+# Packages that take a second or more to import.
+SLOW_PACKAGES = {
+    "datasets",
+    "gradio",
+    "lerobot",
+    "matplotlib",
+    "sentence_transformers",
+    "torch",
+    "transformers",
+}
+PROGRAM = """
+import sys
+from lerobot_deltaco import cli
+
+slow = set(sys.argv.pop().split(","))
+for name in sys.argv[1:]:
+    before = set(sys.modules)
+    sys.argv = ["deltaco", *filter(None, [name]), "--help"]
+    try:
+        cli.main()
+    except SystemExit as end:
+        assert not end.code, end.code
+    print("END", sorted(slow & (set(sys.modules) - before)))
+"""
+
+
+@pytest.fixture(scope="module")
+def helps():
+    """What the help of the command, and of each subcommand, prints, and which slow packages it imports."""
+    names = ["", *cli.COMMANDS]
+    result = run_python(PROGRAM, *names, ",".join(SLOW_PACKAGES))
+    assert result.returncode == 0, result.stderr
+    parts = re.findall(r"(.*?)^END (.*?)$\n", result.stdout, re.MULTILINE | re.DOTALL)
+    return dict(zip(names, parts, strict=True))
+
+
+def test_the_help_lists_all_commands(helps):
+    text, _ = helps[""]
+    for name, description in cli.COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(description)}$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_help_is_quick_and_explains_every_option(helps, name):
+    text, slow = helps[name]
+    assert f"usage: deltaco {name}" in text
+    # These two are functions of modules that need a policy at hand.
+    assert slow == "[]" or name in ("look", "play")
+    if name == "train":
+        return
+    plain = re.sub(r"[│╭╮╰╯─]", " ", text)
+    # An option, its values in capitals or braces, its description and its default.
+    entries = re.split(r"\n +(?=-{1,2}[a-z])", plain)[1:]
+    assert len(entries) > 1
+    for entry in entries:
+        option, _, described = entry.partition(" ")
+        described = re.sub(r"\(default: .*?\)|\(required\)|\{[^}]*\}|--\S+", "", described)
+        assert re.search(r"[a-z]{3,}", described), option
+
+
+def test_the_help_of_training_lists_the_options_of_both_policies(helps):
+    from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
+    from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+
+    text, _ = helps["train"]
+    hidden = {"push_to_hub", "normalization_mapping", "one_hot_tasks", "known_words", "demo_feature_dim"}
+    inherited = {field.name for field in fields(DeltacoConfig.__mro__[2])}
+    for config in (DeltacoConfig, DeltacoMatchConfig):
+        for option in {field.name for field in fields(config)} - inherited - hidden:
+            assert f"--policy.{option} " in text
+    assert "--policy.type=deltaco_match" in text
+
+
+def test_an_unknown_command_names_the_valid_ones(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["deltaco", "trian"])
+    with pytest.raises(SystemExit, match="unknown command 'trian'. The commands are collect, train"):
+        cli.main()
+
+
+def run_with(monkeypatch, function):
+    monkeypatch.setattr(cli, "_look", lambda: function)
+    monkeypatch.setattr(sys, "argv", ["deltaco", "look"])
+    cli.main()
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (ImportError("no simulator"), "deltaco look: no simulator"),
+        (FileNotFoundError("no file"), "deltaco look: no file"),
+        (KeyboardInterrupt(), "\nInterrupted. Run the same command again to continue."),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_an_error_that_a_user_can_act_on_is_one_line(monkeypatch, error, message):
+    def fail() -> None:
+        raise error
+
+    # Errors that are raised on purpose come from one of the packages.
+    monkeypatch.setattr(cli, "_PACKAGES", ("tests",))
+    with pytest.raises(SystemExit) as caught:
+        run_with(monkeypatch, fail)
+    assert caught.value.code == message
+
+
+def test_a_bug_shows_its_traceback(monkeypatch):
+    def fail() -> None:
+        raise TypeError
+
+    with pytest.raises(TypeError):
+        run_with(monkeypatch, fail)
+
+
+# Commands of the dataset's card: a stranger pastes them
+
+
+@pytest.mark.slow
+def test_act_is_trained_and_evaluated_by_the_commands_of_a_datasets_card(tmp_path):
+    from lerobot_deltaco.cards import dataset_card
+    from lerobot_deltaco.collect import CollectionPlan, collect
+
+    root = tmp_path / "data"
+    collect(root, CollectionPlan("4", 2))
+    blocks = re.findall(r"```bash\n(.*?)```", dataset_card(root), re.DOTALL)
+    lines = "".join(blocks).replace("\\\n", " ").splitlines()
+    commands = {words[0]: words[1:] for words in map(shlex.split, lines) if words}
+    quick = {
+        "lerobot-train": [
+            *("--policy.pretrained_backbone_weights=null", "--policy.device=cpu", "--policy.dim_model=32"),
+            *("--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.n_encoder_layers=1"),
+            *("--steps=3", "--batch_size=2", "--num_workers=0", "--log_freq=1", "--env_eval_freq=3"),
+            *("--eval.n_episodes=1", "--eval.batch_size=1"),
+        ],
+        "lerobot-eval": ["--eval.n_episodes=2", "--output_dir=outputs/eval"],
+    }
+    for name, changes in quick.items():
+        changed = {change.split("=")[0] for change in changes}  # LeRobot takes each option once
+        words = [word for word in commands[name] if word.split("=")[0] not in changed]
+        words = [word.replace("DIR", str(root)) for word in words]
+        module = f"lerobot.scripts.{name.replace('-', '_')}"
+        subprocess.run([sys.executable, "-m", module, *words, *changes], cwd=tmp_path, check=True)
+    info = json.loads(Path(tmp_path, "outputs/eval/eval_info.json").read_text())
+    assert info["overall"]["n_episodes"] == 2

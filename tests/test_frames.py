@@ -1,0 +1,125 @@
+"""Frames in memory: they equal what LeRobot reads from the disk."""
+
+import io
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.transforms import ImageTransforms, ImageTransformsConfig
+from PIL import Image
+from tiny_runs import batch_of, write_dataset
+
+from lerobot_deltaco import frames as frames_module
+from lerobot_deltaco.demonstrations import read_demonstrations, read_robot_data
+from lerobot_deltaco.frames import FramesInMemory
+
+TASKS = ["stack the cups", "pour the tea", "wave"] * 2
+LENGTH = 5
+TOP, WRIST = "observation.images.top", "observation.images.wrist"
+CAMERAS = {"top": (20, 28), "wrist": (24, 24)}
+MORE_FEATURES = {
+    "observation.pose": lambda rng: rng.normal(size=(2, 3)).astype(np.float32),
+    "observation.flag": lambda rng: rng.integers(0, 2, 1).astype(bool),
+    "force": lambda rng: rng.normal(size=2),
+    "count": lambda rng: rng.integers(0, 99, 1).astype(np.int32),
+    "levels": lambda rng: rng.integers(0, 255, 3, dtype=np.uint8),
+    "note": lambda rng: f"note {rng.integers(99)}",
+}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data") / "small", TASKS, LENGTH, CAMERAS, **MORE_FEATURES)
+
+
+@pytest.fixture(scope="module")
+def video_root(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "video"
+    return write_dataset(folder, TASKS[:2], LENGTH, {"top": (32, 48)}, video=True)
+
+
+def read(root, **options):
+    return LeRobotDataset("test/small", root=root, return_uint8=True, **options)
+
+
+def assert_batches_are_equal(dataset, indices):
+    expected, found = batch_of(dataset, indices), FramesInMemory(dataset).batch(indices)
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        if name in dataset.meta.camera_keys and value.is_floating_point():
+            found[name] = found[name].float() / 255  # LeRobot's loop does this to images of bytes
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(found[name], value, rtol=0, atol=0, msg=name)
+        else:
+            assert found[name] == value, name
+
+
+@pytest.mark.parametrize("episodes", [None, [1, 3, 4]], ids=["all episodes", "some episodes"])
+def test_batches_equal_those_of_lerobot(root, episodes):
+    assert_batches_are_equal(read(root, episodes=episodes), [0, 7, 14, 3, 7])
+
+
+@pytest.mark.parametrize("episodes", [None, [1, 3, 4]], ids=["all episodes", "some episodes"])
+def test_windows_equal_those_of_lerobot(root, episodes):
+    windows = {TOP: [-0.1, 0.0], "action": [0.0, 0.1, 0.2, 0.3], "observation.state": [0.0]}
+    dataset = read(root, episodes=episodes, delta_timestamps=windows)
+    assert_batches_are_equal(dataset, list(range(3 * LENGTH)))
+
+
+@pytest.mark.parametrize("seconds", [[-0.1, 0.0], [0.0], None], ids=["two frames", "one frame", "no window"])
+def test_videos_equal_those_of_lerobot(video_root, seconds):
+    windows = None if seconds is None else {TOP: seconds, "action": [0.0, 0.1]}
+    dataset = read(video_root, delta_timestamps=windows, video_backend="pyav")
+    assert_batches_are_equal(dataset, list(range(2 * LENGTH)))
+    # The dataset still gives windows.
+    assert dataset[3]["action"].shape == ((3,) if seconds is None else (2, 3))
+
+
+@pytest.mark.parametrize("n_frames", [2, 3])
+def test_demonstrations_and_robot_data_equal_those_that_are_read(root, n_frames):
+    dataset = read(root, episodes=[0, 2, 5])
+    frames = FramesInMemory(dataset)
+    found = frames.demonstrations(WRIST, 16, n_frames)
+    expected = read_demonstrations(read(root), WRIST, 16, n_frames, [0, 2, 5])
+    assert found.tasks == expected.tasks
+    assert torch.equal(found.episodes, expected.episodes)
+    assert torch.equal(found.frames, expected.frames)
+    robot, expected_robot = frames.robot_data(), read_robot_data(read(root), [0, 2, 5])
+    for (first, last), (a, b) in zip(robot.spans, expected_robot.spans, strict=True):
+        assert torch.equal(robot.states[first : last + 1], expected_robot.states[a : b + 1])
+        assert torch.equal(robot.actions[first : last + 1], expected_robot.actions[a : b + 1])
+
+
+def test_images_are_scaled_on_request(root):
+    batch = FramesInMemory(read(root), image_size=16).batch([0, 1])
+    assert {batch[camera].shape for camera in (TOP, WRIST)} == {(2, 3, 16, 16)}
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "BMP"])
+def test_any_image_format_is_decoded(kind):
+    image = np.random.default_rng(0).integers(0, 255, (9, 7, 3), dtype=np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, kind)
+    assert torch.equal(frames_module._decoded(file.getvalue()), torch.from_numpy(image).permute(2, 0, 1))
+
+
+def test_frames_that_do_not_fit_into_memory_are_refused(root, monkeypatch):
+    # Images, and 8 bytes for each number.
+    needed = 30 * (20 * 28 * 3 + 24 * 24 * 3 + 8 * (2 + 3 + 6 + 1 + 2 + 1 + 3 + 1 + 5))
+    monkeypatch.setattr(
+        frames_module.psutil, "virtual_memory", lambda: SimpleNamespace(available=needed // 0.8 - 2)
+    )
+    with pytest.raises(MemoryError, match="The 30 frames take 0.0 GB of memory.*--dataset.episodes"):
+        FramesInMemory(read(root))
+    monkeypatch.setattr(
+        frames_module.psutil, "virtual_memory", lambda: SimpleNamespace(available=needed // 0.8 + 2)
+    )
+    FramesInMemory(read(root))
+
+
+def test_random_transforms_are_refused(root):
+    dataset = read(root, image_transforms=ImageTransforms(ImageTransformsConfig(enable=True)))
+    with pytest.raises(ValueError, match=r"cannot be transformed at random.*--dataset.image_transforms"):
+        FramesInMemory(dataset)

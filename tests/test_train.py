@@ -1,0 +1,315 @@
+"""`deltaco train`: LeRobot's loop over frames in memory, from the command line to the checkpoints."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.scripts import lerobot_train
+from safetensors.torch import load_file
+from tiny_runs import ACT, DELTACO, MATCH, POLICIES, TASK_IDS, collect_benchmark, run_training
+
+from gym_deltaco.tasks import get_task
+from lerobot_deltaco import cli
+from lerobot_deltaco import train as train_module
+from lerobot_deltaco.base_policy import TaskConditionedPolicy, TrainingDivergedError
+from lerobot_deltaco.deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+
+EPISODE_LENGTH = 30
+CLASSES = {"deltaco": DeltacoPolicy, "deltaco_match": DeltacoMatchPolicy, "act": ACTPolicy}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return collect_benchmark(tmp_path_factory.mktemp("data") / "small")
+
+
+@pytest.fixture
+def train(root, tmp_path):
+    """Trains in this process, and returns the folder of the checkpoints."""
+
+    def train(options, name="run", **more):
+        return run_training(root, tmp_path / name, options, **more)
+
+    return train
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """Batches that policies are given: (whether to train on, batch)."""
+    batches = []
+    for policy in CLASSES.values():
+
+        def spy(self, batch, *arguments, forward=policy.forward, **options):
+            batches.append((self.training, dict(batch)))
+            return forward(self, batch, *arguments, **options)
+
+        monkeypatch.setattr(policy, "forward", spy)
+    return batches
+
+
+def state_of(checkpoints, step):
+    """Weights and optimizer state of a checkpoint."""
+    files = "pretrained_model/model.safetensors", "training_state/optimizer_state.safetensors"
+    return {
+        (file, name): tensor
+        for file in files
+        for name, tensor in load_file(checkpoints / f"{step:06d}" / file).items()
+    }
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    assert [name for name in one if not torch.equal(one[name], other[name])] == []
+
+
+# The same as LeRobot's own loop
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_training_equals_that_of_lerobot_train(train, policy):
+    # The same seed gives the same weights, samples, and demonstrations; batches of tasks are ours alone.
+    options = {**POLICIES[policy]}
+    if policy != "act":
+        options["policy.tasks_per_batch"] = 0
+    if policy == "deltaco_match":
+        options["policy.frames_after_release"] = "null"
+    stock = train(options, "stock", in_memory=False)
+    memory = train(options, "memory")
+    assert_same(state_of(stock, 4), state_of(memory, 4))
+
+
+# Episodes whose 120 frames are 3 batches of 40, and so a few epochs of a short run.
+FEW = {"dataset.episodes": "[0,6,12,18]", "batch_size": 40}
+RESUMABLE = {
+    "tasks": {**DELTACO, **FEW},
+    "frames": {**DELTACO, **FEW, "policy.tasks_per_batch": 0},
+    "deltaco_match": MATCH,
+    # What draws from the global random state, such as dropout, is not repeated.
+    "act": {**ACT, **FEW, "policy.use_vae": False, "policy.dropout": 0.0},
+}
+
+
+@pytest.mark.parametrize("name", RESUMABLE)
+def test_a_resumed_run_equals_an_uninterrupted_one(train, tmp_path, seen, name):
+    whole = train(RESUMABLE[name], "whole", steps=8, save_freq=4)
+    indices = [batch["index"].tolist() for _, batch in seen]
+    # What is there if the run was killed after step 4, in the second epoch.
+    killed = tmp_path / "killed" / "checkpoints"
+    shutil.copytree(whole / "000004", killed / "000004")
+    seen.clear()
+    config = killed / "000004" / "pretrained_model" / "train_config.json"
+    train({}, "killed", config_path=config, resume=True, save_freq=8)
+    # accelerate 1.15 would begin with the order of the first epoch.
+    assert [batch["index"].tolist() for _, batch in seen] == indices[4:]
+    assert_same(state_of(whole, 8), state_of(killed, 8))
+
+
+def test_an_epoch_has_every_frame_once_in_an_order_of_its_own(train, seen):
+    train({**ACT, **FEW}, steps=6, save_freq=6)
+    indices = [batch["index"].tolist() for _, batch in seen]
+    assert indices[:3] != indices[3:]
+    for epoch in (indices[:3], indices[3:]):
+        assert len(set(sum(epoch, []))) == 120
+
+
+@pytest.mark.parametrize(("policy", "in_memory"), [("deltaco", False), ("deltaco_match", True)])
+def test_a_training_evaluates_itself(train, policy, in_memory, capfd):
+    options = {**POLICIES[policy], "env.type": "deltaco", "env.task": "4", "env.scene.episode_length": 2}
+    train({**options, "eval.n_episodes": 1, "eval.batch_size": 1, "env_eval_freq": 2}, in_memory=in_memory)
+    assert "".join(capfd.readouterr()).count("'pc_success': 0.0") >= 2
+
+
+@pytest.mark.slow
+def test_two_processes_train_alike_from_the_disk_and_from_memory(root, tmp_path):
+    """Both end with the same weights, by gloo on a CPU, and other ones than a process alone."""
+    # The one-hot policy needs no language encoder.
+    options = {**DELTACO, "policy.method": "one_hot", "policy.tasks_per_batch": 0}
+    options |= {"policy.device": "cpu", "dataset.repo_id": "test/small", "dataset.root": root, "batch_size": 6}
+    options |= {"steps": 3, "save_freq": 3, "num_workers": 0}
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    programs = {
+        "disk": [*launch, "-m", "lerobot.scripts.lerobot_train"],
+        "memory": [*launch, "-m", "lerobot_deltaco.cli", "train"],
+        "alone": ["-m", "lerobot_deltaco.cli", "train"],
+    }
+    for name, words in programs.items():
+        arguments = [f"--{key}={value}" for key, value in {**options, "output_dir": tmp_path / name}.items()]
+        environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo"}
+        result = subprocess.run(
+            [sys.executable, *words, *arguments], env=environment, capture_output=True, text=True
+        )
+        assert result.returncode == 0, result.stderr[-3000:]
+    disk, memory, alone = (state_of(tmp_path / name / "checkpoints", 3) for name in programs)
+    assert_same(disk, memory)
+    assert any(not torch.equal(alone[name], tensor) for name, tensor in memory.items())
+
+
+# What is trained on
+
+
+@pytest.mark.parametrize("policy", ["deltaco", "act"])
+def test_episodes_and_the_split_are_respected(train, seen, policy):
+    chosen = {0, 1, 2, 6, 7, 8, 12, 13, 18, 19}
+    split = {"dataset.episodes": f"{sorted(chosen)}", "dataset.eval_split": 0.3, "eval_steps": 2}
+    train({**POLICIES[policy], **split}, steps=4, save_freq=4, batch_size=24)
+    trained, held_back = (
+        {index for training, batch in seen if training == wanted for index in batch["episode_index"].tolist()}
+        for wanted in (True, False)
+    )
+    assert trained
+    assert held_back
+    assert trained | held_back <= chosen
+    assert not trained & held_back
+
+
+def test_demonstrations_are_drawn_from_the_episodes_that_are_trained_on(train, seen, monkeypatch):
+    banks = []
+
+    def noted(self, bank, robot_data, set_training_data=DeltacoPolicy.set_training_data):
+        banks.append(bank)
+        set_training_data(self, bank, robot_data)
+
+    monkeypatch.setattr(DeltacoPolicy, "set_training_data", noted)
+    train({**DELTACO, "dataset.episodes": "[1,2,3,7,8,9]", "dataset.eval_split": 0.5}, batch_size=90)
+    trained = {index for _, batch in seen for index in batch["episode_index"].tolist()}
+    assert set(banks[0].episodes.tolist()) == trained < {1, 2, 3, 7, 8, 9}
+
+
+def test_batches_hold_the_tasks_that_are_wanted(train, seen):
+    instructions = [get_task(task_id).instruction for task_id in TASK_IDS]
+    pattern = instructions[1].split(" in ")[0]
+    train({**DELTACO, "policy.upsampled_tasks": pattern, "policy.upsampled_fraction": 0.5})
+    for _, batch in seen:
+        assert batch["task"].count(instructions[1]) == 3
+        assert len(set(batch["task"])) == 2
+
+
+def test_as_many_tasks_are_in_a_batch_as_divide_it(train, seen):
+    train({**DELTACO, "policy.tasks_per_batch": 16}, batch_size=9)  # of 4 tasks
+    assert {len(set(batch["task"])) for _, batch in seen} == {3}
+
+
+@pytest.mark.parametrize("n_after", [0, 3])
+def test_frames_long_after_the_release_are_left_out(train, monkeypatch, n_after):
+    used = []
+    sampler = train_module.TaskBatchSampler
+    monkeypatch.setattr(
+        train_module,
+        "TaskBatchSampler",
+        lambda *arguments, use, **options: used.append(use) or sampler(*arguments, use=use, **options),
+    )
+    frames = []
+    held = train_module.FramesInMemory
+    monkeypatch.setattr(
+        train_module, "FramesInMemory", lambda *arguments: frames.append(held(*arguments)) or frames[0]
+    )
+    train({**MATCH, "policy.frames_after_release": n_after}, steps=1)
+    gripper = frames[0].columns["action"][:, 3].reshape(-1, EPISODE_LENGTH)
+    for opening, use in zip(gripper.numpy(), used[0].reshape(-1, EPISODE_LENGTH), strict=True):
+        release = np.flatnonzero((opening[1:] > 0) & (opening[:-1] <= 0))[-1] + 1
+        np.testing.assert_array_equal(use, np.arange(EPISODE_LENGTH) <= release + n_after)
+
+
+# Checkpoints and logs
+
+
+def test_a_checkpoint_names_its_policy_and_no_folder_of_the_demonstrations(train, root, capfd):
+    demos = {"policy.demo_repo_id": "test/small", "policy.demo_root": root}
+    checkpoints = train({**DELTACO, **demos}, steps=1, save_freq=1, job_name="small")
+    folder = checkpoints / "000001" / "pretrained_model"
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["type"], config["gripper"], config["demo_root"]) == ("deltaco", "3", None)
+    policy = DeltacoPolicy.from_pretrained(folder)
+    assert set(policy.demonstrations.tasks) == {get_task(task_id).instruction for task_id in TASK_IDS}
+    printed = "".join(capfd.readouterr())
+    for name in ("gripper_accuracy", "grdn", "loss"):
+        assert name in printed
+
+
+def test_lerobots_loop_is_left_as_it_was(train):
+    names = "make_train_eval_datasets", "EpisodeAwareSampler"
+    before = [getattr(lerobot_train, name) for name in names]
+    train(DELTACO, steps=1)
+    assert [getattr(lerobot_train, name) for name in names] == before
+
+
+@pytest.mark.parametrize(
+    ("damage", "cause"),
+    [
+        (lambda batch: batch["action"].fill_(torch.inf), "`action` has numbers that are not finite"),
+        (lambda batch: None, "lower --policy.optimizer_lr, or limit the gradient"),
+    ],
+    ids=["data", "divergence"],
+)
+def test_a_loss_that_is_not_finite_ends_the_training(train, tmp_path, monkeypatch, damage, cause):
+    finish = TaskConditionedPolicy._finish_step
+
+    def diverging(self, batch, loss, *arguments):
+        if int(self.step) == 2:
+            damage(batch)
+            loss = loss * torch.inf
+        return finish(self, batch, loss, *arguments)
+
+    monkeypatch.setattr(TaskConditionedPolicy, "_finish_step", diverging)
+    with pytest.raises(TrainingDivergedError, match="loss of training step 3 is not finite") as error:
+        train(DELTACO, steps=8)
+    assert cause in str(error.value)
+    assert "--resume=true" in str(error.value)
+    assert [path.parent.parent.name for path in tmp_path.rglob("model.safetensors")] == ["000002"]
+
+
+def test_weights_that_are_not_finite_are_not_saved(train, tmp_path, monkeypatch):
+    def overflowing(self, batch, forward=DeltacoPolicy.forward, **options):
+        result = forward(self, batch, **options)
+        with torch.no_grad():
+            next(self.model.parameters()).fill_(torch.nan)
+        return result
+
+    monkeypatch.setattr(DeltacoPolicy, "forward", overflowing)
+    with pytest.raises(
+        TrainingDivergedError, match="After training step 1, the weight model.* is not finite"
+    ):
+        train(DELTACO, steps=1, save_freq=1)
+    assert not list(tmp_path.rglob("model.safetensors"))
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({**DELTACO, "policy.upsampled_tasks": "dance"}, "is found in no task of the dataset"),
+        ({**ACT, "dataset.image_transforms.enable": True}, "cannot be transformed at random"),
+        ({**ACT, "dataset.streaming": True}, "use `lerobot-train`"),
+        ({**DELTACO, "dataset.root": "mistyped"}, "--dataset.root is mistyped, but there is no dataset"),
+        (
+            {**DELTACO, "policy.demo_repo_id": "a/b", "policy.demo_root": "mistyped"},
+            "--policy.demo_root is mistyped, but there is no dataset",
+        ),
+        ({**MATCH, "dataset.episodes": "[0,1,2]"}, "at least 24 episodes"),
+        ({**MATCH, "policy.gripper": "none"}, "`gripper` names"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_mistake_ends_the_command_in_one_line(root, tmp_path, monkeypatch, options, message):
+    monkeypatch.chdir(tmp_path)
+
+    def train(arguments):
+        run_training(root, tmp_path / "run", options)
+
+    monkeypatch.setattr(cli, "_train", train)
+    monkeypatch.setattr(sys, "argv", ["deltaco", "train"])
+    with pytest.raises(SystemExit) as error:
+        cli.main()
+    assert str(error.value).startswith("deltaco train: ")
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "mistyped").exists()
