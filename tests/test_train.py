@@ -131,7 +131,12 @@ def test_two_processes_train_alike_from_the_disk_and_from_memory(root, tmp_path)
     """Both end with the same weights, by gloo on a CPU, and other ones than a process alone."""
     # The one-hot policy needs no language encoder.
     options = {**DELTACO, "policy.method": "one_hot", "policy.tasks_per_batch": 0}
-    options |= {"policy.device": "cpu", "dataset.repo_id": "test/small", "dataset.root": root, "batch_size": 6}
+    options |= {
+        "policy.device": "cpu",
+        "dataset.repo_id": "test/small",
+        "dataset.root": root,
+        "batch_size": 6,
+    }
     options |= {"steps": 3, "save_freq": 3, "num_workers": 0}
     launch = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     programs = {
