@@ -155,7 +155,8 @@ class TaskConditionedConfig(PreTrainedConfig):
         """
         for name, valid in choices.items():
             if getattr(self, name) not in valid:
-                raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
+                names = ", ".join(filter(None, valid))
+                raise ValueError(f"`{name}` must be one of {names}. Got {getattr(self, name)!r}.")
 
     def check_ranges(self, **ranges: tuple[float, float]) -> None:
         """Checks that options are between their least and greatest valid values.
