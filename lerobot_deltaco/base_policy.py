@@ -306,7 +306,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Returns the card of the policy on the Hugging Face Hub. The arguments are those of LeRobot."""
         from lerobot_deltaco.cards import policy_card
 
-        return policy_card(self, dataset_repo_id, license, tags, cfg, dataset_meta)
+        demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
+        n_instructions = len(self.instructions.rows)
+        return policy_card(
+            self.config, demonstrated, n_instructions, dataset_repo_id, license, tags, cfg, dataset_meta
+        )
 
 
 def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) -> Tensor:

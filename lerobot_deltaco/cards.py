@@ -1,108 +1,24 @@
-"""Cards for the Hugging Face Hub, filled in from the templates in `datasets_cards/`."""
+"""Cards for the Hugging Face Hub, filled in from the templates in `datasets_cards/`: that of a policy."""
 
 from __future__ import annotations
 
 import html
-import io
 import json
 import re
 import shlex
-import textwrap
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jinja2
-import numpy as np
-import pyarrow.parquet as pq
-from PIL import Image
-
-from gym_deltaco.atomic_files import atomic_write, write_text
-from gym_deltaco.tasks import SCENARIOS, get_task
-from lerobot_deltaco.collect import read_description, read_plan
-from lerobot_deltaco.dataset_writer import INFO_FILE
 
 if TYPE_CHECKING:
     from huggingface_hub import ModelCard
     from lerobot.configs.train import TrainPipelineConfig
     from lerobot.datasets import LeRobotDatasetMetadata
 
-    from lerobot_deltaco.base_policy import TaskConditionedPolicy
-
-CARD_FILE = "README.md"
-TASKS_IMAGE = "assets/tasks.png"
-MAX_TASKS_SHOWN = 12
-
-
-def render(template: str, **values: Any) -> str:
-    """Fills in a template; a value that it lacks is an error.
-
-    Templates lie beside the package in a clone, and inside it in a wheel.
-    """
-    package = Path(__file__).parent
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader([package / "datasets_cards", package.parent / "datasets_cards"]),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters["quote"] = lambda value: shlex.quote(str(value))
-    return environment.get_template(template).render(**values)
-
-
-def dataset_card(root: Path, repo_id: str | None = None) -> str:
-    """Returns the card of a finished dataset: YAML metadata, then Markdown.
-
-    Args:
-        root: Folder of the dataset.
-        repo_id: Name of the dataset on the Hub; None if it is only in a folder.
-    """
-    files = [path for name in ("data", "meta") for path in (root / name).rglob("*") if path.is_file()]
-    return render(
-        "benchmark_dataset.md",
-        info=json.loads((root / INFO_FILE).read_text(encoding="utf-8")),
-        origin=read_description(root),
-        tasks=[get_task(task_id) for task_id in read_plan(root).task_ids],
-        scenarios=list(SCENARIOS.values()),
-        repo_id=repo_id,
-        tasks_image=TASKS_IMAGE,
-        megabytes=sum(path.stat().st_size for path in files) / 1e6,
-    )
-
-
-def write_dataset_card(root: Path, repo_id: str | None = None) -> None:
-    """Writes the card of a finished dataset and its image into the dataset's folder."""
-    _save_tasks_image(root)
-    write_text(root / CARD_FILE, dataset_card(root, repo_id))
-
-
-def _save_tasks_image(root: Path) -> None:
-    """Draws the first image of an episode of each of some tasks, with the instructions."""
-    from matplotlib.figure import Figure
-
-    plan = read_plan(root)
-    shown = np.unique(np.linspace(0, len(plan.task_ids) - 1, MAX_TASKS_SHOWN).round().astype(int))
-    episodes = pq.read_table(
-        root / "data",
-        columns=["observation.image", "benchmark.task_id"],
-        filters=[("frame_index", "==", 0), ("episode_index", "in", shown * plan.episodes_per_task)],
-    ).to_pylist()
-    n_columns = min(4, len(episodes))
-    n_rows = -(-len(episodes) // n_columns)
-    figure = Figure(figsize=(2.5 * n_columns, 3 * n_rows), layout="constrained")
-    grid = figure.subplots(n_rows, n_columns, squeeze=False)
-    for axes in grid.flat:
-        axes.axis("off")
-    for axes, episode in zip(grid.flat, episodes, strict=False):
-        axes.imshow(Image.open(io.BytesIO(episode["observation.image"]["bytes"])))
-        instruction = get_task(episode["benchmark.task_id"]).instruction
-        axes.set_title(textwrap.fill(instruction, 30), fontsize=8)
-    with atomic_write(root / TASKS_IMAGE) as temporary:
-        figure.savefig(temporary, format="png", dpi=120)
-
-
-# Policies
+    from lerobot_deltaco.base_config import TaskConditionedConfig
 
 _TAGS = ("robotics", "lerobot", "deltaco", "imitation-learning")
 _SUMMARIES = {
@@ -127,8 +43,27 @@ _HIDDEN = {
 }
 
 
+def render(template: str, **values: Any) -> str:
+    """Fills in a template; a value that it lacks is an error.
+
+    Templates lie beside the package in a clone, and inside it in a wheel.
+    """
+    package = Path(__file__).parent
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader([package / "datasets_cards", package.parent / "datasets_cards"]),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters["quote"] = lambda value: shlex.quote(str(value))
+    return environment.get_template(template).render(**values)
+
+
 def policy_card(
-    policy: TaskConditionedPolicy,
+    config: TaskConditionedConfig,
+    demonstrated_tasks: Sequence[str],
+    n_instructions: int,
     dataset_repo_id: str | None,
     license: str | None = None,
     tags: list[str] | None = None,
@@ -138,7 +73,9 @@ def policy_card(
     """Returns the card of a policy, as far as it is known at the push: without success rates.
 
     Args:
-        policy: The policy.
+        config: Configuration of the policy.
+        demonstrated_tasks: Tasks that the checkpoint has demonstrations of.
+        n_instructions: Number of instructions whose embeddings the checkpoint has.
         dataset_repo_id: Repository id of the training dataset.
         license: License of the weights, by its name on the Hub; None for Apache 2.0.
         tags: Additional tags.
@@ -151,10 +88,8 @@ def policy_card(
 
     from lerobot_deltaco.language import LANGUAGE_ENCODERS
 
-    config = policy.config
     kind = getattr(config, "method", None) or config.inputs
     training_tasks = [] if meta is None else list(meta.tasks.index)
-    demonstrated = [] if policy.demonstrations is None else list(policy.demonstrations.rows)
     image = {} if meta is None else meta.features.get("observation.image", {}).get("info") or {}
     lerobot_options = set(draccus.encode(PreTrainedConfig.get_choice_class("act")()))
     own = {name: value for name, value in draccus.encode(config).items() if name not in lerobot_options}
@@ -188,11 +123,11 @@ def policy_card(
         training_tasks=training_tasks,
         benchmark=image if "benchmark" in image else None,
         robot_type=None if meta is None else meta.robot_type,
-        demonstrated_tasks=[markdown(task) for task in demonstrated],
-        n_instructions=len(policy.instructions.rows),
+        demonstrated_tasks=[markdown(task) for task in demonstrated_tasks],
+        n_instructions=n_instructions,
         language_repo_id=LANGUAGE_ENCODERS[config.language_encoder].repo_id,
         repo_id=config.repo_id or "USER/NAME",
-        example_task=json.dumps(next(iter([*demonstrated, *training_tasks]), "the instruction"))[1:-1],
+        example_task=json.dumps(next(iter([*demonstrated_tasks, *training_tasks]), "the instruction"))[1:-1],
         inputs={name: tuple(feature.shape) for name, feature in config.input_features.items()},
         action_shape=tuple(config.action_feature.shape),
         options={name: markdown(str(value)) for name, value in options.items()},

@@ -10,8 +10,8 @@ from huggingface_hub import DatasetCard, HfApi, constants, get_token
 from huggingface_hub.errors import HFValidationError, RevisionNotFoundError
 from huggingface_hub.utils import validate_repo_id
 
-from lerobot_deltaco.cards import CARD_FILE, write_dataset_card
 from lerobot_deltaco.collect import is_finished
+from lerobot_deltaco.dataset_card import CARD_FILE, write_dataset_card
 from lerobot_deltaco.dataset_writer import CODEBASE_VERSION
 
 

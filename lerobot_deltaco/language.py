@@ -82,14 +82,17 @@ class InstructionEmbeddings:
         self._encode: LanguageEncoder | None = None
 
     def __call__(self, instructions: Sequence[str], device: torch.device | str) -> Tensor:
-        """Returns unit vectors of instructions, (instructions, embedding).
+        """Returns unit vectors of instructions, (instructions, embedding); zeros for an empty one.
 
         Raises:
             LanguageEncoderError: An instruction is not known yet, and the encoder cannot be loaded.
         """
-        self.add(instructions)
+        given = [n for n, text in enumerate(instructions) if text]
+        self.add([instructions[n] for n in given])
         self.embeddings = self.embeddings.to(device)
-        return self.embeddings[[self.rows[text] for text in instructions]]
+        found = self.embeddings.new_zeros(len(instructions), self.embeddings.shape[1])
+        found[given] = self.embeddings[[self.rows[instructions[n]] for n in given]]
+        return found
 
     def add(self, instructions: Sequence[str]) -> None:
         """Embeds those that are not known yet, in batches.

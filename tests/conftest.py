@@ -18,7 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 @pytest.fixture
 def fake_language(monkeypatch):
-    """A fake sentence encoder in the place of all others."""
+    """Replaces all sentence encoders by a fake one."""
     from small_policies import use_fake_encoder
 
     use_fake_encoder(monkeypatch)
@@ -27,10 +27,9 @@ def fake_language(monkeypatch):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     """A small dataset unlike the benchmark's."""
-    from small_policies import EPISODES_PER_TASK, TASKS, write_dataset
+    from small_policies import write_dataset
 
-    episodes = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
-    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
+    return write_dataset(tmp_path_factory.mktemp("data") / "foreign")
 
 
 @pytest.fixture
@@ -43,5 +42,7 @@ def make(dataset):
 
 @pytest.fixture
 def short_fit(monkeypatch):
-    """A fit of matching in two steps, where what it learns does not matter."""
-    monkeypatch.setattr("lerobot_deltaco.policy.goals.matching_fit.fit_matching.__defaults__", (2,))
+    """Limits the fit of feature matching to two steps, where what it learns does not matter."""
+    from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
+
+    monkeypatch.setattr(FeatureMatching.fit, "__defaults__", (2,))

@@ -1,6 +1,6 @@
-"""The paper's formulas in NumPy, in double precision, written from the paper, not from the code under test.
+"""The paper's formulas in NumPy and double precision, written from the paper and not from the code under test.
 
-Weights come by name: the names are those of a state dict, the arithmetic is this module's own.
+Only the names of weights are those of the networks.
 """
 
 import numpy as np
@@ -50,7 +50,7 @@ def batch_norm(x, weights, name, training):
 
 
 def fully_connected(x, weights, name):
-    """Layers with ReLU between them; `name` has them at the even places."""
+    """Layers with ReLU between them; `name` has them at the even indices."""
     layers = sorted(
         int(key.removeprefix(f"{name}.").split(".")[0])
         for key in weights
@@ -64,11 +64,11 @@ def fully_connected(x, weights, name):
 
 
 def spatial_softmax(maps):
-    """The mean place under each map's softmax, in -1..1: first all to the right, then all down."""
+    """The mean location under each map's softmax, in -1..1: all x, then all y."""
     batch, channels, height, width = maps.shape
-    shares = np.exp(log_softmax(maps.reshape(batch, channels, -1))).reshape(maps.shape)
-    x = (shares * np.linspace(-1, 1, width)).sum(axis=(2, 3))
-    y = (shares * np.linspace(-1, 1, height)[:, None]).sum(axis=(2, 3))
+    softmax = np.exp(log_softmax(maps.reshape(batch, channels, -1))).reshape(maps.shape)
+    x = (softmax * np.linspace(-1, 1, width)).sum(axis=(2, 3))
+    y = (softmax * np.linspace(-1, 1, height)[:, None]).sum(axis=(2, 3))
     return np.concatenate([x, y], axis=1)
 
 
@@ -83,7 +83,7 @@ def network(weights, images, film_embedding, concatenated, stem_stride, training
     """The policy's network (appendix B, figure 3).
 
     Args:
-        weights: By name, of a `ConditionedPolicy`.
+        weights: By name, of a `PolicyNetwork`.
         images: (batch, cameras, 3, h, w).
         film_embedding: (batch, embedding), or None.
         concatenated: (batch, numbers), or None.
@@ -91,7 +91,7 @@ def network(weights, images, film_embedding, concatenated, stem_stride, training
         training: Whether batch norms use the batch's statistics.
 
     Returns:
-        The outputs of the motion's layers, (batch, outputs), and the gripper's logit, (batch,), or None.
+        The outputs of the action's layers, (batch, outputs), and the gripper's logit, (batch,), or None.
     """
     batch, cameras = images.shape[:2]
     x = images.reshape(batch * cameras, *images.shape[2:])
@@ -114,9 +114,9 @@ def network(weights, images, film_embedding, concatenated, stem_stride, training
     features = spatial_softmax(x).reshape(batch, -1)
     if concatenated is not None:
         features = np.concatenate([features, concatenated], axis=1)
-    has_gripper = "gripper.0.weight" in weights
-    gripper = fully_connected(features, weights, "gripper")[:, 0] if has_gripper else None
-    return fully_connected(features, weights, "motion"), gripper
+    has_gripper = "gripper_head.0.weight" in weights
+    gripper = fully_connected(features, weights, "gripper_head")[:, 0] if has_gripper else None
+    return fully_connected(features, weights, "action_head"), gripper
 
 
 def encoder(weights, frames, rows, stride):
@@ -142,16 +142,16 @@ def log_std(raw):
 
 
 def normal_log_density(mean, log_std, target):
-    """log N(target; mean, exp(log_std)^2), summed over the axes of the motion."""
+    """log N(target; mean, exp(log_std)^2), summed over the dimensions of the action."""
     density = np.exp(-((target - mean) ** 2) / (2 * np.exp(log_std) ** 2)) / (
         np.exp(log_std) * np.sqrt(2 * np.pi)
     )
     return np.log(density).sum(axis=-1)
 
 
-def imitation_loss(outputs, gripper, raw_log_std, motion, gripper_target, gripper_weight):
+def imitation_loss(outputs, gripper, raw_log_std, action, gripper_target, gripper_weight):
     """L_pi of each sample: -log N, and the gripper's squared error."""
-    loss = -normal_log_density(outputs, log_std(raw_log_std), motion)
+    loss = -normal_log_density(outputs, log_std(raw_log_std), action)
     if gripper is None:
         return loss
     return loss + gripper_weight * (sigmoid(gripper) - gripper_target) ** 2

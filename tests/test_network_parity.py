@@ -5,8 +5,8 @@ import numpy_reference as reference
 import pytest
 import torch
 
-from lerobot_deltaco.policy.demo_encoders import ArrayEncoder
-from lerobot_deltaco.policy.losses import (
+from lerobot_deltaco.deltaco.demo_encoders import FrameGridEncoder
+from lerobot_deltaco.losses import (
     contrastive_logits,
     contrastive_loss,
     cosine_loss,
@@ -14,7 +14,7 @@ from lerobot_deltaco.policy.losses import (
     gripper_loss,
     mixture_negative_log_likelihood,
 )
-from lerobot_deltaco.policy.networks import ConditionedPolicy
+from lerobot_deltaco.networks import PolicyNetwork
 
 TOLERANCE = {"rtol": 1e-5, "atol": 1e-5}
 BATCH, CAMERAS, HEIGHT, WIDTH = 3, 2, 12, 16
@@ -22,7 +22,7 @@ FILM_DIM, CONCAT_DIM, EMBEDDING_DIM = 5, 4, 6
 
 
 def drawn_weights(module, seed=0):
-    """Gives a module weights that were drawn in NumPy. Returns them by name, in double precision."""
+    """Sets weights that NumPy draws. Returns them by name, in double precision."""
     rng = np.random.default_rng(seed)
     weights = {}
     for name, tensor in sorted(module.state_dict().items()):
@@ -34,7 +34,7 @@ def drawn_weights(module, seed=0):
         else:
             size = np.prod(shape[1:]) if len(shape) > 1 else 4
             weights[name] = rng.normal(size=shape) / np.sqrt(size)
-    # Rounded as the module has them, so that both compute with the same numbers.
+    # Rounded to single precision, so that both compute with the same numbers.
     weights = {name: value.astype(np.float32) for name, value in weights.items()}
     dtypes = {name: tensor.dtype for name, tensor in module.state_dict().items()}
     module.load_state_dict({name: torch.tensor(value).to(dtypes[name]) for name, value in weights.items()})
@@ -52,12 +52,12 @@ def drawn(*shape, seed):
     [(FILM_DIM, CONCAT_DIM, True, 1), (FILM_DIM, 0, True, 2), (0, CONCAT_DIM, False, 1)],
     ids=["both", "film, strided", "concatenated, no gripper"],
 )
-def test_the_policys_network(training, film_dim, concat_dim, has_gripper, stem_stride):
-    network = ConditionedPolicy(
+def test_policy_network_matches_formulas(training, film_dim, concat_dim, has_gripper, stem_stride):
+    network = PolicyNetwork(
         n_cameras=CAMERAS,
         film_dim=film_dim,
         concat_dim=concat_dim,
-        motion_dim=3,
+        action_dim=3,
         has_gripper=has_gripper,
         channels=(4, 4, 6),
         stem_stride=stem_stride,
@@ -70,9 +70,9 @@ def test_the_policys_network(training, film_dim, concat_dim, has_gripper, stem_s
     concat, concat_tensor = drawn(BATCH, concat_dim, seed=3) if concat_dim else (None, None)
     expected, expected_gripper = reference.network(weights, images, film, concat, stem_stride, training)
     with torch.no_grad():
-        motion, gripper = network(image_tensor, film_tensor, concat_tensor)
+        predicted, gripper = network(image_tensor, film_tensor, concat_tensor)
     assert np.abs(expected).max() > 0.1  # else this would test nothing
-    np.testing.assert_allclose(motion.mean.numpy(), expected, **TOLERANCE)
+    np.testing.assert_allclose(predicted.mode.numpy(), expected, **TOLERANCE)
     if has_gripper:
         np.testing.assert_allclose(gripper.numpy(), expected_gripper, **TOLERANCE)
     else:
@@ -83,8 +83,8 @@ def test_the_policys_network(training, film_dim, concat_dim, has_gripper, stem_s
 
 
 @pytest.mark.parametrize(("rows", "columns", "stride"), [(1, 2, 1), (2, 2, 1), (1, 3, 2)])
-def test_the_demonstration_encoder(rows, columns, stride):
-    encoder = ArrayEncoder(
+def test_demonstration_encoder_matches_formulas(rows, columns, stride):
+    encoder = FrameGridEncoder(
         HEIGHT, WIDTH, rows, columns, EMBEDDING_DIM, stride=stride, channels=4, hidden_dims=(9, 8)
     )
     weights = drawn_weights(encoder)
@@ -95,43 +95,43 @@ def test_the_demonstration_encoder(rows, columns, stride):
         np.testing.assert_allclose(encoder(frame_tensor).numpy(), expected, **TOLERANCE)
 
 
-def test_the_likelihood_of_a_motion():
+def test_likelihood_of_an_action_matches_formula():
     mean, mean_tensor = drawn(BATCH, 3, seed=1)
     target, target_tensor = drawn(BATCH, 3, seed=2)
     log_std, log_std_tensor = drawn(3, seed=3)
     expected = -reference.normal_log_density(mean, log_std, target)
     found = gaussian_negative_log_likelihood(mean_tensor, log_std_tensor, target_tensor)
     np.testing.assert_allclose(found.numpy(), expected, **TOLERANCE)
-    one_mode = mixture_negative_log_likelihood(
+    one_component = mixture_negative_log_likelihood(
         mean_tensor[:, None], torch.zeros(BATCH, 1), log_std_tensor, target_tensor
     )
-    np.testing.assert_allclose(one_mode.numpy(), expected, **TOLERANCE)
+    np.testing.assert_allclose(one_component.numpy(), expected, **TOLERANCE)
 
 
-def test_the_likelihood_of_a_mixture():
+def test_likelihood_of_a_mixture_matches_formula():
     means, mean_tensor = drawn(BATCH, 4, 3, seed=1)
     target, target_tensor = drawn(BATCH, 3, seed=2)
     log_std, log_std_tensor = drawn(4, 3, seed=3)
     logits, logit_tensor = drawn(BATCH, 4, seed=4)
-    shares = np.exp(reference.log_softmax(logits))
+    probabilities = np.exp(reference.log_softmax(logits))
     densities = np.exp(reference.normal_log_density(means, log_std, target[:, None]))
     found = mixture_negative_log_likelihood(mean_tensor, logit_tensor, log_std_tensor, target_tensor)
-    np.testing.assert_allclose(found.numpy(), -np.log((shares * densities).sum(axis=1)), **TOLERANCE)
+    np.testing.assert_allclose(found.numpy(), -np.log((probabilities * densities).sum(axis=1)), **TOLERANCE)
 
 
-def test_the_losses_of_the_gripper():
+def test_gripper_losses_match_formulas():
     logit, logit_tensor = drawn(BATCH, seed=1)
     target, target_tensor = drawn(BATCH, seed=2)
     target, target_tensor = (target + 1) / 2, (target_tensor + 1) / 2
-    share = reference.sigmoid(logit)
+    probability = reference.sigmoid(logit)
     squared = gripper_loss(logit_tensor, target_tensor, "squared_error")
-    np.testing.assert_allclose(squared.numpy(), (share - target) ** 2, **TOLERANCE)
+    np.testing.assert_allclose(squared.numpy(), (probability - target) ** 2, **TOLERANCE)
     entropy = gripper_loss(logit_tensor, target_tensor, "cross_entropy")
-    expected = -(target * np.log(share) + (1 - target) * np.log(1 - share))
+    expected = -(target * np.log(probability) + (1 - target) * np.log(1 - probability))
     np.testing.assert_allclose(entropy.numpy(), expected, **TOLERANCE)
 
 
-def test_the_losses_of_the_encoder():
+def test_encoder_losses_match_formulas():
     demo, language = (reference.unit(drawn(n, EMBEDDING_DIM, seed=n)[0]) for n in (5, 3))
     task = np.array([0, 2, 1, 1, 0])
     demo_tensor, language_tensor = torch.tensor(demo), torch.tensor(language)

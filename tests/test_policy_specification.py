@@ -1,4 +1,4 @@
-"""What every method, baseline and ablation must do, as one specification; and the paper's loss in numbers."""
+"""One specification for every method, baseline and ablation; and the paper's loss in numbers."""
 
 import copy
 import functools
@@ -12,83 +12,88 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.optim.factory import make_optimizer_and_scheduler
+from lerobot.policies import get_policy_class
 from small_policies import (
-    EPISODES_PER_TASK,
-    REPO_ID,
+    TABLE_LENGTH,
+    TABLE_TASKS,
     TASKS,
     batch_of,
+    demos_of,
     observation,
+    random_moves,
     small_policy,
-    use_fake_encoder,
-    write_dataset,
+    write_table,
 )
 
-from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy.options import BACKBONES, METHODS
+from lerobot_deltaco.deltaco.configuration_deltaco import METHODS
+from lerobot_deltaco.networks import BACKBONES
 
-OPTIONS = [
-    *({"method": method} for method in METHODS),
-    {"film": "demo+language", "concat": "none"},
-    {"film": "none", "concat": "demo+language"},
-    {"film": "language", "concat": "demo"},
-    {"encoder_loss": "cosine"},
-    {"encoder_loss": "none"},
-    {"demo_rows": 2},
-    {"demo_encoder": "attention"},
-    {"demo_encoder": "attention", "demo_rows": 2},
-    {"motion_modes": 3},
-    {"demos_per_task": 2},
-    {"gripper": "none"},
-    {"gripper_loss": "cross_entropy"},
-    {"language_encoder": "all-distilroberta-v1"},
-    {"dtype": "bfloat16", "grad_clip_norm": 1.0},
+VARIANTS = [
+    *(("deltaco", {"method": method}) for method in METHODS),
+    ("deltaco", {"film": "demo+language", "concat": "none"}),
+    ("deltaco", {"film": "none", "concat": "demo+language"}),
+    ("deltaco", {"film": "language", "concat": "demo"}),
+    ("deltaco", {"encoder_loss": "cosine"}),
+    ("deltaco", {"encoder_loss": "none"}),
+    ("deltaco", {"demo_rows": 2}),
+    ("deltaco", {"demo_encoder": "attention"}),
+    ("deltaco", {"demo_encoder": "attention", "demo_rows": 2, "num_mixture_components": 3}),
+    ("deltaco", {"gripper": "none"}),
+    ("deltaco", {"gripper_loss": "cross_entropy", "language_head": [8]}),
+    ("deltaco", {"language_encoder": "all-distilroberta-v1"}),
+    ("deltaco", {"dtype": "bfloat16", "grad_clip_norm": 1.0}),
+    ("deltaco_match", {}),
+    ("deltaco_match", {"inputs": "demonstration"}),
+    ("deltaco_match", {"inputs": "both", "feature_matching": False, "dtype": "bfloat16"}),
+    ("deltaco_match", {"p_drop_demonstration": 0.0, "p_drop_instruction": 0.0, "n_demonstrations": 2}),
+    ("deltaco_match", {"inputs": "instruction", "frames_after_release": None}),
+    ("deltaco_match", {"inputs": "one_hot", "num_mixture_components": 1}),
 ]
-# Samples of all three tasks.
-SAMPLES = [0, 7, 16, 22, 29]
-
-
-@pytest.fixture(autouse=True)
-def _language(monkeypatch):
-    use_fake_encoder(monkeypatch)
+# Frames that are trained on, of all tasks.
+FRAMES = {"deltaco": [0, 7, 16, 22, 29], "deltaco_match": list(range(0, 20 * TABLE_LENGTH, TABLE_LENGTH + 1))}
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    episodes = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
-    return write_dataset(tmp_path_factory.mktemp("data") / "foreign", episodes)
+def table(tmp_path_factory):
+    return write_table(tmp_path_factory.mktemp("data") / "table", random_moves(24))
 
 
-@pytest.fixture(params=OPTIONS, ids=str)
-def make(request, dataset):
-    """Makes the policy that is tested, and its processors, always with the same weights."""
+@pytest.fixture(params=VARIANTS, ids=lambda variant: f"{variant[0]}-{variant[1]}")
+def make(request, dataset, table, fake_language, short_fit):
+    """Makes the policy that is tested, its processors and its data, always with the same weights."""
+    policy_type, options = request.param
+    data = {"deltaco": dataset, "deltaco_match": table}[policy_type]
 
-    def make(**demos):
+    def make(with_demos=False):
         torch.manual_seed(0)
-        policy, before, after = small_policy(dataset, **demos, **request.param)
-        return SimpleNamespace(policy=policy, before=before, after=after, config=policy.config)
+        demos = demos_of(data) if with_demos else {}
+        policy, before, after = small_policy(data, policy_type, **demos, **options)
+        return SimpleNamespace(
+            policy=policy,
+            config=policy.config,
+            before=before,
+            after=after,
+            data=data,
+            tasks=TASKS if policy_type == "deltaco" else TABLE_TASKS,
+            batch=before(batch_of(data, FRAMES[policy_type])),
+        )
 
     return make
 
 
-@pytest.fixture
-def demos(dataset):
-    """Demonstrations for acting and for checkpoints. Without them, a policy acts by those of its training."""
-    return {"demo_repo_id": REPO_ID, "demo_root": str(dataset.root)}
-
-
 def optimizer_of(policy):
     """The optimizer that LeRobot makes for a policy."""
-    config = TrainPipelineConfig(DatasetConfig(REPO_ID), policy=policy.config)
+    config = TrainPipelineConfig(DatasetConfig("test/data"), policy=policy.config)
     config.optimizer = policy.config.get_optimizer_preset()
     return make_optimizer_and_scheduler(config, policy)[0]
 
 
-def trained(made, batch, n_steps=2):
-    """Losses of a few steps of training on one batch."""
+def train(made, n_steps=2):
+    """Trains on one batch. Returns the losses."""
     optimizer = optimizer_of(made.policy)
     losses = []
     for _ in range(n_steps):
-        loss, _ = made.policy(batch)
+        loss, _ = made.policy(made.batch)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
@@ -102,94 +107,87 @@ def assert_same(one, other):
         assert torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
 
 
-def test_it_trains_and_logs_and_leaves_the_batch_alone(make, dataset):
+def test_training_loss_has_gradients_and_leaves_the_batch_unchanged(make):
     made = make()
-    batch = made.before(batch_of(dataset, SAMPLES))
-    kept = copy.deepcopy(batch)
-    loss, logged = made.policy(batch)
+    kept = copy.deepcopy(made.batch)
+    loss, logged = made.policy(made.batch)
     loss.backward()
     assert loss.shape == ()
     assert torch.isfinite(loss)
-    assert {"motion_nll", "motion_mse"} <= set(logged)
+    assert {"action_nll", "action_mse"} <= set(logged)
     assert ("gripper_accuracy" in logged) == (made.config.gripper_index is not None)
-    assert ("demo_accuracy" in logged) == (made.config.conditioning.encoder_loss != "none")
-    without = [name for name, parameter in made.policy.named_parameters() if parameter.grad is None]
-    assert without == []
-    assert_same(kept, batch)
-    each, _ = make().policy(batch, reduction="none")
-    assert each.shape == (len(SAMPLES),)
+    if made.config.type == "deltaco":
+        assert ("demo_accuracy" in logged) == (made.config.conditioning.encoder_loss != "none")
+    trained = {id(parameter) for parameter in made.policy.get_optim_params()}
+    for name, parameter in made.policy.named_parameters():
+        assert (parameter.grad is not None) == (id(parameter) in trained), name
+    assert_same(kept, made.batch)
+    each, _ = make().policy(made.batch, reduction="none")
+    assert each.shape == (len(kept["task"]),)
     torch.testing.assert_close(each.mean(), loss.detach(), rtol=1e-5, atol=1e-5)
 
 
-def test_it_acts_in_batches_of_any_size_and_leaves_the_batch_alone(make, dataset, demos):
-    made = make(**demos)
+def test_acting_in_batches_of_any_size_leaves_the_batch_unchanged(make):
+    made = make()
+    made.policy(made.batch)
     made.policy.eval()
-    for tasks in (TASKS[:1], TASKS):
+    for tasks in (made.tasks[:1], made.tasks):
         made.policy.reset()
-        batch = made.before(observation(dataset, tasks))
+        batch = made.before(observation(made.data, tasks))
         kept = copy.deepcopy(batch)
         action = made.policy.select_action(batch)
         assert action.shape == (len(tasks), 3)
-        assert torch.isfinite(action).all()
         assert torch.isfinite(made.after(action)).all()
         assert torch.equal(made.policy.select_action(batch), action)
         assert torch.equal(made.policy.predict_action_chunk(batch), action[:, None])
         assert_same(kept, batch)
 
 
-def test_the_optimizer_has_every_weight_of_the_networks_and_changes_it(make, dataset):
+def test_optimizer_changes_every_weight_of_the_networks(make):
     made = make()
-    policy, batch = made.policy, made.before(batch_of(dataset, SAMPLES))
-    policy(batch)  # by now, all that is read later is there
+    policy = made.policy
+    policy(made.batch)  # by now, all that is read later is there
     (group,) = optimizer_of(policy).param_groups
-    expected = {
-        id(parameter)
-        for network in (policy.model, policy.demo_encoder, policy.language_head)
-        if network is not None
-        for parameter in network.parameters()
-    }
-    assert {id(parameter) for parameter in group["params"]} == expected
-    assert len(group["params"]) == len(expected)
+    trained = {id(parameter) for parameter in policy.get_optim_params()}
+    assert {id(parameter) for parameter in group["params"]} == trained
     # Neither demonstrations nor embeddings are weights: a checkpoint of the networks stays small.
-    assert not any("demonstrations" in name for name in policy.state_dict())
+    assert not any("demonstrations" in name or "bank" in name for name in policy.state_dict())
     before = {name: parameter.detach().clone() for name, parameter in policy.named_parameters()}
-    trained(made, batch)
-    unchanged = [
-        name for name, parameter in policy.named_parameters() if torch.equal(parameter, before[name])
-    ]
-    assert unchanged == []
+    train(made, n_steps=4)
+    for name, parameter in policy.named_parameters():
+        assert torch.equal(parameter, before[name]) == (id(parameter) not in trained), name
 
 
-def test_the_same_seed_gives_the_same_result_to_the_bit(make, dataset):
+def test_same_seed_gives_the_same_result_to_the_bit(make):
     results = []
     for _ in range(2):
         made = make()
-        batch = made.before(batch_of(dataset, SAMPLES))
-        losses = trained(made, batch)
+        losses = train(made)
         made.policy.eval()
-        results.append(
-            {"losses": losses, **made.policy.state_dict(), "act": made.policy.select_action(batch)}
-        )
+        torch.manual_seed(99)  # draws do not depend on the global generator
+        action = made.policy.select_action(made.batch)
+        results.append({"losses": losses, **made.policy.state_dict(), "action": action})
     assert_same(*results)
 
 
-def test_it_survives_saving_to_the_bit(make, dataset, demos, tmp_path):
-    made = make(**demos)
-    trained(made, made.before(batch_of(dataset, SAMPLES)), n_steps=1)
+def test_checkpoint_acts_the_same_to_the_bit(make, tmp_path):
+    made = make(with_demos=True)
+    train(made, n_steps=1)
     made.policy.eval()
-    batch = made.before(observation(dataset, TASKS))
+    batch = made.before(observation(made.data, made.tasks))
     action = made.policy.select_action(batch)
     made.policy.save_pretrained(tmp_path)
-    loaded = DeltacoPolicy.from_pretrained(tmp_path)
+    loaded = get_policy_class(made.config.type).from_pretrained(tmp_path)
     assert not loaded.training
     assert_same(loaded.state_dict(), made.policy.state_dict())
     assert torch.equal(loaded.select_action(batch), action)
-    # It needs its demonstrations' dataset no more.
+    # It does not need the dataset of its demonstrations any more.
     made.config.demo_repo_id = made.config.demo_root = None
     assert loaded.config == PreTrainedConfig.from_pretrained(tmp_path) == made.config
 
 
 # The loss, in numbers
+
 
 
 def weights_of(policy, prefix):
@@ -200,11 +198,12 @@ def weights_of(policy, prefix):
     }
 
 
+@pytest.mark.usefixtures("fake_language")
 @pytest.mark.parametrize("method", METHODS)
-def test_the_loss_is_that_of_the_papers_formulas(dataset, method):
-    # Of these samples' episodes, one has another one of its task, which demonstrates it, and the other none.
+def test_loss_matches_the_papers_formulas(dataset, method):
+    # Each of these samples has exactly one episode that can demonstrate it.
     samples, rows, task = [16, 22, 27], [4, 3, 5], np.array([0, 0, 1])
-    policy, before, _ = small_policy(dataset, method=method, crop_padding=0, demo_crop_padding=0)
+    policy, before, _ = small_policy(dataset, method=method, shift_padding=0, demo_shift_padding=0)
     batch = before(batch_of(dataset, samples))
     distinct = list(dict.fromkeys(batch["task"]))
     loss, _ = policy(batch, reduction="none")
@@ -215,14 +214,14 @@ def test_the_loss_is_that_of_the_papers_formulas(dataset, method):
     action = batch["action"].numpy().astype(np.float64)
     known = policy.instructions(distinct, "cpu").numpy().astype(np.float64)
     demo = None
-    if policy.config.uses_demo:
-        frames = policy.train_demonstrations.frames[rows].numpy() / 255
+    if policy.config.uses_demonstrations:
+        frames = policy.training_bank.frames[rows].numpy() / 255
         demo = reference.encoder(weights_of(policy, "demo_encoder."), frames, 1, stride.demo_stride)
     model = weights_of(policy, "model.")
     imitation = functools.partial(
         reference.imitation_loss,
         raw_log_std=model["raw_log_std"],
-        motion=action[:, [0, 2]],
+        action=action[:, [0, 2]],
         gripper_target=(action[:, 1] + 1) / 2,
         gripper_weight=30,
     )

@@ -31,8 +31,6 @@ def repository(tmp_path):
     (tmp_path / "pyproject.toml").write_text('[project]\nversion = "1.2.0"\n')
     (tmp_path / "CITATION.cff").write_text("title: x\nversion: 1.2.0\n")
     (tmp_path / "CHANGELOG.md").write_text(CHANGES)
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "docs" / "release-notes.md").write_text("# Release notes\n\n## 1.2.0\n\nText.\n")
     return tmp_path
 
 
@@ -46,7 +44,6 @@ def test_a_repository_that_is_ready_passes(repository):
         ("CITATION.cff", "1.2.0", "1.1.0", "pyproject.toml has version 1.2.0, CITATION.cff has 1.1.0"),
         ("CHANGELOG.md", "1.2.0 (2026-11-30)", "Unreleased", 'Got "## Unreleased"'),
         ("CHANGELOG.md", "- A thing.", "", "lists no changes of version 1.2.0"),
-        ("docs/release-notes.md", "1.2.0", "1.1.0", "no section of version 1.2.0"),
     ],
 )
 def test_what_is_missing_is_named(repository, file, before, after, message):

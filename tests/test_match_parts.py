@@ -1,0 +1,405 @@
+"""What `deltaco_match` consists of: keyframes, calibration, heights, correspondence, feature matching."""
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F  # noqa: N812
+from small_policies import TABLE_SIZE, draw_table, random_moves, state_at
+
+from lerobot_deltaco.deltaco_match.calibration import MIN_EPISODES, StateToImage
+from lerobot_deltaco.deltaco_match.correspondence import CorrespondenceNetwork, Given, peak_locations
+from lerobot_deltaco.deltaco_match.feature_matching import (
+    BagOfWords,
+    FeatureMatching,
+    bag_of_words,
+    vocabulary_of,
+)
+from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
+from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
+from lerobot_deltaco.deltaco_match.keyframes import (
+    Keyframes,
+    find_keyframes,
+    follows_gripper,
+    release_frames,
+    warn_if_inverted,
+)
+from lerobot_deltaco.deltaco_match.robot_states import RobotStates
+from lerobot_deltaco.losses import location_loss
+from lerobot_deltaco.networks import gaussian_maps
+
+# Keyframes
+
+
+def test_last_grasp_that_is_released_counts():
+    states = torch.arange(14).float()[:, None]
+    gripper = torch.tensor([1, -1, 1, 1, -1, -1, 1, 1, -1, 1.0, 1, 1, -1, -1])
+    spans = [(0, 7), (8, 10), (11, 13)]
+    keyframes = find_keyframes(states, gripper, spans)
+    assert keyframes.found.tolist() == [True, True, False]
+    # One step after the command to close, and the step of the command to open.
+    assert keyframes.states[:2, :, 0].tolist() == [[5, 6], [9, 9]]
+    assert keyframes.approach[:2, 0].tolist() == [2, 8]
+    assert not keyframes.states[2].any()
+    assert keyframes.pick_states[:, 0].isnan().tolist() == [False, False, True]
+    assert release_frames(gripper, spans) == [6, 9, None]
+
+
+def test_episodes_without_a_grasp_and_inverted_grippers_are_warned_of(caplog):
+    gripper = torch.tensor([1.0, 1, -1, 1, 1, 1, 1, 1])
+    find_keyframes(torch.zeros(8, 1), gripper, [(0, 3), (4, 7)])
+    assert "does not close and open again in 1 of 2 episodes" in caplog.text
+    warn_if_inverted(gripper, [(0, 3), (4, 7)])
+    assert "gripper_closed" not in caplog.text
+    warn_if_inverted(-gripper, [(0, 3), (4, 7)])
+    assert "closed at the beginning of 2 of 2 episodes" in caplog.text
+    assert "--policy.gripper_closed" in caplog.text
+
+
+def test_states_of_the_gripper_are_those_that_follow_its_commands():
+    generator = torch.Generator().manual_seed(0)
+    gripper = torch.randn(60, generator=generator).sign()
+    arm = torch.randn(60, generator=generator)
+    opening = torch.cat([gripper.new_ones(1), 0.02 + 0.5 * gripper[:-1]])
+    states = torch.stack([arm, opening, torch.full((60,), 7.0), -opening], dim=1)
+    assert follows_gripper(states, gripper, [(0, 29), (30, 59)]).tolist() == [False, True, False, True]
+
+
+# Calibration and heights
+
+
+def stacked_images(images):
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
+
+
+def test_changes_alone_tell_where_states_are_in_the_image():
+    moves = random_moves(60)
+    first = stacked_images([draw_table(task, start, other) for task, start, other, _ in moves])
+    last = stacked_images([draw_table(task, end, other) for task, _, other, end in moves])
+    starts = np.stack([start for _, start, _, _ in moves])
+    states = torch.from_numpy(np.stack([state_at(start) for start in starts]))
+    to_image = StateToImage(states.shape[1])
+    to_image.fit(first, last, states)
+    errors = (to_image(states) - torch.from_numpy(starts).float()).norm(dim=1) * TABLE_SIZE / 2  # px
+    assert errors.median() < 1
+    assert errors.max() < 2.5
+
+
+def test_too_few_grasps_are_an_error():
+    images = torch.zeros(8, 3, TABLE_SIZE, TABLE_SIZE, dtype=torch.uint8)
+    with pytest.raises(
+        ValueError,
+        match=r"at least 24 episodes in which the gripper closes and opens\. Got 8\. Collect more, or train "
+        "--policy.type=deltaco with --policy.demo_encoder=attention",
+    ):
+        StateToImage(2).fit(images, images, torch.zeros(8, 2))
+    assert MIN_EPISODES == 24
+
+
+class ExactLocations(torch.nn.Module):
+    """Inverts how `grasps` makes states from locations."""
+
+    def fit(self, *_): ...
+
+    def forward(self, states):
+        x, y, z = states[..., 0] - 2, states[..., 1], states[..., 2]
+        return torch.stack([x, (y - z * 0.2 / 3) / (5 - x * 0.2 / 3)], dim=-1)
+
+
+def grasps(heights):
+    """Keyframes whose states depend on the location and the height; the gripper's width is the last number.
+
+    Returns them, and the locations.
+    """
+    generator = torch.Generator().manual_seed(0)
+    locations = torch.rand(200, 2, 2, generator=generator) * 1.6 - 0.8
+    x, y = locations.unbind(dim=2)
+    height = torch.stack([heights, torch.zeros(200)], dim=1)  # of grasps alone
+    width = torch.rand(200, 2, generator=generator) * 40
+    states = torch.stack([2 + x, 5 * y + 0.2 * height, 3 * height + x * y, width], dim=2)
+    approach = states[:, 0] - torch.tensor([0, 0.2, 3, 0])
+    return Keyframes(states, approach, torch.arange(200) % 10 > 0), locations
+
+
+def fitted_states(keyframes):
+    robot_states = RobotStates(4)
+    robot_states.to_image = ExactLocations()
+    images = torch.zeros(200, 3, 2, 2, dtype=torch.uint8)
+    scale, shift = torch.tensor([0.5, 2, 0.1, 1]), torch.tensor([1.0, 0, -1, 0])
+    is_arm = torch.tensor([True, True, True, False])
+    return robot_states, robot_states.fit(keyframes, images, images, scale, shift, is_arm), (scale, shift)
+
+
+def test_heights_are_what_locations_do_not_tell_of_states():
+    heights = torch.randn(200, generator=torch.Generator().manual_seed(1))
+    keyframes, locations = grasps(heights)
+    robot_states, known, (scale, shift) = fitted_states(keyframes)
+    found = keyframes.found
+    torch.testing.assert_close(known.locations[found, 0], locations[found, 0], atol=0.1, rtol=0)
+    assert not known.locations[~found].any()
+    assert torch.corrcoef(torch.stack([known.heights[found], heights[found]]))[0, 1] > 0.98
+    assert known.heights[found].std() == pytest.approx(1, abs=0.05)
+    # Locations and heights give the states; without the heights, that of the grasp is not known.
+    true = keyframes.states * scale + shift
+    predicted = robot_states(known.locations, known.heights)
+    torch.testing.assert_close(predicted[found, 0, :3], true[found, 0, :3], atol=0.1, rtol=0)
+    error = (robot_states(known.locations, torch.zeros(200)) - predicted)[found, 0].abs().mean(dim=0)
+    assert error[2] > 0.1
+    assert error[0] < 0.02
+    unknown = robot_states.heights(torch.full((1, 4), torch.nan))
+    assert unknown.isnan().all()
+
+
+def test_heights_are_zero_if_all_grasps_have_the_same():
+    keyframes, locations = grasps(torch.zeros(200))
+    flat = keyframes.states.clone()
+    flat[..., 1], flat[..., 2], flat[..., 3] = 5 * locations[..., 1], 0, 1
+    robot_states, known, _ = fitted_states(keyframes._replace(states=flat))
+    assert not robot_states.height_to_state.any()
+    assert not known.heights.any()
+
+
+def test_height_of_a_demonstration_counts_as_far_as_it_can_be_trusted():
+    torch.manual_seed(0)
+    n, dim = 256, 8
+    estimator = GraspHeightEstimator(dim, condition_dim=2, has_demonstration=True)
+    optimizer = torch.optim.Adam(estimator.parameters(), lr=1e-2)
+    generator = torch.Generator().manual_seed(0)
+
+    def samples():
+        features = torch.randn(n, dim, 6, 6, generator=generator)
+        kind = torch.arange(n) % 2  # 0: the demonstration moved the same object
+        heights = torch.randn(n, generator=generator)
+        others = torch.where(kind == 0, heights, torch.randn(n, generator=generator))
+        return features, torch.zeros(n, 2), heights, torch.randn(n, dim), others, F.one_hot(kind, 2).float()
+
+    for _ in range(150):
+        loss = estimator.losses(*samples(), generator).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    features, locations, heights, descriptors, others, condition = samples()
+    found = estimator(features, locations, descriptors, others, condition)
+    same = condition[:, 0] == 1
+    assert (found - heights)[same].abs().mean() < 0.1
+    # Another object's height counts little, and an unknown one not at all.
+    by_appearance = estimator(features, locations, descriptors, others * torch.nan, condition)
+    assert by_appearance.isfinite().all()
+    change = (found - by_appearance)[~same].abs().mean()
+    assert change < 0.5 * (others - by_appearance)[~same].abs().mean()
+
+
+def test_unknown_heights_leave_the_loss_finite():
+    estimator = GraspHeightEstimator(4, 0, has_demonstration=True)
+    features, descriptors = torch.rand(3, 4, 6, 6), torch.rand(3, 4)
+    unknown = torch.full((3,), torch.nan)
+    losses = estimator.losses(
+        features, torch.zeros(3, 2), torch.zeros(3), descriptors, unknown, None, torch.Generator()
+    )
+    losses.sum().backward()
+    assert losses.isfinite().all()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in estimator.parameters())
+
+
+# Colors and maps
+
+
+def test_hue_augmentation_changes_a_fraction_of_the_samples_and_leaves_gray_gray():
+    changes = random_color_changes(400, 0.7, torch.Generator().manual_seed(0))
+    same = (changes == torch.eye(3)).all(dim=(1, 2))
+    assert 0.2 < same.float().mean() < 0.4
+    gray = change_colors(torch.full((400, 3, 2, 2), 0.4), changes)
+    torch.testing.assert_close(gray, gray[:, :1].expand_as(gray))
+    images = torch.rand(400, 2, 3, 4, 4)
+    changed = change_colors(images, changes)
+    assert changed.shape == images.shape
+    assert (changed >= 0).all()
+    assert (changed <= 1).all()
+    torch.testing.assert_close(changed[same], images[same])
+    # All images of a sample change alike.
+    torch.testing.assert_close(change_colors(images[:, 0], changes), changed[:, 0])
+
+
+def test_peak_of_a_map_is_its_location():
+    locations = torch.rand(5, 2, 2, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
+    maps = gaussian_maps(locations, 24, 32, 0.1)
+    torch.testing.assert_close(peak_locations(20 * maps), locations, atol=0.03, rtol=0)
+
+
+# Correspondence
+
+
+def test_descriptor_is_most_similar_to_what_it_was_made_of():
+    torch.manual_seed(0)
+    network = CorrespondenceNetwork(True, True, condition_dim=0).eval()
+    scene = torch.rand(1, 3, TABLE_SIZE, TABLE_SIZE)
+    description = network.describe(torch.stack([scene, scene], dim=1))
+    features = network.trunk(scene)
+    row, column = 3, 8
+    maps, _ = network(scene, scene, description._replace(moved=features[:, :, row, column]), None)
+    assert maps.shape == (1, 2, TABLE_SIZE // 2, TABLE_SIZE // 2)
+    assert maps[0, 0].argmax() == row * (TABLE_SIZE // 2) + column
+
+
+def test_correspondence_learns_to_find_the_moved_object():
+    torch.manual_seed(0)
+    moves = random_moves(32)
+    first = stacked_images([draw_table(task, start, other) for task, start, other, _ in moves]) / 255
+    last = stacked_images([draw_table(task, end, other) for task, _, other, end in moves]) / 255
+    locations = torch.from_numpy(np.stack([[start, end] for _, start, _, end in moves])).float()
+    network = CorrespondenceNetwork(True, True, condition_dim=0)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3)
+    # Episodes of a task, which is every other one, demonstrate each other.
+    rows, shown = torch.arange(24), (torch.arange(24) + 2) % 24
+    for _ in range(40):
+        description = network.describe(torch.stack([first[shown], last[shown]], dim=1))
+        maps, _ = network(first[rows], first[rows], description, None)
+        attention = description.attention.clamp_min(1e-9).log()
+        loss = location_loss(maps, locations[rows]) + location_loss(attention, locations[shown])
+        optimizer.zero_grad()
+        loss.mean().backward()
+        optimizer.step()
+    network.eval()
+    shown = torch.arange(24, 32) - 2
+    description = network.describe(torch.stack([first[shown], last[shown]], dim=1))
+    maps, _ = network(first[24:], first[24:], description, None)
+    errors = (peak_locations(maps)[:, 0] - locations[24:, 0]).norm(dim=1)
+    assert (errors < 0.25).sum() >= 7
+
+
+def test_what_is_not_given_does_not_matter():
+    torch.manual_seed(0)
+    network = CorrespondenceNetwork(True, False, condition_dim=5, takes_either=True).eval()
+    scenes, ends = torch.rand(2, 1, 3, 16, 16)[0], torch.rand(2, 1, 2, 3, 16, 16)
+    conditions = torch.randn(2, 1, 5)
+    for demonstration, condition in ((True, False), (False, True), (True, True)):
+        given = Given(torch.tensor([demonstration]), torch.tensor([condition]))
+        maps = torch.stack(
+            [
+                network(scenes, scenes, network.describe(shown), said, given)[0]
+                for shown, said in ((ends[0], conditions[0]), (ends[1], conditions[0]), (ends[0], conditions[1]))
+            ]
+        )
+        by_demonstration, by_condition = ((maps[0] != other).flatten(2).any(dim=2)[0] for other in maps[1:])
+        # With both, the demonstration says what to pick, and the condition where to place it.
+        assert by_demonstration.tolist() == [demonstration, demonstration and not condition]
+        assert by_condition.tolist() == [condition, condition]
+
+
+# Feature matching
+
+SIZE = 48
+SHAPE_TASKS = ["move the ring left", "move the cross right"]
+
+
+def draw_shapes(task, moved, other):
+    """Draws a ring and a cross of 9 x 9 px and one color on a gray table, the task's first."""
+    image = np.full((SIZE, SIZE, 3), 150, np.uint8)
+    y, x = np.mgrid[-4:5, -4:5]
+    ring, cross = (np.hypot(x, y) < 4.6) & (np.hypot(x, y) > 2.2), (abs(x) < 1.5) | (abs(y) < 1.5)
+    for mask, location in zip((ring, cross) if "ring" in task else (cross, ring), (moved, other), strict=True):
+        column, row = (round((c + 1) * SIZE / 2) for c in location)
+        image[row - 4 : row + 5, column - 4 : column + 5][mask] = (60, 90, 160)
+    return image
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    """First images, locations of the grasps, and tasks of episodes."""
+    moves = random_moves(60, SHAPE_TASKS)
+    images = stacked_images([draw_shapes(*move[:3]) for move in moves])
+    locations = torch.tensor(np.stack([move[1] for move in moves]), dtype=torch.float32)
+    return images, locations, [move[0] for move in moves]
+
+
+@pytest.fixture(scope="module")
+def matching(shapes):
+    """A feature matching that is fitted to 40 of the episodes."""
+    images, locations, tasks = (part[:40] for part in shapes)
+    vocabulary = vocabulary_of(SHAPE_TASKS)
+    matching = FeatureMatching(len(vocabulary))
+    matching.fit(images, locations, tasks, bag_of_words(vocabulary, tasks).present, seed=0, steps=35)
+    assert matching.fitted
+    return matching
+
+
+def fraction_found(matching, shapes, ends=None, words=None):
+    """Fraction of the other 20 episodes in which the object is found, by other episodes or by words."""
+    images, locations, tasks = (part[40:] for part in shapes)
+    scenes = images.float() / 255
+    shown = [(n + 2) % 20 for n in range(20)]
+    bag = None if words is None else bag_of_words(vocabulary_of(SHAPE_TASKS), [words(task) for task in tasks])
+    maps = matching.pick_map(
+        torch.zeros(20, SIZE // 2, SIZE // 2),
+        scenes,
+        scenes[shown][:, None, None].expand(-1, -1, 2, -1, -1, -1) if ends else None,
+        locations[shown][:, None] if ends else None,
+        bag,
+    )
+    errors = (peak_locations(maps[:, None])[:, 0] - locations).abs().amax(dim=1)
+    return (errors < 0.2).float().mean()
+
+
+def test_fit_finds_shapes_of_one_color_by_demonstrations_and_by_words(matching, shapes):
+    assert fraction_found(matching, shapes, ends=True) >= 0.9
+    assert fraction_found(matching, shapes, words=lambda task: task) >= 0.9
+    assert fraction_found(matching, shapes, words=lambda task: "RING!" if "ring" in task else "cross") >= 0.9
+    # Wrong words do not count if a demonstration shows what is meant, and words are unknown.
+    confused = fraction_found(matching, shapes, True, lambda t: "a cross" if "ring" in t else "a ring")
+    assert confused >= 0.9
+    assert fraction_found(matching, shapes, words=lambda task: "a b c") < 0.5
+
+
+def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes):
+    images, locations, tasks = (part[:8] for part in shapes)
+    present = bag_of_words(vocabulary_of(tasks), tasks).present
+    state = torch.get_rng_state()
+    fitted = []
+    for seed in (0, 0, 1):
+        matching = FeatureMatching(present.shape[1]).train()
+        torch.set_rng_state(state)
+        matching.fit(images, locations, tasks, present, seed=seed, steps=2)
+        assert torch.equal(torch.get_rng_state(), state)
+        assert not any(weights.requires_grad for weights in matching.parameters())
+        assert not any(module.training for module in matching.encoder.modules())
+        fitted.append(dict(matching.named_parameters()))
+    learned = [name for name in fitted[0] if not name.startswith("encoder.")]
+    assert len(learned) == 15  # of two networks: 6 weights and biases, and a scale; and the words
+    assert all(torch.equal(fitted[0][name], fitted[1][name]) for name in fitted[0])
+    drawn = [name for name in learned if "log_scale" not in name]
+    assert not any(torch.equal(fitted[0][name], fitted[2][name]) for name in drawn)
+
+
+def test_maps_of_large_images_have_a_limited_size(matching, shapes):
+    for size, cells in ((SIZE, SIZE // 4), (19, 4), (256, 24)):
+        images = F.interpolate(shapes[0][:1].float() / 255, size=(size, size))
+        maps = matching._encode(images)
+        assert maps.fine.shape == (1, 40, cells, cells)
+        assert maps.coarse.shape == (1, 80, cells, cells)
+        pick = matching.pick_map(torch.zeros(1, size // 2, size // 2), images, None, None, None)
+        assert pick.shape == (1, size // 2, size // 2)
+
+
+def test_fit_needs_a_task_with_two_grasps(shapes):
+    images, locations, tasks = (part[:6] for part in shapes)
+    locations = torch.where(torch.arange(6)[:, None] < 2, locations, torch.nan)
+    with pytest.raises(ValueError, match="at least two episodes .* 2 such episodes are of 2 different tasks"):
+        FeatureMatching().fit(images, locations, tasks, None, seed=0, steps=2)
+
+
+def test_fit_takes_a_limited_number_of_episodes(shapes, monkeypatch):
+    monkeypatch.setattr("lerobot_deltaco.deltaco_match.feature_matching._MAX_EPISODES", 6)
+    matching, seen = FeatureMatching(), []
+    encode = matching._encode_all
+    monkeypatch.setattr(matching, "_encode_all", lambda images: seen.append(len(images)) or encode(images))
+    matching.fit(*shapes, None, seed=0, steps=1)
+    assert seen == [6]
+
+
+def test_words_are_known_or_not():
+    vocabulary = vocabulary_of(["Put the red cup in.", "Put 2 bowls in."])
+    assert vocabulary == ["bowls", "cup", "in", "put", "red", "the"]
+    words = bag_of_words(vocabulary, ["put RED bowls, in!", "put the jar in", ""])
+    assert words.present.sum(dim=1).tolist() == [4, 3, 0]
+    assert words.is_known.tolist() == [True, False, False]
+    assert bag_of_words(vocabulary, []).present.shape == (0, 6)
+    assert isinstance(words, BagOfWords)

@@ -1,0 +1,356 @@
+"""`deltaco_match` on a small synthetic pick-and-place dataset: two objects, of which one is moved."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from small_policies import (
+    TABLE_LENGTH,
+    TABLE_SIZE,
+    TABLE_TASKS,
+    batch_of,
+    demos_of,
+    observation,
+    random_moves,
+    small_policy,
+    use_fake_encoder,
+    write_table,
+)
+
+from lerobot_deltaco.base_policy import TrainingDivergedError
+from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.frames import FramesInMemory
+
+pytestmark = pytest.mark.usefixtures("fake_language", "short_fit")
+
+N_EPISODES, N_TRAINED = 48, 36
+MOVES = random_moves(N_EPISODES)
+RED, BLUE = TABLE_TASKS  # the tasks of the even and the odd episodes
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    return write_table(tmp_path_factory.mktemp("data") / "table", MOVES)
+
+
+@pytest.fixture(scope="module")
+def frames(table):
+    return FramesInMemory(table)
+
+
+@pytest.fixture
+def make(table, frames):
+    """Makes a policy that has its training data, with the same weights each time."""
+
+    def make(**options):
+        torch.manual_seed(0)
+        config = {"feature_matching": False, **options}
+        policy, _, _ = small_policy(table, "deltaco_match", **config)
+        policy.set_training_data(
+            frames.demonstrations("observation.image", TABLE_SIZE, 2), frames.robot_data()
+        )
+        return policy
+
+    return make
+
+
+def first_frames(episodes):
+    return [episode * TABLE_LENGTH for episode in episodes]
+
+
+def found_in(policy, scenes, instructions, demonstrations):
+    """Returns what a policy finds in the first images of episodes, by episodes that demonstrate."""
+    policy.reset()
+    rows = [policy.training_bank.episode_rows(torch.tensor(own)).tolist() for own in demonstrations]
+    policy.set_tasks(instructions, [[policy.training_bank[row] for row in own] for own in rows])
+    policy.select_action(scenes)
+    return policy.found
+
+
+# Training
+
+
+@pytest.fixture(scope="module")
+def trained(table):
+    """A policy that has learned, on 36 of the 48 episodes, to find the locations."""
+    with pytest.MonkeyPatch.context() as patch:
+        use_fake_encoder(patch)
+        patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._LOCATED_FRACTION", 1.0)
+        patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._SHIFT_PADDING", 1)
+        policy, before, _ = small_policy(table, "deltaco_match", feature_matching=False)
+        optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
+        rng = np.random.default_rng(0)
+        for _ in range(60):
+            batch = before(batch_of(table, first_frames(rng.choice(N_TRAINED, 16))))
+            loss, _ = policy(batch)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    return policy.eval()
+
+
+def test_training_learns_to_find_what_a_demonstration_moved_and_an_instruction_names(trained, table):
+    held_out = range(N_TRAINED, N_EPISODES)
+    scenes, tasks = batch_of(table, first_frames(held_out)), [MOVES[n][0] for n in held_out]
+    shown = [[n - 2] for n in held_out]  # another episode of the same task
+    true = torch.tensor(np.stack([MOVES[n][1::2] for n in held_out])).float()  # picks and places
+    for instructions, demonstrations in (
+        (tasks, shown),
+        ([""] * len(tasks), shown),
+        (tasks, [[] for _ in tasks]),
+    ):
+        found = found_in(trained, scenes, instructions, demonstrations)
+        errors = (found.locations - true).abs() * TABLE_SIZE / 2  # px
+        assert (errors[:, 0].amax(dim=1) < 3).float().mean() > 0.8
+        # The tasks say on which side the object is placed; its y is that of the object.
+        assert (errors[:, 1, 0] < 3).float().mean() > 0.8
+        assert found.heights.isfinite().all()
+
+
+def test_locations_of_training_episodes_are_where_objects_were_moved(make):
+    known = make().training_locations
+    true = torch.tensor(np.stack([move[1::2] for move in MOVES])).float().clamp(-1, 1)
+    assert known.found.all()
+    errors = (known.locations - true).norm(dim=2) * TABLE_SIZE / 2
+    assert errors.median() < 1.5  # px
+
+
+def test_episode_without_a_grasp_teaches_nothing(make, table):
+    policy = make()
+    batch = batch_of(table, first_frames([0, 1]))
+
+    def losses():
+        policy.step.zero_()
+        policy.zero_grad()
+        loss, _ = policy(batch, reduction="none")
+        loss[0].backward()
+        return loss.tolist(), [weight.grad for weight in policy.model.parameters() if weight.grad is not None]
+
+    known, gradients = losses()
+    assert any(gradient.any() for gradient in gradients)
+    policy.training_locations.found[0] = False
+    unknown, gradients = losses()
+    assert unknown == [0, known[1]]
+    assert not any(gradient.any() for gradient in gradients)
+
+
+def test_data_from_memory_and_from_the_disk_give_the_same_loss(make, table):
+    batch = batch_of(table, first_frames([0, 1, 2, 3]))
+    torch.manual_seed(0)
+    from_disk, _, _ = small_policy(table, "deltaco_match", feature_matching=False)
+    losses = [policy(batch)[0] for policy in (make(), from_disk)]
+    torch.testing.assert_close(*losses)
+
+
+def test_too_few_grasps_are_an_error_before_training(table):
+    policy, _, _ = small_policy(table, "deltaco_match", demo_episodes=list(range(8)))
+    with pytest.raises(ValueError, match=r"at least 24 episodes .* Got 8\. Collect more, or train"):
+        policy(batch_of(table, [0]))
+
+
+def test_greater_values_of_the_gripper_may_mean_closed(make, table, frames, caplog):
+    bank, robot = frames.demonstrations("observation.image", TABLE_SIZE, 2), frames.robot_data()
+    inverted = robot._replace(actions=robot.actions * torch.tensor([1, 1, -1]))
+
+    def locations(data, **options):
+        caplog.clear()
+        policy, _, _ = small_policy(table, "deltaco_match", feature_matching=False, **options)
+        policy.set_training_data(copy.deepcopy(bank), data)
+        return policy.training_locations.locations
+
+    expected = locations(robot)
+    assert torch.equal(locations(inverted, gripper_closed="high"), expected)
+    assert "gripper_closed" not in caplog.text
+    # In the wrong direction, the end of the approach looks like a release.
+    assert not torch.equal(locations(inverted), expected)
+    assert "closed at the beginning of 48 of 48 episodes" in caplog.text
+    assert "--policy.gripper_closed" in caplog.text
+
+
+def test_damaged_data_and_diverged_losses_are_told_apart(make, table):
+    policy = make()
+    batch = batch_of(table, first_frames([0, 1]))
+    damaged = {**batch, "observation.state": batch["observation.state"] * torch.nan}
+    with pytest.raises(TrainingDivergedError, match="step 1 is not finite. In its batch, `observation.state`"):
+        policy(damaged)
+    with torch.no_grad():
+        policy.model.action_head[-1].bias.fill_(torch.inf)
+    with pytest.raises(TrainingDivergedError, match="The batch was finite, so the training has diverged"):
+        policy(batch)
+
+
+def test_validation_loss_of_held_back_episodes_finds_their_locations(make, table):
+    policy = make().eval()
+    batch = batch_of(table, first_frames([0, 1]))
+    known, _ = policy(batch, reduction="none")
+    policy.training_locations.found[:] = False  # as of episodes that are held back
+    found, logged = policy(batch, reduction="none")
+    assert found.isfinite().all()
+    assert not torch.equal(known, found)
+    assert policy(batch)[0] == found.mean()
+    assert int(policy.step) == 0
+    assert {"action_nll", "gripper_accuracy"} <= set(logged)
+
+
+# Feature matching
+
+
+def test_all_other_weights_are_the_same_without_feature_matching(make, table):
+    batch = batch_of(table, first_frames([0, 1]))
+    without, matching = make(), make(feature_matching=True)
+    assert matching.feature_matching.fitted
+    assert torch.equal(without(batch)[0], matching(batch)[0])
+    weights = {name: value for name, value in matching.state_dict().items() if "matching" not in name}
+    assert weights.keys() == without.state_dict().keys()
+    assert all(torch.equal(value, without.state_dict()[name]) for name, value in weights.items())
+
+
+def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
+    policy = make(feature_matching=True)
+    policy.save_pretrained(tmp_path)
+    before = copy.deepcopy(policy.feature_matching.state_dict())
+    resumed = DeltacoMatchPolicy.from_pretrained(tmp_path, dataset_meta=table.meta).train()
+    resumed.config.seed = 5
+    resumed(batch_of(table, [0]))
+    assert all(
+        torch.equal(before[name], value) for name, value in resumed.feature_matching.state_dict().items()
+    )
+    assert resumed.config.known_words == "blue left move object red right the".split()
+
+
+@pytest.mark.parametrize("size", [16, 19])
+def test_feature_matching_takes_images_of_any_size(table, size):
+    policy, _, _ = small_policy(table, "deltaco_match", image_size=size)
+    policy(batch_of(table, [0]))
+    policy.eval()
+    found = found_in(policy, batch_of(table, [0, 0]), [RED, ""], [[0], [2]])
+    assert found.locations.isfinite().all()
+    assert found.locations.abs().max() <= 1
+
+
+# Acting
+
+
+def test_what_is_left_out_does_not_matter(make, table):
+    policy = make().eval()
+    scene = batch_of(table, [0])
+
+    def found(instruction, *episodes):
+        return found_in(policy, scene, [instruction], [list(episodes)])
+
+    both, by_demonstration, by_instruction = found(RED, 0), found("", 0), found(RED)
+    assert both.by_demonstration == (True, False)
+    assert by_demonstration.by_demonstration == (True, True)
+    assert by_instruction.by_demonstration == (False, False)
+    assert by_instruction.attention is None
+    # With both, the demonstration alone says what to pick, and the instruction alone where to place it.
+    torch.testing.assert_close(both.maps[:, 1], found(RED, 1).maps[:, 1])
+    assert not torch.equal(both.maps[:, 0], found(RED, 1).maps[:, 0])
+    assert not torch.equal(both.maps[:, 1], found(BLUE, 0).maps[:, 1])
+
+
+def test_checkpoint_acts_without_a_demonstration_and_without_an_encoder(make, table, tmp_path, monkeypatch):
+    make(**demos_of(table)).save_pretrained(tmp_path)
+    loaded = DeltacoMatchPolicy.from_pretrained(tmp_path)
+    monkeypatch.setattr(
+        "lerobot_deltaco.language.load_language_encoder", lambda _: pytest.fail("loaded the encoder")
+    )
+    # Nothing is embedded for an instruction that is left out.
+    loaded.set_tasks([""], [loaded.demonstrations.of_task(RED)[:1]])
+    assert loaded.select_action(observation(table, [RED])).shape == (1, 3)
+    assert loaded.demonstrations.pick_states.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("options", "instruction", "n_demonstrations", "message"),
+    [
+        ({}, "", 0, "Neither a demonstration nor an instruction is given"),
+        ({"p_drop_demonstration": 0.0}, RED, 0, "demonstration is left out.*`p_drop_demonstration` was 0"),
+        ({"p_drop_instruction": 0.0}, "", 1, "instruction is left out.*`p_drop_instruction` was 0"),
+        ({"inputs": "demonstration"}, RED, 0, "`inputs` was 'demonstration'"),
+        ({"inputs": "instruction"}, "", 0, "`inputs` was 'instruction'"),
+        ({"inputs": "one_hot"}, "juggle", 0, "does not know the task 'juggle'"),
+    ],
+)
+def test_left_out_inputs_that_were_not_learned_are_errors(
+    make, table, options, instruction, n_demonstrations, message
+):
+    policy = make(**options).eval()
+    with pytest.raises(ValueError, match=message):
+        found_in(policy, batch_of(table, [0]), [instruction], [[0] * n_demonstrations])
+
+
+def test_samples_of_a_batch_need_as_many_demonstrations_each(make, table):
+    with pytest.raises(ValueError, match=r"as many demonstrations each. Got \[0, 1\]"):
+        found_in(make().eval(), batch_of(table, [0, 0]), [RED, RED], [[0], []])
+
+
+def test_several_demonstrations_are_combined(make, table):
+    policy = make(n_demonstrations=2).eval()
+    scene = batch_of(table, [0])
+    one, other, both = (found_in(policy, scene, [RED], [episodes]) for episodes in ([0], [2], [0, 2]))
+    for single in (one, other):
+        assert not torch.equal(both.maps[:, 0], single.maps[:, 0])
+        torch.testing.assert_close(both.maps[:, 1], single.maps[:, 1])
+    # Without `set_tasks`, the bank gives as many.
+    policy.reset()
+    policy.select_action(scene | {"task": [RED]})
+    torch.testing.assert_close(policy.found.maps, both.maps)
+
+
+def test_locations_are_found_once_in_the_first_image_of_an_episode(make, table, monkeypatch):
+    policy = make().eval()
+    calls, find = [], policy._find
+    monkeypatch.setattr(policy, "_find", lambda *inputs: calls.append(1) or find(*inputs))
+    assert policy.found is None
+    for n_episodes in (1, 2):
+        policy.reset()
+        for frame in (0, 3):
+            policy.select_action(batch_of(table, [frame]))
+            locations = policy.found.locations
+        assert policy.found.locations is locations
+        assert len(calls) == n_episodes
+
+
+def test_height_bias_is_added_when_acting(make, table):
+    heights = [
+        found_in(make(grasp_height_bias=bias).eval(), batch_of(table, [0]), [RED], [[0]]).heights
+        for bias in (0.0, 0.5)
+    ]
+    torch.testing.assert_close(heights[1], heights[0] + 0.5)
+
+
+# Errors
+
+
+def test_demonstrations_of_another_robot_are_an_error(table, dataset, tmp_path):
+    other = write_table(tmp_path / "other", MOVES[:2], n_joints=5)
+    with pytest.raises(ValueError, match="of another robot: their states and actions have 5 and 3 numbers"):
+        small_policy(table, "deltaco_match", **demos_of(other))
+    with pytest.raises(ValueError, match="have no camera 'observation.image', only observation.images.top"):
+        small_policy(table, "deltaco_match", **demos_of(dataset))
+
+
+def test_a_gripper_and_a_state_are_needed(table):
+    with pytest.raises(ValueError, match=r"needs the feature 'observation.state' and a gripper"):
+        small_policy(table, "deltaco_match", gripper="none")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"inputs": "video"}, "`inputs` must be one of both, demonstration, instruction, one_hot"),
+        ({"p_hue_augmentation": 1.5}, "`p_hue_augmentation` must be from 0 to 1"),
+        ({"n_demonstrations": 0}, "`n_demonstrations` must be from 1"),
+        ({"n_demonstrations": 5, "demo_episode": 0}, "names a single demonstration, but .* is 5"),
+        ({"colorless_tasks": "("}, "`colorless_tasks` must be a regular expression"),
+        ({"grasp_height_bias": float("nan")}, "`grasp_height_bias` must be from -10 to 10"),
+        ({"frames_after_release": -1}, "`frames_after_release` must be at least 0"),
+        ({"p_drop_demonstration": 0.5, "p_drop_instruction": 0.5}, "must sum to less than 1"),
+    ],
+)
+def test_invalid_options_say_what_is_valid(options, message):
+    with pytest.raises(ValueError, match=message):
+        DeltacoMatchConfig(device="cpu", **options)
