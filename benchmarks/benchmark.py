@@ -172,7 +172,8 @@ def train(
         make_dataset(root)
         for name, in_memory in (("lerobot-train", False), ("deltaco train", True)):
             results[f"{name}: data alone, samples/s"] = _data_rate(root, in_memory, batch_size)
-            words = {f"policy.{word.partition('=')[0]}": word.partition("=")[2] for word in options}
+            words: dict[str, Any] = {}
+            words |= {f"policy.{word.partition('=')[0]}": word.partition("=")[2] for word in options}
             words |= {"policy.type": policy_type, "policy.tasks_per_batch": N_TASKS if in_memory else 0}
             words |= {"batch_size": batch_size, "steps": steps, "output_dir": f"{folder}/{in_memory}"}
             results[f"{name}: training, samples/s"] = _training_rate(root, in_memory, words)
