@@ -304,7 +304,8 @@ def read_demonstrations(
     episodes = list(range(meta.total_episodes)) if episodes is None else list(episodes)
     if not episodes or not all(0 <= episode < meta.total_episodes for episode in episodes):
         raise ValueError(
-            f"{repo_id} has the episodes 0 to {meta.total_episodes - 1}. Got {_shortened(episodes)}."
+            f"{repo_id} has the episodes 0 to {meta.total_episodes - 1}. Got {_shortened(episodes)}. "
+            "Name others in `demo_episodes`."
         )
     frames, tasks, target_objects = [], [], []
     for episode in tqdm(episodes, desc="Reading demonstrations", unit="episode", leave=False):

@@ -1,101 +1,125 @@
-"""What `make release` checks of versions, change log and wheel."""
+"""What `make release` checks and publishes."""
 
-import importlib.util
+import json
 import subprocess
 from pathlib import Path
 
 import pytest
+from fake_hub import USER, WITHOUT_CARD_CHECK, FakeHub
+from fresh_python import run_python
 
-ROOT = Path(__file__).parents[1]
-_SPEC = importlib.util.spec_from_file_location("check_release", ROOT / "scripts" / "check_release.py")
-check_release = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(check_release)
+SCRIPTS = Path(__file__).parents[1] / "scripts"
 
-CHANGES = """# Changelog
 
-## 1.2.0 (2026-11-30)
+@pytest.fixture
+def release(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    import release
 
-### Added
-
-- A thing.
-
-## 1.1.0 (2026-10-01)
-
-- Old.
-"""
+    return release
 
 
 @pytest.fixture
 def repository(tmp_path):
     """A repository that is ready for the release of 1.2.0."""
-    (tmp_path / "pyproject.toml").write_text('[project]\nversion = "1.2.0"\n')
-    (tmp_path / "CITATION.cff").write_text("title: x\nversion: 1.2.0\n")
-    (tmp_path / "CHANGELOG.md").write_text(CHANGES)
+    files = {
+        "pyproject.toml": '[project]\nversion = "1.2.0"\n',
+        "CITATION.cff": "title: x\nversion: 1.2.0\n",
+        "CHANGELOG.md": "# Log\n\n## 1.2.0 (2026-11-30)\n\n- A thing.\n\n## 1.1.0 (2026-10-01)\n\n- Old.\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
     return tmp_path
-
-
-def test_a_repository_that_is_ready_passes(repository):
-    assert check_release.check_version(repository) == "1.2.0"
 
 
 @pytest.mark.parametrize(
     ("file", "before", "after", "message"),
     [
-        ("CITATION.cff", "1.2.0", "1.1.0", "pyproject.toml has version 1.2.0, CITATION.cff has 1.1.0"),
+        ("CITATION.cff", "1.2.0", "1.1.0", "pyproject.toml has version 1.2.0, CITATION.cff has another one"),
         ("CHANGELOG.md", "1.2.0 (2026-11-30)", "Unreleased", 'Got "## Unreleased"'),
-        ("CHANGELOG.md", "- A thing.", "", "lists no changes of version 1.2.0"),
+        ("CHANGELOG.md", "- A thing.", "", "says nothing of version 1.2.0"),
     ],
 )
-def test_what_is_missing_is_named(repository, file, before, after, message):
+def test_a_version_that_is_not_ready_is_refused(release, repository, file, before, after, message):
+    assert release.check_version(repository) == "1.2.0"
     path = repository / file
     path.write_text(path.read_text().replace(before, after))
-    with pytest.raises(check_release.ReleaseError) as error:
-        check_release.check_version(repository)
+    with pytest.raises(release.ReleaseError) as error:
+        release.check_version(repository)
     assert message in str(error.value)
 
 
-def test_the_tree_must_be_clean_and_the_version_new(repository):
+def test_the_tree_must_be_clean_and_the_version_new(release, repository):
     def git(*words):
         identity = ["-c", "user.name=Test", "-c", "user.email=test@example.org"]
         subprocess.run(["git", *identity, *words], cwd=repository, check=True, capture_output=True)
 
     git("init")
-    with pytest.raises(check_release.ReleaseError, match="Commit or remove"):
-        check_release.check_working_tree(repository)
+    with pytest.raises(release.ReleaseError, match="Commit or remove"):
+        release.check_working_tree(repository)
     git("add", "-A")
     git("commit", "-m", "Release 1.2.0")
-    check_release.check_working_tree(repository)
+    release.check_working_tree(repository)
     git("tag", "v1.2.0")
-    with pytest.raises(check_release.ReleaseError, match=r"The tag v1\.2\.0 is there already"):
-        check_release.check_working_tree(repository)
+    with pytest.raises(release.ReleaseError, match=r"The tag v1\.2\.0 exists already"):
+        release.check_working_tree(repository)
 
 
-def test_a_folder_without_exactly_one_wheel_is_refused(tmp_path):
-    with pytest.raises(check_release.ReleaseError, match="has 0"):
-        check_release.find_wheel(tmp_path)
-    wheel = tmp_path / "lerobot_policy_deltaco-1.2.0-py3-none-any.whl"
-    wheel.touch()
-    assert check_release.find_wheel(tmp_path) == wheel
+def test_what_publishing_needs_is_checked_before(release, tmp_path, monkeypatch):
+    monkeypatch.delenv("UV_PUBLISH_TOKEN", raising=False)
+    with pytest.raises(release.ReleaseError, match="Set UV_PUBLISH_TOKEN"):
+        release.check_publishing(USER, ())
+    monkeypatch.setenv("UV_PUBLISH_TOKEN", "token")
+    monkeypatch.setattr("lerobot_deltaco.hub.get_token", lambda: "token")
+    release.check_publishing(USER, ())
+    with pytest.raises(release.ReleaseError, match="holds no finished dataset"):
+        release.check_publishing(USER, [tmp_path])
+    with pytest.raises(release.ReleaseError, match="does not say 'USER/NAME'"):
+        release.hub_files(release.CHECKPOINT, {"USER/NAME": "me/deltaco"})
+    with pytest.raises(SystemExit, match="A rehearsal publishes nothing"):
+        release.release(USER, rehearse=True)
 
 
-def test_a_command_that_is_missing_is_named(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(check_release.ReleaseError, match="`git` is missing"):
-        check_release.check_working_tree(tmp_path)
+PUBLISH = """
+import sys
+sys.path.insert(0, {scripts!r})
+import release
+release._run = lambda command, folder: print(*command)
+release.publish({user!r}, ())
+"""
+USE = """
+import json
+from lerobot.envs import close_envs, make_env
+from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+policy = DeltacoMatchPolicy.from_pretrained("{user}/deltaco_pick_place")
+envs = make_env("{user}/deltaco", trust_remote_code=True)
+print(json.dumps([len(policy.demonstrations), {{kind: len(group) for kind, group in envs.items()}}]))
+close_envs(envs)
+"""
 
 
-def test_a_rehearsal_is_not_published():
-    # -n: nothing is run.
-    command = ["make", "-n", "-C", str(ROOT), "release", "HUB_USER=me"]
-    result = subprocess.run([*command, "ARGS=--rehearse"], capture_output=True, text=True)
-    assert result.returncode != 0
-    assert "A rehearsal publishes nothing: leave out HUB_USER" in result.stderr
-    assert "publish_release.py" not in result.stdout
+@pytest.mark.slow
+def test_what_is_published_can_be_used_by_a_stranger(tmp_path):
+    with FakeHub() as hub:
+        program = WITHOUT_CARD_CHECK + PUBLISH.format(scripts=str(SCRIPTS), user=USER)
+        for _ in range(2):  # it can be published again
+            result = run_python(program, env=hub.environment(tmp_path / "maintainer"))
+            assert result.returncode == 0, result.stderr
+        assert f"Published {hub.url}/{USER}/deltaco_pick_place" in result.stdout
+        cards = [
+            hub.repos["model", f"{USER}/{name}"].files()["README.md"].decode()
+            for name in ("deltaco", "deltaco_pick_place")
+        ]
+        assert f'make_env("{USER}/deltaco"' in cards[0]
+        assert f"{USER}/deltaco_pick_place" in cards[1]
+        stranger = hub.environment(tmp_path / "stranger", token=None)
+        result = run_python(USE.format(user=USER), env=stranger, cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+        n_demonstrations, groups = json.loads(result.stdout.splitlines()[-1])
+        assert n_demonstrations == sum(groups.values()) == 102
+
+
+def test_make_passes_its_variables_to_the_script():
+    command = ["make", "-n", "-C", str(SCRIPTS.parent), "release", "HUB_USER=me", "DATASETS=data/train"]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "publish_release.py me" in result.stdout
-
-
-def test_the_versions_of_this_repository_agree():
-    citation = (ROOT / "CITATION.cff").read_text()
-    project = check_release.tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert f"\nversion: {project['version']}\n" in citation
+    assert "scripts/release.py --user me --datasets data/train" in result.stdout

@@ -1,0 +1,362 @@
+"""Speed of the environment, of data collection, of training and of the policies.
+
+    python benchmarks/benchmark.py env|collect|train|policy
+
+Times are of one machine: compare figures of one run, made while nothing else uses the processor.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+N_TASKS = 16  # of made-up datasets
+
+
+def main() -> None:
+    """Runs the benchmark that the command line names, and prints its table."""
+    import tyro
+
+    commands: dict[str, Callable[..., dict[str, float]]] = {
+        "env": env,
+        "collect": collect,
+        "train": train,
+        "policy": policy,
+    }
+    results = tyro.extras.subcommand_cli_from_dict(commands, description=(__doc__ or "").partition("\n")[0])
+    width = max(map(len, results))
+    sys.stdout.writelines(f"{name:{width}}  {value:12.3f}\n" for name, value in results.items())
+
+
+def seconds_of(action: Callable[[], object], seconds: float = 1.0) -> float:
+    """Returns the median duration of an action, s, over as many calls as fit into some seconds."""
+    action()  # warms up
+    times: list[float] = []
+    while len(times) < 3 or sum(times) < seconds:
+        start = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+# The environment
+
+
+def env(
+    episodes: int = 300, workers: int = len(os.sched_getaffinity(0)), seconds: float = 1.0
+) -> dict[str, float]:
+    """Measures the parts of an episode, and episodes of the expert.
+
+    Args:
+        episodes: Number of episodes for each of two runs: in one process, and in several.
+        workers: Number of processes of the second run.
+        seconds: Duration of the measurement of each part.
+    """
+    import psutil
+
+    from gym_deltaco import kinematics
+    from gym_deltaco.env import PickPlaceEnv
+
+    before = psutil.Process().memory_info().rss
+    pick_place = PickPlaceEnv()
+    pick_place.reset(seed=0)
+    memory = (psutil.Process().memory_info().rss - before) / 1e6
+    scene, seeds = pick_place.scene, itertools.count()
+    signs = itertools.cycle([1.0, -1.0])
+
+    def step(switches_gripper: bool) -> None:
+        sign = next(signs)
+        gripper = sign if switches_gripper else 1.0
+        pick_place.step(np.array([0.5 * sign, 0.3 * sign, 0.2 * sign, gripper], dtype=np.float32))
+
+    parts: dict[str, Callable[[], object]] = {
+        "control step": lambda: step(switches_gripper=False),
+        "step that opens or closes the gripper": lambda: step(switches_gripper=True),
+        "inverse kinematics": lambda: kinematics.inverse(scene.arm.position),
+        "image of 48 px": lambda: scene.render(48),
+        "image of 96 px": lambda: scene.render(96),
+        "image of 256 px": lambda: scene.render(256),
+        "reset": lambda: pick_place.reset(seed=next(seeds)),
+    }
+    results = {f"{name}, ms": 1e3 * seconds_of(action, seconds) for name, action in parts.items()}
+    pick_place.close()
+    results["memory of an environment, MB"] = memory
+    results["expert, 1 process, episodes/s"], success = _expert_rate(episodes, 1)
+    results[f"expert, {workers} processes, episodes/s"], _ = _expert_rate(episodes, workers)
+    return {**results, "expert, success, %": 100 * success}
+
+
+def _expert_rate(n_episodes: int, n_workers: int) -> tuple[float, float]:
+    """Returns episodes per second, one a task, and the fraction of successes."""
+    with get_context("spawn").Pool(n_workers) as pool:
+        pool.map(_run_expert, range(4 * n_workers), chunksize=1)  # starts the simulators
+        start = time.perf_counter()
+        successes = pool.map(
+            _run_expert, range(n_episodes), chunksize=max(1, min(5, n_episodes // n_workers))
+        )
+        return n_episodes / (time.perf_counter() - start), float(np.mean(successes))
+
+
+_env: Any = None  # of a worker
+
+
+def _run_expert(number: int) -> bool:
+    global _env
+    from gym_deltaco.env import PickPlaceEnv
+    from gym_deltaco.expert import expert_episode
+    from gym_deltaco.seeding import episode_seed
+
+    _env = _env or PickPlaceEnv()
+    # 7 and 300 have no common divisor, so 300 episodes meet every task once.
+    task_id = 7 * number % 300
+    steps = list(expert_episode(_env, task_id, episode_seed(0, "evaluation", task_id, 0, number)))
+    return bool(steps[-1].info["is_success"])
+
+
+# Collection
+
+
+def collect(episodes_per_task: int = 16, workers: int = len(os.sched_getaffinity(0))) -> dict[str, float]:
+    """Measures `deltaco collect`, from the simulation to the finished dataset, on tasks of all kinds.
+
+    Args:
+        episodes_per_task: Number of episodes of each of 20 tasks.
+        workers: Number of processes of the second run; the first has one.
+    """
+    from lerobot_deltaco.collect import CollectionPlan
+    from lerobot_deltaco.collect import collect as collect_dataset
+
+    plan = CollectionPlan(",".join(map(str, range(0, 300, 15))), episodes_per_task)
+    results = {}
+    for n_workers in sorted({1, workers}):
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            summary = collect_dataset(Path(folder), plan, n_workers)
+            results[f"{n_workers} processes, episodes/s"] = summary.episodes_per_s or 0.0
+            results[f"{n_workers} processes, all, s"] = time.perf_counter() - start
+    rate = results["1 processes, episodes/s"]
+    results[f"ratio of {workers} processes to 1"] = results[f"{workers} processes, episodes/s"] / rate
+    return results
+
+
+# Training
+
+
+def train(
+    policy_type: str = "deltaco", batch_size: int = 256, steps: int = 10, options: tuple[str, ...] = ()
+) -> dict[str, float]:
+    """Compares `deltaco train` with `lerobot-train`: samples per second of the data alone, and of training.
+
+    Args:
+        policy_type: deltaco or deltaco_match.
+        batch_size: Size of the batches, a multiple of 16.
+        steps: Number of steps of each training, of which the first third is not counted.
+        options: More options of the policy, such as backbone=strided.
+    """
+    if batch_size < N_TASKS or batch_size % N_TASKS or steps < 3:
+        raise ValueError(f"`batch_size` must be a multiple of {N_TASKS}, and `steps` at least 3.")
+    results = {}
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "dataset"
+        make_dataset(root)
+        for name, in_memory in (("lerobot-train", False), ("deltaco train", True)):
+            results[f"{name}: data alone, samples/s"] = _data_rate(root, in_memory, batch_size)
+            words: dict[str, Any] = {}
+            words |= {f"policy.{word.partition('=')[0]}": word.partition("=")[2] for word in options}
+            words |= {"policy.type": policy_type, "policy.tasks_per_batch": N_TASKS if in_memory else 0}
+            words |= {"batch_size": batch_size, "steps": steps, "output_dir": f"{folder}/{in_memory}"}
+            results[f"{name}: training, samples/s"] = _training_rate(root, in_memory, words)
+    for part in ("data alone", "training"):
+        stock, ours = (results[f"{name}: {part}, samples/s"] for name in ("lerobot-train", "deltaco train"))
+        results[f"ratio: {part}"] = ours / stock
+    return results
+
+
+def make_dataset(root: Path, n_episodes: int = 12 * N_TASKS) -> None:
+    """Writes a dataset with the benchmark's features; noise, so that images are as large as they get."""
+    from lerobot.datasets import LeRobotDataset
+
+    names = ["delta_x", "delta_y", "delta_z", "gripper"]
+    axes = ["height", "width", "channels"]
+    features = {
+        "observation.image": {"dtype": "image", "shape": (48, 48, 3), "names": axes},
+        "observation.state": {"dtype": "float32", "shape": (10,), "names": None},
+        "action": {"dtype": "float32", "shape": (4,), "names": names},
+    }
+    dataset = LeRobotDataset.create("benchmark/noise", 24, features, root=root, use_videos=False)
+    rng = np.random.default_rng(0)
+    for episode in range(n_episodes):
+        for step in range(30):
+            gripper = -1.0 if 10 <= step < 20 else 1.0
+            dataset.add_frame(
+                {
+                    "observation.image": rng.integers(0, 256, (48, 48, 3), dtype=np.uint8),
+                    "observation.state": rng.normal(size=10).astype(np.float32),
+                    "action": np.array([*rng.uniform(-1, 1, 3), gripper], np.float32),
+                    "task": f"task {episode % N_TASKS}",
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+
+
+def _data_rate(root: Path, in_memory: bool, batch_size: int) -> float:
+    """Returns samples per second that a data loader gives, with two worker processes or from memory."""
+    from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
+    from torch.utils.data import DataLoader
+
+    from lerobot_deltaco.frames import FramesInMemory
+
+    dataset = LeRobotDataset("benchmark/noise", root=root, return_uint8=True)
+    bounds = dataset.meta.episodes["dataset_from_index"], dataset.meta.episodes["dataset_to_index"]
+    loader = DataLoader(
+        FramesInMemory(dataset) if in_memory else dataset,
+        batch_size=batch_size,
+        sampler=EpisodeAwareSampler(*bounds, shuffle=True),
+        drop_last=True,
+        num_workers=0 if in_memory else 2,
+    )
+    batches = itertools.chain.from_iterable(itertools.repeat(loader))
+    next(batches)
+    n_batches, start = 50 if in_memory else 8, time.perf_counter()
+    for _ in range(n_batches):
+        next(batches)
+    return batch_size * n_batches / (time.perf_counter() - start)
+
+
+def _training_rate(root: Path, in_memory: bool, options: dict[str, Any]) -> float:
+    """Returns samples per second of a training, after its first third."""
+    import torch
+    from lerobot.scripts import lerobot_train
+
+    from lerobot_deltaco import language
+    from lerobot_deltaco.train import train as train_in_memory
+
+    words = {
+        "policy.device": "cuda" if torch.cuda.is_available() else "cpu",
+        "dataset.repo_id": "benchmark/noise",
+        "dataset.root": root,
+        "num_workers": 0 if in_memory else 2,
+        "save_checkpoint": "false",
+        "log_freq": 1000,
+        **options,
+    }
+    ends: list[float] = []
+    update = lerobot_train.update_policy
+
+    def noted(*arguments: Any, **keywords: Any) -> Any:
+        result = update(*arguments, **keywords)
+        ends.append(time.perf_counter())
+        return result
+
+    with (
+        patch.object(sys, "argv", ["train", *(f"--{name}={value}" for name, value in words.items())]),
+        patch.object(lerobot_train, "update_policy", noted),
+        patch.object(language, "load_language_encoder", lambda name: _random_embeddings(name)),
+    ):
+        train_in_memory() if in_memory else lerobot_train.main()
+    first = len(ends) // 3
+    return options["batch_size"] * (len(ends) - 1 - first) / (ends[-1] - ends[first])
+
+
+def _random_embeddings(name: str) -> Callable[[Any], Any]:
+    import torch
+
+    from lerobot_deltaco.language import LANGUAGE_ENCODERS
+
+    dim = LANGUAGE_ENCODERS[name].embedding_dim
+    return lambda sentences: torch.nn.functional.normalize(torch.randn(len(sentences), dim), dim=1)
+
+
+# The policies
+
+
+def policy(batch_size: int = 128, seconds: float = 5.0) -> dict[str, float]:
+    """Measures an action on one core, in ms, and training steps on all cores, in samples per second.
+
+    Args:
+        batch_size: Number of samples of a training step.
+        seconds: Duration of each measurement.
+    """
+    import torch
+
+    devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    variants: dict[str, dict[str, Any]] = {
+        "deltaco, paper": {"type": "deltaco"},
+        "deltaco, strided": {"type": "deltaco", "backbone": "strided"},
+        "deltaco_match": {"type": "deltaco_match", "feature_matching": False},
+    }
+    results: dict[str, float] = {}
+    n_threads = torch.get_num_threads()
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "dataset"
+        make_dataset(root, 3 * N_TASKS)
+        for device, (name, options) in itertools.product(devices, variants.items()):
+            for dtype in ("float32", "bfloat16"):
+                label = f"{name}, {device}, {dtype}"
+                torch.set_num_threads(1)
+                act, step = _policy_actions(root, {**options, "device": device, "dtype": dtype}, batch_size)
+                if dtype == "float32":  # acting is in float32
+                    results[f"{name}, {device}: action, ms"] = 1e3 * seconds_of(act, seconds)
+                torch.set_num_threads(n_threads)
+                results[f"{label}: training, samples/s"] = batch_size / seconds_of(step, seconds)
+    paper, strided = (
+        results[f"deltaco, {n}, cpu, float32: training, samples/s"] for n in ("paper", "strided")
+    )
+    return {**results, "ratio: training of strided to paper": strided / paper}
+
+
+def _policy_actions(
+    root: Path, options: dict[str, Any], batch_size: int
+) -> tuple[Callable[[], object], Callable[[], object]]:
+    """Returns what chooses the next action of an episode, and what makes a training step."""
+    import torch
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+    from torch.utils.data import default_collate
+
+    import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
+    from lerobot_deltaco import language
+
+    dataset = LeRobotDataset("benchmark/noise", root=root)
+    config = make_policy_config(options.pop("type"), **options)
+    made: Any = make_policy(config, ds_meta=dataset.meta)
+    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    samples = default_collate([dataset[7 * n % len(dataset)] for n in range(batch_size)])
+    optimizer = config.get_optimizer_preset().build(made.get_optim_params())
+    with patch.object(language, "load_language_encoder", _random_embeddings):
+        batch = before(samples)
+        made.train()(batch)  # reads the demonstrations
+
+    def step() -> None:
+        made.train()
+        loss, _ = made(batch)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        if config.device == "cuda":
+            torch.cuda.synchronize()
+
+    observation = {name: value[:1] for name, value in samples.items() if name.startswith("observation.")}
+    observation["task"] = samples["task"][:1]
+
+    def act() -> None:
+        made.eval()
+        after(made.select_action(before(dict(observation)))).cpu()
+
+    return act, step
+
+
+if __name__ == "__main__":
+    main()

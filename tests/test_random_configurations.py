@@ -1,0 +1,82 @@
+"""A random configuration of a policy works, or is refused by an error that names an option."""
+
+import random
+import re
+
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+from tiny_runs import batch_of, collect_benchmark, fake_language_encoder
+
+from lerobot_deltaco import language
+
+# Options, with values that are valid alone and others.
+COMMON = {
+    "image_size": [16, 24, 8],
+    "num_mixture_components": [1, 5, 0],
+    "gripper_closed": ["low", "x"],
+    "demo_camera": [None, "observation.image", "observation.images.none"],
+    "dtype": ["float32", "bfloat16", "int8"],
+    "optimizer_lr": [3e-4, 0.0],
+    "grad_clip_norm": [0.0, 1.0, -1.0],
+}
+OPTIONS = {
+    "deltaco": {
+        "method": ["deltaco", "language_only", "demo_only", "one_hot", "bc_z", "mcil", "best"],
+        "film": [None, "none", "demo", "language", "demo+language", "x"],
+        "concat": [None, "none", "demo", "language"],
+        "encoder_loss": [None, "contrastive", "cosine", "none"],
+        "demo_encoder": ["cnn", "attention", "vit"],
+        "demo_columns": [2, 3, 1],
+        "gripper_loss": ["squared_error", "cross_entropy"],
+        "shift_padding": [0, 4, -1],
+        "language_head": [None, [8], [0]],
+        "gripper": ["auto", "3", "0", "none", "7", "left"],
+        "demo_episodes": [None, list(range(24)), [0, 6], [99]],
+        "scheduler_name": ["constant", "cosine", "linear"],
+    },
+    "deltaco_match": {
+        "gripper": ["auto", "3", "7", "left"],
+        "inputs": ["both", "demonstration", "instruction", "one_hot", "none"],
+        "p_drop_demonstration": [0.0, 0.3, 1.0],
+        "p_drop_instruction": [0.0, 0.3, -1.0],
+        "grasp_height_bias": [0.0, 0.75, 99],
+        "p_hue_augmentation": [0.0, 0.5, 1.5],
+        "colorless_tasks": [None, "shaped", "("],
+        "frames_after_release": [None, 2, -1],
+    },
+}
+
+
+@pytest.mark.parametrize("policy_type", OPTIONS)
+def test_a_random_configuration_works_or_is_refused_by_name(policy_type, tmp_path_factory, monkeypatch):
+    monkeypatch.setattr(language, "load_language_encoder", fake_language_encoder)
+    dataset = LeRobotDataset("soak/data", root=collect_benchmark(tmp_path_factory.mktemp("data") / "data"))
+    fixed = {"deltaco": {"backbone": "strided"}, "deltaco_match": {"feature_matching": False}}[policy_type]
+    values, rng, batch = (
+        {**COMMON, **OPTIONS[policy_type]},
+        random.Random(0),
+        batch_of(dataset, [0, 200, 400]),
+    )
+    n_trained = 0
+    for _ in range(60):
+        options = {name: rng.choice(values[name]) for name in rng.sample(sorted(values), 3)}
+        try:
+            config = make_policy_config(policy_type, device="cpu", **fixed, **options)
+            policy = make_policy(config, ds_meta=dataset.meta).train()
+            before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+            loss, _ = policy(before(dict(batch)))
+        except ValueError as error:
+            if not set(re.findall(r"`(\w+)", str(error))) & set(values):
+                pytest.fail(f"{options} is refused without a name: {error}")
+            continue
+        loss.backward()
+        config.get_optimizer_preset().build(policy.get_optim_params()).step()
+        policy.eval()
+        observation = {name: value for name, value in batch.items() if name.startswith("observation.")}
+        action = after(policy.select_action(before({**observation, "task": batch["task"]})))
+        assert action.shape == (3, 4)
+        assert torch.isfinite(action).all(), options
+        n_trained += 1
+    assert n_trained > 10
