@@ -138,12 +138,17 @@ def set_known(name, value):
         (set_known("instructions", "no JSON"), "Expecting value"),
         (set_known("tasks", "[]"), "its demonstrations differ in number"),
         (set_known("target_objects", "[1]"), "its target objects and demonstrations differ in number"),
-        (set_known("language_encoder", "all-MiniLM-L6-v2"), "its instructions were embedded by all-MiniLM-L6"),
+        (
+            set_known("language_encoder", "all-MiniLM-L6-v2"),
+            "its instructions were embedded by all-MiniLM-L6",
+        ),
     ],
 )
 def test_damaged_task_bank_is_an_error(checkpoint, change, message):
     edit(checkpoint / TASK_BANK, change)
-    with pytest.raises(TaskBankError, match=f"{TASK_BANK} cannot be used: {message}.*Save or fetch the check"):
+    with pytest.raises(
+        TaskBankError, match=f"{TASK_BANK} cannot be used: {message}.*Save or fetch the check"
+    ):
         DeltacoPolicy.from_pretrained(checkpoint)
 
 
@@ -185,7 +190,9 @@ def test_task_bank_of_another_robot_is_an_error(tmp_path):
 
 def test_weights_that_do_not_fit_are_an_error(checkpoint):
     edit(checkpoint / "model.safetensors", lambda tensors, _: tensors.pop("model.raw_log_std"))
-    with pytest.raises(ValueError, match="does not have the weights of this policy: .*raw_log_std.*config.js"):
+    with pytest.raises(
+        ValueError, match="does not have the weights of this policy: .*raw_log_std.*config.js"
+    ):
         DeltacoPolicy.from_pretrained(checkpoint)
 
 
@@ -196,7 +203,9 @@ def test_weights_that_are_not_finite_are_neither_loaded_nor_saved(checkpoint, ma
     policy, _, _ = make()
     with torch.no_grad():
         policy.model.raw_log_std.fill_(torch.inf)
-    with pytest.raises(TrainingDivergedError, match="weight model.raw_log_std is not finite, and no checkpoin"):
+    with pytest.raises(
+        TrainingDivergedError, match="weight model.raw_log_std is not finite, and no checkpoin"
+    ):
         policy.save_pretrained(tmp_path / "new")
     assert not (tmp_path / "new" / "model.safetensors").exists()
 
@@ -206,7 +215,9 @@ def test_one_hot_policy_remembers_its_tasks(make, dataset, tmp_path):
     policy.save_pretrained(tmp_path)
     loaded = DeltacoPolicy.from_pretrained(tmp_path)
     assert loaded.config.one_hot_tasks == TASKS
-    with pytest.raises(ValueError, match="does not know the task 'juggle'. It knows the 3 tasks .*'stack the"):
+    with pytest.raises(
+        ValueError, match="does not know the task 'juggle'. It knows the 3 tasks .*'stack the"
+    ):
         loaded.select_action(before(observation(dataset, ["juggle"])))
 
 
@@ -248,7 +259,7 @@ def test_card_names_options_demonstrations_and_training(dataset):
     card = card_of(dataset, train_config=train_config, **options)
     for row in ("| steps | 12345 |", "| batch\\_size | 24 |", "| temperature | 0.2 |"):
         assert row.replace("\\_", "_") in card.text.replace("\\_", "_")
-    assert "the checkpoint has some of 3 tasks, such as \"stack the cups\"" in card.text
+    assert 'the checkpoint has some of 3 tasks, such as "stack the cups"' in card.text
     assert "| `observation.images.top` | (3, 20, 28) |" in card.text
     assert LANGUAGE_ENCODERS["paraphrase-MiniLM-L3-v2"].repo_id in card.text
     assert "@inproceedings{yu2023deltaco" in card.text

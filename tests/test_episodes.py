@@ -98,7 +98,9 @@ def test_frames_between_the_ends_are_drawn_from_equal_parts_of_the_time():
 
 
 def test_demonstrations_that_do_not_exist_are_errors(bank, dataset, tmp_path, make):
-    with pytest.raises(ValueError, match="no demonstration of the task 'sing'.*of 3 tasks, such as 'stack th"):
+    with pytest.raises(
+        ValueError, match="no demonstration of the task 'sing'.*of 3 tasks, such as 'stack th"
+    ):
         bank.of_task("sing")
     with pytest.raises(ValueError, match="`demo_episode` is 9.*They are the episodes 0, 1, 2, 3, 4, 5"):
         bank.of_episode(9)
@@ -290,13 +292,22 @@ def test_mcil_takes_an_instruction_or_a_demonstration(acting, dataset):
 
 @pytest.mark.parametrize(
     ("method", "instruction", "has_demonstration"),
-    [("deltaco", "", True), ("deltaco", POUR, False), ("language_only", "", True), ("demo_only", POUR, False)],
+    [
+        ("deltaco", "", True),
+        ("deltaco", POUR, False),
+        ("language_only", "", True),
+        ("demo_only", POUR, False),
+    ],
 )
-def test_inputs_that_the_method_needs_cannot_be_left_out(acting, dataset, method, instruction, has_demonstration):
+def test_inputs_that_the_method_needs_cannot_be_left_out(
+    acting, dataset, method, instruction, has_demonstration
+):
     policy, before = acting(method=method)
     shown = DemonstrationBank(torch.zeros(1, 2, 3, 16, 16, dtype=torch.uint8), [POUR], [0])[0]
     policy.set_tasks([instruction], [[shown] if has_demonstration else []])
-    with pytest.raises(ValueError, match=f"{method!r} needs what is left out. Pass an instruction and a demo"):
+    with pytest.raises(
+        ValueError, match=f"{method!r} needs what is left out. Pass an instruction and a demo"
+    ):
         policy.select_action(before(observation(dataset, [POUR])))
 
 
@@ -311,8 +322,10 @@ def test_missing_tasks_are_errors(acting, make, dataset):
     with pytest.raises(ValueError, match="as many lists of demonstrations as instructions. Got 0 and 1"):
         policy.set_tasks([WAVE], [])
     without, _, _ = make()
-    with pytest.raises(ValueError, match="no demonstrations. Name a dataset of them with --policy.demo_repo_"):
+    with pytest.raises(
+        ValueError, match="no demonstrations. Name a dataset of them with --policy.demo_repo_"
+    ):
         without.eval().select_action(seen)
+    without._meta, batch = None, before(batch_of(dataset, [0]))
     with pytest.raises(ValueError, match="trained with its dataset's metadata"):
-        without._meta = None
-        without.train()(before(batch_of(dataset, [0])))
+        without.train()(batch)

@@ -173,7 +173,9 @@ def test_damaged_data_and_diverged_losses_are_told_apart(make, table):
     policy = make()
     batch = batch_of(table, first_frames([0, 1]))
     damaged = {**batch, "observation.state": batch["observation.state"] * torch.nan}
-    with pytest.raises(TrainingDivergedError, match="step 1 is not finite. In its batch, `observation.state`"):
+    with pytest.raises(
+        TrainingDivergedError, match="step 1 is not finite. In its batch, `observation.state`"
+    ):
         policy(damaged)
     with torch.no_grad():
         policy.model.action_head[-1].bias.fill_(torch.inf)
@@ -217,7 +219,7 @@ def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
     assert all(
         torch.equal(before[name], value) for name, value in resumed.feature_matching.state_dict().items()
     )
-    assert resumed.config.known_words == "blue left move object red right the".split()
+    assert resumed.config.known_words == ["blue", "left", "move", "object", "red", "right", "the"]
 
 
 @pytest.mark.parametrize("size", [16, 19])
