@@ -1,4 +1,4 @@
-"""The paper's formulas in NumPy and double precision, written from the paper and not from the code under test.
+"""The paper's formulas in NumPy and double precision, written from the paper, not from the tested code.
 
 Only the names of weights are those of the networks.
 """

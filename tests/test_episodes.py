@@ -326,6 +326,6 @@ def test_missing_tasks_are_errors(acting, make, dataset):
         ValueError, match="no demonstrations. Name a dataset of them with --policy.demo_repo_"
     ):
         without.eval().select_action(seen)
+    without._meta, batch = None, before(batch_of(dataset, [0]))
     with pytest.raises(ValueError, match="trained with its dataset's metadata"):
-        without._meta = None
-        without.train()(before(batch_of(dataset, [0])))
+        without.train()(batch)

@@ -24,7 +24,6 @@ from lerobot_deltaco.deltaco_match.keyframes import (
     warn_if_inverted,
 )
 from lerobot_deltaco.deltaco_match.robot_states import RobotStates
-from lerobot_deltaco.losses import location_loss
 from lerobot_deltaco.networks import gaussian_maps
 
 # Keyframes
@@ -279,32 +278,6 @@ def test_descriptor_is_most_similar_to_what_it_was_made_of():
     assert maps[0, 0].argmax() == row * (TABLE_SIZE // 2) + column
 
 
-def test_correspondence_learns_to_find_the_moved_object():
-    torch.manual_seed(0)
-    moves = random_moves(32)
-    first = stacked_images([draw_table(task, start, other) for task, start, other, _ in moves]) / 255
-    last = stacked_images([draw_table(task, end, other) for task, _, other, end in moves]) / 255
-    locations = torch.from_numpy(np.stack([[start, end] for _, start, _, end in moves])).float()
-    network = CorrespondenceNetwork(True, True, condition_dim=0)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3)
-    # Episodes of a task, which is every other one, demonstrate each other.
-    rows, shown = torch.arange(24), (torch.arange(24) + 2) % 24
-    for _ in range(40):
-        description = network.describe(torch.stack([first[shown], last[shown]], dim=1))
-        maps, _ = network(first[rows], first[rows], description, None)
-        attention = description.attention.clamp_min(1e-9).log()
-        loss = location_loss(maps, locations[rows]) + location_loss(attention, locations[shown])
-        optimizer.zero_grad()
-        loss.mean().backward()
-        optimizer.step()
-    network.eval()
-    shown = torch.arange(24, 32) - 2
-    description = network.describe(torch.stack([first[shown], last[shown]], dim=1))
-    maps, _ = network(first[24:], first[24:], description, None)
-    errors = (peak_locations(maps)[:, 0] - locations[24:, 0]).norm(dim=1)
-    assert (errors < 0.25).sum() >= 7
-
-
 def test_what_is_not_given_does_not_matter():
     torch.manual_seed(0)
     network = CorrespondenceNetwork(True, False, condition_dim=5, takes_either=True).eval()
@@ -350,7 +323,7 @@ def draw_shapes(task, moved, other):
 @pytest.fixture(scope="module")
 def shapes():
     """First images, locations of the grasps, and tasks of episodes."""
-    moves = random_moves(60, SHAPE_TASKS)
+    moves = random_moves(36, SHAPE_TASKS)
     images = stacked_images([draw_shapes(*move[:3]) for move in moves])
     locations = torch.tensor(np.stack([move[1] for move in moves]), dtype=torch.float32)
     return images, locations, [move[0] for move in moves]
@@ -358,8 +331,8 @@ def shapes():
 
 @pytest.fixture(scope="module")
 def matching(shapes):
-    """A feature matching that is fitted to 40 of the episodes."""
-    images, locations, tasks = (part[:40] for part in shapes)
+    """A feature matching that is fitted to 24 of the episodes."""
+    images, locations, tasks = (part[:24] for part in shapes)
     vocabulary = vocabulary_of(SHAPE_TASKS)
     matching = FeatureMatching(len(vocabulary))
     matching.fit(images, locations, tasks, bag_of_words(vocabulary, tasks).present, seed=0, steps=35)
@@ -368,13 +341,13 @@ def matching(shapes):
 
 
 def fraction_found(matching, shapes, ends=None, words=None):
-    """Fraction of the other 20 episodes in which the object is found, by other episodes or by words."""
-    images, locations, tasks = (part[40:] for part in shapes)
+    """Fraction of the other 12 episodes in which the object is found, by other episodes or by words."""
+    images, locations, tasks = (part[24:] for part in shapes)
     scenes = images.float() / 255
-    shown = [(n + 2) % 20 for n in range(20)]
+    shown = [(n + 2) % 12 for n in range(12)]
     bag = None if words is None else bag_of_words(vocabulary_of(SHAPE_TASKS), [words(task) for task in tasks])
     maps = matching.pick_map(
-        torch.zeros(20, SIZE // 2, SIZE // 2),
+        torch.zeros(12, SIZE // 2, SIZE // 2),
         scenes,
         scenes[shown][:, None, None].expand(-1, -1, 2, -1, -1, -1) if ends else None,
         locations[shown][:, None] if ends else None,

@@ -230,7 +230,7 @@ def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
     assert all(
         torch.equal(before[name], value) for name, value in resumed.feature_matching.state_dict().items()
     )
-    assert resumed.config.known_words == "blue left move object red right the".split()
+    assert resumed.config.known_words == ["blue", "left", "move", "object", "red", "right", "the"]
 
 
 @pytest.mark.parametrize("size", [16, 19])

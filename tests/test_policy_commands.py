@@ -94,4 +94,6 @@ def test_checkpoint_is_evaluated_without_its_datasets(folder):
     assert json.loads((output / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
     # A task without a demonstration is named.
     assert result.returncode != 0
-    assert re.search("ValueError: There is no demonstration of the task .*--policy.demo_repo_id", result.stderr)
+    assert re.search(
+        "ValueError: There is no demonstration of the task .*--policy.demo_repo_id", result.stderr
+    )

@@ -238,9 +238,9 @@ def test_rollouts_move_a_robot_by_the_demonstration_of_a_new_task(tmp_path):
         policy(before(batch_of(dataset, [0, 7, 14, 21])))
         for part in (policy, before, after):
             part.save_pretrained(tmp_path / policy_type)
-        path = f"--policy.path={tmp_path / policy_type}"
-        commands.append([path, f"--task={ROBOT_TASKS[1]}", *named, *common])
-        commands.append([path, "--task=in other words", "--policy.demo_episode=0", *named, *common])
+        commands.append([f"--policy.path={tmp_path / policy_type}", *named, *common])
+    commands[0].append(f"--task={ROBOT_TASKS[1]}")
+    commands[1] += ["--task=in other words", "--policy.demo_episode=0"]
     result = run_python(
         *(ROLLOUTS, json.dumps(commands)),
         cwd=tmp_path,

@@ -311,7 +311,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         encoder = self._load_vision_encoder()
         padding, frames, rows = config.demo_shift_padding, config.n_demo_frames, config.demo_rows
         # The features do not depend on the precision of the training.
-        with torch.autocast(self.step.device.type, enabled=False):
+        with torch.autocast(bank.frames.device.type, enabled=False):
             return encode_bank(bank, encoder, frames, rows, n_variants, padding, config.seed)
 
     def _load_vision_encoder(self) -> VisionEncoder:
