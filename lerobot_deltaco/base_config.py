@@ -50,7 +50,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         demo_episode: Episode of that dataset to use as the demonstration of every instruction, such as a
             sentence of your own.
         demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default, those
-            that are trained on; with `lerobot-train`, all.
+            that are trained on.
         tasks_per_batch: Largest number of tasks in a batch of `deltaco train`, with equally many samples of
             each (the paper: 16 tasks x 64 samples); 0 for samples of any tasks.
         upsampled_tasks: Regular expression for the instructions of the tasks that get `upsampled_fraction` of
@@ -155,7 +155,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         """
         for name, valid in choices.items():
             if getattr(self, name) not in valid:
-                names = ", ".join(value for value in valid if value is not None)
+                names = ", ".join(filter(None, valid))
                 raise ValueError(f"`{name}` must be one of {names}. Got {getattr(self, name)!r}.")
 
     def check_ranges(self, **ranges: tuple[float, float]) -> None:

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import get_task, select_tasks
+from gym_deltaco.tasks import N_TASKS, get_task, select_tasks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -212,8 +212,12 @@ def read_records(*paths: Path) -> list[EvaluationRecord]:
     records = []
     for path in paths:
         files = sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
-        # Datasets are Parquet, too.
-        files = [file for file in files if path.is_file() or not {"data", "meta"} & set(file.parts)]
+        # Datasets are Parquet, too; only what is below the given folder tells.
+        files = [
+            file
+            for file in files
+            if path.is_file() or not {"data", "meta"} & set(file.relative_to(path).parts)
+        ]
         found = [record for file in files for record in _read(file)]
         if not found:
             raise RecordError(f"{path} has no records of evaluations. `deltaco evaluate` writes them.")
@@ -277,16 +281,18 @@ def _check(record: EvaluationRecord, source: str) -> None:
             & rows["trial"].between(0, record.plan.trials - 1)
             & ~rows.duplicated(["task_id", "trial"])
         ),
+        "a demonstrated task of the benchmark, or -1": rows["demonstration_task"].between(-1, N_TASKS - 1),
         "containers -1, 0 or 1 of three objects": containers.map(
             lambda found: len(found) == _N_OBJECTS and set(found) <= {-1, 0, 1}
         ),
         "a grasped object from -1 to 2": rows["grasped_object"].between(-1, _N_OBJECTS - 1),
         "a grasped object where it is the right one": ~rows["right_object"] | (rows["grasped_object"] >= 0),
         "an object in a container where that is the right one": (
-            ~rows["right_container"] | containers.map(lambda found: max(found, default=-1) >= 0)
+            ~rows["right_container"] | containers.map(lambda found: len(set(found) - {-1}) == 1)
         ),
     }
-    if len(rows) == 0 or record.step < 0 or record.seconds < 0 or "benchmark" not in record.versions:
+    n_episodes = len(record.plan.task_ids) * record.plan.trials
+    if len(rows) != n_episodes or record.step < 0 or record.seconds < 0 or "benchmark" not in record.versions:
         raise RecordError(f"{source} has an evaluation of {record.experiment!r} that lacks something.")
     for name, valid in is_valid.items():
         if not valid.all():

@@ -113,6 +113,7 @@ def _square(images: Tensor, size: int | None) -> Tensor:
     return F.interpolate(images, (size, size), mode="bicubic", antialias=True).clamp(0, 1)
 
 
+@torch.random.fork_rng(devices=[])  # initial weights of a policy do not depend on draws of its encoder's
 def load_vision_encoder(
     name: str, weights: str | None = None, image_size: int | None = None, input_kind: str = "published"
 ) -> VisionEncoder:

@@ -20,7 +20,7 @@ from lerobot_deltaco.deltaco_match.keyframes import (
     Keyframes,
     find_keyframes,
     follows_gripper,
-    release_frames,
+    grasp_frames,
     warn_if_inverted,
 )
 from lerobot_deltaco.deltaco_match.robot_states import RobotStates
@@ -35,13 +35,52 @@ def test_last_grasp_that_is_released_counts():
     gripper = torch.tensor([1, -1, 1, 1, -1, -1, 1, 1, -1, 1.0, 1, 1, -1, -1])
     spans = [(0, 7), (8, 10), (11, 13)]
     keyframes = find_keyframes(states, gripper, spans)
-    assert keyframes.found.tolist() == [True, True, False]
+    assert keyframes.found.tolist() == [True, False, False]
     # One step after the command to close, and the step of the command to open.
-    assert keyframes.states[:2, :, 0].tolist() == [[5, 6], [9, 9]]
-    assert keyframes.approach[:2, 0].tolist() == [2, 8]
-    assert not keyframes.states[2].any()
-    assert keyframes.pick_states[:, 0].isnan().tolist() == [False, False, True]
-    assert release_frames(gripper, spans) == [6, 9, None]
+    assert keyframes.states[0, :, 0].tolist() == [5, 6]
+    assert keyframes.approach[0, 0] == 2
+    assert not keyframes.states[1:].any()
+    assert keyframes.pick_states[:, 0].isnan().tolist() == [False, True, True]
+    assert grasp_frames(gripper, spans) == [(4, 6), None, None]
+
+
+def ramps(*values, frames=10):
+    """Returns a course that goes from each value to the next in some frames, and rests there for as many."""
+    parts = [np.linspace(a, b, frames) for a, b in zip(values[:1] + values, values, strict=False)]
+    return np.concatenate([np.concatenate([part, np.full(frames, part[-1])]) for part in parts])
+
+
+@pytest.mark.parametrize(
+    ("values", "closes", "opens"),
+    [
+        ((1, 0, 1), 30, 50),
+        ((0, 1, 0.3, 1, 0), 50, 70),  # at rest, it is closed; the object holds it open
+        ((1, 0.4, 0.7), 30, 50),  # it opens less after the release
+        ((1, 0, 1, 0, 1), 70, 90),  # it slips: the last grasp counts
+        ((0, 0.2, 0.1, 0.2), 50, 70),  # of another episode's scale
+    ],
+)
+def test_each_course_of_a_gripper_has_its_own_grasp(values, closes, opens):
+    noise = np.random.default_rng(0).normal(0, 0.01 * max(values), 20 * len(values))
+    course = torch.from_numpy(ramps(*values) + noise)
+    ((grasp, release),) = grasp_frames(course, [(0, len(course) - 1)])
+    # Within the ramps, each of which takes 10 frames.
+    assert closes - 10 <= grasp <= closes
+    assert opens - 10 <= release <= opens
+
+
+@pytest.mark.parametrize("values", [(1, 0), (0, 1), (0, 1, 0), (1, 1), (0.3, 0)])
+def test_a_gripper_at_rest_grasps_nothing(values):
+    course = torch.from_numpy(ramps(*values))
+    assert grasp_frames(course, [(0, len(course) - 1)]) == [None]
+
+
+def test_a_tremble_is_no_grasp():
+    courses = [ramps(1, 0, 1), ramps(1, 0, 1), 1 - 0.05 * ramps(1, 0, 1)]
+    starts = np.cumsum([0, *map(len, courses)]).tolist()
+    spans = [(start, end - 1) for start, end in zip(starts, starts[1:], strict=False)]
+    found = grasp_frames(torch.from_numpy(np.concatenate(courses)), spans)
+    assert [each is not None for each in found] == [True, True, False]
 
 
 def test_episodes_without_a_grasp_and_inverted_grippers_are_warned_of(caplog):
@@ -51,7 +90,7 @@ def test_episodes_without_a_grasp_and_inverted_grippers_are_warned_of(caplog):
     warn_if_inverted(gripper, [(0, 3), (4, 7)])
     assert "gripper_closed" not in caplog.text
     warn_if_inverted(-gripper, [(0, 3), (4, 7)])
-    assert "closed at the beginning of 2 of 2 episodes" in caplog.text
+    assert "0 of 2 episodes have a grasp, and 1 would have one" in caplog.text
     assert "--policy.gripper_closed" in caplog.text
 
 
@@ -276,7 +315,11 @@ def test_what_is_not_given_does_not_matter():
         maps = torch.stack(
             [
                 network(scenes, scenes, network.describe(shown), said, given)[0]
-                for shown, said in ((ends[0], conditions[0]), (ends[1], conditions[0]), (ends[0], conditions[1]))
+                for shown, said in (
+                    (ends[0], conditions[0]),
+                    (ends[1], conditions[0]),
+                    (ends[0], conditions[1]),
+                )
             ]
         )
         by_demonstration, by_condition = ((maps[0] != other).flatten(2).any(dim=2)[0] for other in maps[1:])
@@ -296,7 +339,9 @@ def draw_shapes(task, moved, other):
     image = np.full((SIZE, SIZE, 3), 150, np.uint8)
     y, x = np.mgrid[-4:5, -4:5]
     ring, cross = (np.hypot(x, y) < 4.6) & (np.hypot(x, y) > 2.2), (abs(x) < 1.5) | (abs(y) < 1.5)
-    for mask, location in zip((ring, cross) if "ring" in task else (cross, ring), (moved, other), strict=True):
+    for mask, location in zip(
+        (ring, cross) if "ring" in task else (cross, ring), (moved, other), strict=True
+    ):
         column, row = (round((c + 1) * SIZE / 2) for c in location)
         image[row - 4 : row + 5, column - 4 : column + 5][mask] = (60, 90, 160)
     return image

@@ -21,6 +21,7 @@ from small_policies import (
 from lerobot_deltaco.base_policy import TrainingDivergedError
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.demonstrations import DemonstrationBank
 from lerobot_deltaco.frames import FramesInMemory
 
 pytestmark = pytest.mark.usefixtures("fake_language", "short_fit")
@@ -136,6 +137,16 @@ def test_episode_without_a_grasp_teaches_nothing(make, table):
     assert not any(gradient.any() for gradient in gradients)
 
 
+def test_samples_outside_of_the_demonstrations_teach_nothing(make, table):
+    policy = make()
+    bank = policy.training_bank
+    others = torch.where(bank.episodes == 0, 10_000, bank.episodes)
+    policy.training_bank = DemonstrationBank(bank.frames, bank.tasks, others)
+    losses, _ = policy(batch_of(table, first_frames([0, 1])), reduction="none")
+    assert losses[0] == 0
+    assert losses[1] > 0
+
+
 def test_data_from_memory_and_from_the_disk_give_the_same_loss(make, table):
     batch = batch_of(table, first_frames([0, 1, 2, 3]))
     torch.manual_seed(0)
@@ -163,9 +174,9 @@ def test_greater_values_of_the_gripper_may_mean_closed(make, table, frames, capl
     expected = locations(robot)
     assert torch.equal(locations(inverted, gripper_closed="high"), expected)
     assert "gripper_closed" not in caplog.text
-    # In the wrong direction, the end of the approach looks like a release.
-    assert not torch.equal(locations(inverted), expected)
-    assert "closed at the beginning of 48 of 48 episodes" in caplog.text
+    with pytest.raises(ValueError, match=r"at least 24 episodes .* Got 0\."):
+        locations(inverted)
+    assert "0 of 48 episodes have a grasp, and 48 would have one" in caplog.text
     assert "--policy.gripper_closed" in caplog.text
 
 
@@ -173,7 +184,9 @@ def test_damaged_data_and_diverged_losses_are_told_apart(make, table):
     policy = make()
     batch = batch_of(table, first_frames([0, 1]))
     damaged = {**batch, "observation.state": batch["observation.state"] * torch.nan}
-    with pytest.raises(TrainingDivergedError, match="step 1 is not finite. In its batch, `observation.state`"):
+    with pytest.raises(
+        TrainingDivergedError, match="step 1 is not finite. In its batch, `observation.state`"
+    ):
         policy(damaged)
     with torch.no_grad():
         policy.model.action_head[-1].bias.fill_(torch.inf)

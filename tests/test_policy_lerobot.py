@@ -1,13 +1,15 @@
-"""What LeRobot asks of its own policies: they are made, saved, loaded, optimized, and trained on videos."""
+"""What LeRobot expects of policies: they are made, trained, resumed, and run by its commands."""
 
 import copy
+import json
 import os
-import time
-from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from fake_robot import CAMERA, IMAGE_SHAPE, MOTORS
+from fresh_python import run_python
 from lerobot.common.train_utils import load_training_state, save_checkpoint
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
@@ -16,45 +18,40 @@ from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
-from safetensors.torch import load_file, save_file
-from small_policies import (
-    EPISODES_PER_TASK,
-    LENGTH,
-    REPO_ID,
-    TASKS,
-    batch_of,
-    fake_encoder,
-    observation,
-    small_policy,
-)
+from small_policies import REPO_ID, batch_of, demos_of, observation, small_policy
 
-from lerobot_deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.envs.configuration_env import DeltacoEnv
-from lerobot_deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.policy.language import instruction_table
-from lerobot_deltaco.policy.language.instruction_table import InstructionTable
+from gym_deltaco.tasks import TASK_SETS, get_task
+from lerobot_deltaco.checkpoints import load_policy
+from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.lerobot_env import DeltacoEnv
 
-pytestmark = pytest.mark.usefixtures("fake_language")
+TESTS, SHIPPED = Path(__file__).parent, Path(__file__).parents[1] / "checkpoints" / "pick_place"
 
-
-def assert_equal_weights(policy, other):
-    assert list(policy.state_dict()) == list(other.state_dict())
-    for name, value in policy.state_dict().items():
-        assert torch.equal(value, other.state_dict()[name]), name
+pytestmark = pytest.mark.usefixtures("fake_language", "short_fit")
 
 
 # Construction
 
 
-def test_the_type_names_the_policy_and_its_configuration():
-    assert get_policy_class("deltaco") is DeltacoPolicy
-    assert type(make_policy_config("deltaco", device="cpu")) is DeltacoConfig
-    assert DeltacoPolicy.config_class is DeltacoConfig
-    assert DeltacoPolicy.name == DeltacoConfig(device="cpu").type == "deltaco"
+@pytest.mark.parametrize(
+    ("policy_type", "policy_class", "config_class"),
+    [
+        ("deltaco", DeltacoPolicy, DeltacoConfig),
+        ("deltaco_match", DeltacoMatchPolicy, DeltacoMatchConfig),
+    ],
+)
+def test_type_names_a_policy_and_its_configuration(policy_type, policy_class, config_class):
+    assert get_policy_class(policy_type) is policy_class
+    assert type(make_policy_config(policy_type, device="cpu")) is config_class
+    assert policy_class.config_class is config_class
+    assert policy_class.name == config_class(device="cpu").type == policy_type
 
 
-def test_a_policy_is_made_for_an_environment():
-    """As `lerobot-eval` does without a checkpoint, and other policies' tests do."""
+def test_policy_is_made_for_an_environment():
+    """As `lerobot-eval` does without a checkpoint."""
     config = make_policy_config("deltaco", device="cpu", backbone="strided", method="language_only")
     policy = make_policy(config, env_cfg=DeltacoEnv(task="4"))
     assert set(config.input_features) == {"observation.image", "observation.state"}
@@ -62,7 +59,7 @@ def test_a_policy_is_made_for_an_environment():
     assert policy.config.robot_state_feature.shape == (10,)
 
 
-def test_the_datasets_features_become_inputs_and_outputs(make):
+def test_features_of_the_dataset_become_inputs_and_outputs(make, dataset):
     config = make()[0].config
     assert {name: feature.shape for name, feature in config.image_features.items()} == {
         "observation.images.top": (3, 20, 28),
@@ -70,106 +67,18 @@ def test_the_datasets_features_become_inputs_and_outputs(make):
     }
     assert config.robot_state_feature.shape == (2,)
     assert (config.action_feature.type, config.action_feature.shape) == (FeatureType.ACTION, (3,))
-
-
-def test_inputs_that_are_given_are_kept(dataset):
-    """One camera of two, as `--policy.input_features` says."""
-    config = make_policy_config("deltaco", device="cpu", image_size=16, backbone="strided")
-    both = make_policy(copy.deepcopy(config), ds_meta=dataset.meta).config.input_features
-    config.input_features = {"observation.images.wrist": both["observation.images.wrist"]}
-    policy = make_policy(config, ds_meta=dataset.meta)
-    before, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
-    loss, _ = policy.train()(before(batch_of(dataset, [0, 7])))
-    assert torch.isfinite(loss)
+    # One camera of two, as `--policy.input_features` says.
+    wrist = {"observation.images.wrist": config.input_features["observation.images.wrist"]}
+    policy, before, _ = make(input_features=wrist)
     assert list(policy.config.input_features) == ["observation.images.wrist"]
-
-
-# Saving and loading
-
-
-@pytest.mark.parametrize(
-    "with_state_dict", [True, False], ids=["as LeRobot 0.6.1 does", "as later versions do"]
-)
-def test_a_policy_is_saved_by_either_signature(make, tmp_path, with_state_dict):
-    policy, _, _ = make(method="language_only")
-    arguments = {"state_dict": None} if with_state_dict else {}
-    policy._save_pretrained(tmp_path, **arguments)
-    assert_equal_weights(policy, DeltacoPolicy.from_pretrained(tmp_path))
-
-
-def test_weights_with_names_of_an_earlier_version_say_what_to_do(make, tmp_path):
-    policy, _, _ = make(method="language_only")
-    policy.save_pretrained(tmp_path)
-    weights = load_file(tmp_path / "model.safetensors")
-    assert any(name.startswith("model.") for name in weights)
-    old = {name.replace("model.", "policy.", 1): value for name, value in weights.items()}
-    save_file(old, tmp_path / "model.safetensors")
-    with pytest.raises(ValueError, match=r"earlier version.*Train the policy again.*`policy.` by `model.`"):
-        DeltacoPolicy.from_pretrained(tmp_path)
-
-
-def test_a_configuration_survives_its_own_file(make, tmp_path):
-    config = make()[0].config
-    config.save_pretrained(tmp_path)
-    assert PreTrainedConfig.from_pretrained(tmp_path) == config
-    overridden = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=["--demo_episode=2", "--seed=7"])
-    assert (overridden.demo_episode, overridden.seed) == (2, 7)
-
-
-def test_training_goes_on_from_a_checkpoint_of_lerobots(make, dataset, tmp_path):
-    """Weights, step, Adam's moments: the next update is the same to the bit."""
-    batch = make()[1](batch_of(dataset, [0, 7, 20]))
-
-    def update(policy, optimizer):
-        loss, _ = policy(batch)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-
-    policy, before, after = make()
-    config = TrainPipelineConfig(DatasetConfig(REPO_ID), policy=policy.config, steps=2)
-    config.optimizer = policy.config.get_optimizer_preset()
-    optimizer, scheduler = make_optimizer_and_scheduler(config, policy)
-    assert scheduler is None
-    update(policy, optimizer)
-    save_checkpoint(tmp_path, 1, config, policy, optimizer, scheduler, before, after)
-
-    config.policy.pretrained_path = tmp_path / "pretrained_model"
-    resumed = make_policy(config.policy, ds_meta=dataset.meta).train()
-    other, _ = make_optimizer_and_scheduler(config, resumed)
-    step, other, _ = load_training_state(tmp_path, other, None)
-    assert step == int(resumed.step) == 1
-    update(policy, optimizer)
-    update(resumed, other)
-    assert_equal_weights(policy, resumed)
+    assert torch.isfinite(policy(before(batch_of(dataset, [0, 7])))[0])
 
 
 # Processors
 
 
-def test_processors_survive_saving(make, dataset, tmp_path):
+def test_processors_normalize_and_revert_it(make, dataset, tmp_path):
     policy, before, after = make()
-    before.save_pretrained(tmp_path)
-    after.save_pretrained(tmp_path)
-    # As `lerobot-eval` loads them.
-    overrides = {
-        "device_processor": {"device": "cpu"},
-        "rename_observations_processor": {"rename_map": {}},
-    }
-    loaded_before, loaded_after = make_pre_post_processors(
-        policy.config, pretrained_path=str(tmp_path), preprocessor_overrides=overrides
-    )
-    raw = batch_of(dataset, [0, 7, 20])
-    batch, loaded = before(copy.deepcopy(raw)), loaded_before(copy.deepcopy(raw))
-    assert set(batch) == set(loaded)
-    for name, value in batch.items():
-        assert torch.equal(value, loaded[name]) if torch.is_tensor(value) else value == loaded[name]
-    action = torch.rand(3, 3) * 2 - 1
-    assert torch.equal(after(action), loaded_after(action))
-
-
-def test_processors_normalize_and_undo_it(make, dataset):
-    _, before, after = make()
     raw = batch_of(dataset, list(range(len(dataset))))
     batch = before(copy.deepcopy(raw))
     state = batch["observation.state"]
@@ -180,141 +89,213 @@ def test_processors_normalize_and_undo_it(make, dataset):
     torch.testing.assert_close(after(batch["action"]), raw["action"], atol=1e-3, rtol=0)
     for camera in dataset.meta.camera_keys:
         assert torch.equal(batch[camera], raw[camera])
+    before.save_pretrained(tmp_path)
+    after.save_pretrained(tmp_path)
+    overrides = {"device_processor": {"device": "cpu"}}  # as those of `lerobot-eval`
+    loaded_before, loaded_after = make_pre_post_processors(
+        policy.config, pretrained_path=str(tmp_path), preprocessor_overrides=overrides
+    )
+    loaded = loaded_before(copy.deepcopy(raw))
+    assert set(batch) == set(loaded)
+    for name, value in batch.items():
+        assert torch.equal(value, loaded[name]) if torch.is_tensor(value) else value == loaded[name]
+    assert torch.equal(after(batch["action"]), loaded_after(batch["action"]))
 
 
-# Evaluation by several threads
+# Training
 
 
-def test_a_thread_that_never_reset_the_policy_may_act(make, dataset):
-    """As in LeRobot's policy server, whose requests come in threads of their own."""
-    policy, before, _ = make(method="language_only")
-    batch = before(observation(dataset, TASKS))
-    expected = policy.eval().select_action(batch)
-    with ThreadPoolExecutor(1) as pool:
-        assert torch.equal(pool.submit(policy.select_action, batch).result(), expected)
+def test_training_resumes_to_the_bit_from_a_checkpoint_of_lerobot(make, dataset, tmp_path):
+    policy, before, after = make(scheduler_name="cosine")
+    batch = before(batch_of(dataset, [0, 7, 20]))
 
+    def update(policy, optimizer, scheduler):
+        loss, _ = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        scheduler.step()
 
-@pytest.mark.parametrize("n_threads", [1, 2])
-def test_the_trials_of_a_task_do_not_depend_on_other_tasks(make, dataset, n_threads):
-    """Each task's demonstrations take turns, and for MCIL language and demonstration, whoever came before."""
-    policy, before, _ = make(method="mcil", demo_repo_id=REPO_ID, demo_root=str(dataset.root))
-    policy.eval()
-    batches = {task: before(observation(dataset, [task])) for task in TASKS}
+    config = TrainPipelineConfig(DatasetConfig(REPO_ID), policy=policy.config, steps=4)
+    config.optimizer, config.scheduler = (
+        policy.config.get_optimizer_preset(),
+        policy.config.get_scheduler_preset(),
+    )
+    optimizer, scheduler = make_optimizer_and_scheduler(config, policy)
+    update(policy, optimizer, scheduler)
+    save_checkpoint(tmp_path, 1, config, policy, optimizer, scheduler, before, after)
 
-    def act(task, policy):
-        actions = []
-        for _ in range(3):
-            policy.reset()
-            actions.append(policy.select_action(batches[task]))
-        return torch.cat(actions)
-
-    alone = {task: act(task, copy.deepcopy(policy)) for task in TASKS}
-    with ThreadPoolExecutor(n_threads) as pool:
-        shown = {task: pool.submit(act, task, policy) for task in TASKS}
-    for task, actions in alone.items():
-        assert torch.equal(shown[task].result(), actions)
-
-
-def test_threads_embed_instructions_without_mixing_them_up(monkeypatch):
-    """Each is embedded once, even if several threads ask for it at the same time."""
-    encode = fake_encoder("all-MiniLM-L6-v2")
-
-    def slowly(sentences):
-        time.sleep(0.01)
-        return encode(sentences)
-
-    monkeypatch.setattr(instruction_table, "load_language_encoder", lambda _: slowly)
-    table = InstructionTable("all-MiniLM-L6-v2")
-    asked = [[f"task {n // 2}"] for n in range(16)]
-    with ThreadPoolExecutor(8) as pool:
-        embeddings = list(pool.map(lambda instructions: table(instructions, "cpu"), asked))
-    for instructions, embedding in zip(asked, embeddings, strict=True):
-        assert torch.equal(embedding, encode(instructions))
-        assert torch.equal(table(instructions, "cpu"), encode(instructions))
-    assert len(table.embeddings) == len(table.rows) == 8
-
-
-# The loss of episodes that `--dataset.eval_split` holds back
-
-
-def test_an_episode_that_is_held_back_is_shown_by_any_of_its_task(make, dataset):
-    policy, before, _ = make(demo_episodes=[0, 1, 3, 5])
-    held_back = before(batch_of(dataset, [2 * LENGTH, 4 * LENGTH]))
-    with pytest.raises(ValueError, match="Episode 2 is trained on, but is not among"):
-        policy(held_back)
-    policy.eval()
-    loss, _ = policy(held_back)
-    assert torch.isfinite(loss)
-    # As `deltaco-train` gives them.
-    policy.set_train_demonstrations(policy.train_demonstrations)
-    assert policy(held_back)[0] == loss
-
-    demonstrations, generator = policy.train_demonstrations, torch.Generator().manual_seed(0)
-    drawn = {}
-    tasks = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
-    for episode, task in enumerate(tasks):
-        rows = demonstrations.sample_other_episodes(
-            torch.full((100,), episode), generator, tasks=[task] * 100
-        )
-        drawn[episode] = set(demonstrations.episodes[rows].tolist())
-    assert drawn == {0: {1}, 1: {0}, 2: {0, 1}, 3: {3}, 4: {3}, 5: {5}}
-
-
-def test_a_task_that_is_held_back_altogether_is_named(make, dataset):
-    policy, before, _ = make(demo_episodes=[0, 1, 2])
-    policy.eval()
-    with pytest.raises(ValueError, match="'wave' has no episode .*`demo_episodes`"):
-        policy(before(batch_of(dataset, [0, 5 * LENGTH])))
-
-
-# Videos
+    config.policy.pretrained_path = tmp_path / "pretrained_model"
+    resumed = make_policy(config.policy, ds_meta=dataset.meta).train()
+    step, *state = load_training_state(tmp_path, *make_optimizer_and_scheduler(config, resumed))
+    assert step == int(resumed.step) == 1
+    update(policy, optimizer, scheduler)
+    update(resumed, *state)
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
 
 
 @pytest.fixture
 def usual_priority():
-    """Undoes what SVT-AV1 does for the superuser: it makes the encoding thread a real-time one for good."""
+    """Undoes what an encoder of videos may do for the superuser: it makes the thread a real-time one."""
     yield
     if hasattr(os, "sched_setscheduler"):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 @pytest.mark.usefixtures("usual_priority")
-@pytest.mark.parametrize("codec", ["h264", "libsvtav1"])
-def test_a_dataset_of_videos_trains_and_demonstrates(tmp_path, codec):
+def test_videos_are_trained_on_and_demonstrate(tmp_path):
     features = {
-        "observation.images.top": {
-            "dtype": "video",
-            "shape": (64, 96, 3),
-            "names": ["height", "width", "channels"],
-        },
+        "observation.images.top": {"dtype": "video", "shape": (64, 96, 3), "names": ["h", "w", "channels"]},
         "action": {"dtype": "float32", "shape": (2,), "names": ["left.pos", "right.pos"]},
     }
     root = tmp_path / "videos"
-    encoder = RGBEncoderConfig(vcodec=codec)
+    encoder = RGBEncoderConfig(vcodec="h264")
     dataset = LeRobotDataset.create(REPO_ID, 10, features, root=root, rgb_encoder=encoder)
     for number, task in enumerate(["wave", "wave", "sing"]):
-        for step in range(LENGTH):
+        for step in range(5):
+            image = np.full((64, 96, 3), 60 * number + 10 * step, np.uint8)
+            action = np.array([number, step], np.float32)
+            dataset.add_frame({"observation.images.top": image, "action": action, "task": task})
+        dataset.save_episode()
+    dataset.finalize()
+    dataset = LeRobotDataset(REPO_ID, root=root, video_backend="pyav")
+    policy, before, _ = small_policy(dataset, **demos_of(dataset))
+    loss, _ = policy(before(batch_of(dataset, [0, 6, 12])))
+    assert torch.isfinite(loss)
+    for bank in (policy.training_bank, policy.demonstrations):
+        shades = bank.frames.float().mean(dim=(2, 3, 4))
+        expected = torch.tensor([[60.0 * number, 60.0 * number + 40] for number in range(3)])
+        torch.testing.assert_close(shades, expected, atol=6, rtol=0)
+    policy.eval()
+    assert policy.select_action(before(observation(dataset, ["sing", "wave"]))).shape == (2, 2)
+
+
+# Commands
+
+PICKS = (0.1, 0.4, 0.8)  # where the object is, as a fraction of the image's width
+ROBOT_TASKS = ["move it to the end", "drop it"]
+
+
+def write_robot_dataset(root, repo_id, tasks):
+    """Writes an episode for each task, in which the arm moves a square from one of `PICKS` to the end."""
+    height, width, _ = IMAGE_SHAPE
+    motors = {"dtype": "float32", "shape": (2,), "names": list(MOTORS)}
+    image = {"dtype": "image", "shape": IMAGE_SHAPE, "names": ["height", "width", "channels"]}
+    features = {f"observation.images.{CAMERA}": image, "observation.state": motors, "action": motors}
+    dataset = LeRobotDataset.create(repo_id, 20, features, root=root, use_videos=False)
+    rng = np.random.default_rng(0)
+    for number, task in enumerate(tasks):
+        pick = PICKS[number % 3] + 0.1 * rng.random()
+        shoulders, grippers = (0, pick, pick, pick, 1, 1, 0), (40, 40, 0, 0, 0, 40, 40)
+        for step, (shoulder, gripper) in enumerate(zip(shoulders, grippers, strict=True)):
+            picture = np.full(IMAGE_SHAPE, 120, np.uint8)
+            left = round((pick if step < 4 else 1) * (width - 5))
+            picture[height // 2 : height // 2 + 5, left : left + 5] = (230, 40, 30)
+            state = np.array([100 * shoulder, gripper], np.float32)
             dataset.add_frame(
                 {
-                    "observation.images.top": np.full((64, 96, 3), 60 * number + 10 * step, np.uint8),
-                    "action": np.array([number, step], np.float32),
+                    f"observation.images.{CAMERA}": picture,
+                    "observation.state": state,
+                    "action": state,
                     "task": task,
                 }
             )
         dataset.save_episode()
     dataset.finalize()
-    dataset = LeRobotDataset(REPO_ID, root=root, video_backend="pyav")
-    assert dataset.meta.video_keys == ["observation.images.top"]
+    return LeRobotDataset(repo_id, root=root)
 
-    policy, before, _ = small_policy(dataset, demo_repo_id=REPO_ID, demo_root=str(root))
-    batch = before(batch_of(dataset, [0, 6, 12]))
-    loss, _ = policy(batch)
-    loss.backward()
-    assert torch.isfinite(loss)
-    # Each demonstration is the first and the last frame of its own episode, as well as the codec keeps them.
-    for demonstrations in (policy.train_demonstrations, policy.eval_demonstrations):
-        shades = demonstrations.frames.float().mean(dim=(2, 3, 4))
-        expected = [[60.0 * number, 60.0 * number + 10 * (LENGTH - 1)] for number in range(3)]
-        torch.testing.assert_close(shades, torch.tensor(expected), atol=6, rtol=0)
-    policy.eval()
-    assert policy.select_action(before(observation(dataset, ["sing", "wave"]))).shape == (2, 2)
+
+# One process for all of it, since importing LeRobot takes 10 s.
+ROLLOUTS = """
+import json, sys
+from pathlib import Path
+
+import fake_robot
+from lerobot.scripts import lerobot_rollout
+from small_policies import fake_encoder, language
+
+fake_encoder.calls = []
+language.load_language_encoder = fake_encoder
+sent = []
+for words in json.loads(sys.argv[1]):
+    fake_robot.FakeArm.sent.clear()
+    sys.argv = ["lerobot-rollout", *words]
+    lerobot_rollout.main()
+    sent.append(list(fake_robot.FakeArm.sent))
+Path("sent.json").write_text(json.dumps(sent))
+"""
+
+
+def test_rollouts_move_a_robot_by_the_demonstration_of_a_new_task(tmp_path):
+    dataset = write_robot_dataset(tmp_path / "tasks", "me/tasks", ROBOT_TASKS[:1] * 24)
+    demos = write_robot_dataset(tmp_path / "demos", "me/demos", ROBOT_TASKS[1:])
+    common = ["--robot.type=fake_arm", "--fps=20", "--duration=0.5", "--return_to_initial_position=false"]
+    named = ["--policy.demo_repo_id=me/demos", f"--policy.demo_root={demos.root}"]
+    commands = []
+    for policy_type in ("deltaco", "deltaco_match"):
+        policy, before, after = small_policy(dataset, policy_type)
+        policy(before(batch_of(dataset, [0, 7, 14, 21])))
+        for part in (policy, before, after):
+            part.save_pretrained(tmp_path / policy_type)
+        path = f"--policy.path={tmp_path / policy_type}"
+        commands.append([path, f"--task={ROBOT_TASKS[1]}", *named, *common])
+        commands.append([path, "--task=in other words", "--policy.demo_episode=0", *named, *common])
+    result = run_python(
+        *(ROLLOUTS, json.dumps(commands)),
+        cwd=tmp_path,
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")]),
+            "HF_HOME": str(tmp_path / "cache"),
+        },
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    rollouts = json.loads((tmp_path / "sent.json").read_text())
+    assert len(rollouts) == len(commands)
+    for sent in rollouts:
+        assert len(sent) >= 3
+        for action in sent:
+            assert set(action) == set(MOTORS)
+            assert 0 <= action["gripper.pos"] <= 40
+
+
+# The checkpoint of this project
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return load_policy(SHIPPED, ["--device=cpu"])
+
+
+def test_shipped_checkpoint_knows_the_test_tasks(shipped):
+    policy = shipped.policy
+    assert isinstance(policy, DeltacoMatchPolicy)
+    assert len(policy.demonstrations.rows) == len(TASK_SETS["scenario_a_test"])
+    assert set(policy.demonstrations.rows) <= set(policy.instructions.rows)
+    for file in SHIPPED.glob("*.json"):
+        settings = json.loads(file.read_text(encoding="utf-8"))
+        assert settings.get("demo_root") is None
+
+
+def test_shipped_checkpoint_loads_offline_and_acts(shipped, monkeypatch):
+    monkeypatch.setattr("socket.socket.connect", lambda *_: pytest.fail("asked the network"))
+    config = PreTrainedConfig.from_pretrained(SHIPPED)
+    config.pretrained_path = SHIPPED  # as `--policy.path` does
+    config.device = "cpu"
+    environment = DeltacoEnv(task="4")
+    policy = make_policy(config, env_cfg=environment).eval()
+    task_id = TASK_SETS["scenario_a_test"][0]
+    generator = torch.Generator().manual_seed(0)
+    batch = shipped.preprocessor(
+        {
+            "observation.image": torch.rand(2, 3, 48, 48, generator=generator),
+            "observation.state": torch.zeros(2, 10),
+            "task": [get_task(task_id).instruction] * 2,
+        }
+    )
+    shipped.policy.reset()
+    action = policy.select_action(batch)
+    assert action.shape == (2, 4)
+    assert torch.isfinite(action).all()
+    assert torch.equal(action, shipped.policy.select_action(batch))

@@ -189,7 +189,6 @@ def test_checkpoint_acts_the_same_to_the_bit(make, tmp_path):
 # The loss, in numbers
 
 
-
 def weights_of(policy, prefix):
     return {
         name.removeprefix(prefix): value.numpy().astype(np.float64)

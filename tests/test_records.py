@@ -51,6 +51,7 @@ def test_a_folder_is_searched(tmp_path):
 
 
 CONTRADICTIONS = {
+    "a demonstrated task of the benchmark, or -1": {"demonstration_task": 777},
     "tasks and trials of the plan": {"trial": 0},
     "containers -1, 0 or 1 of three objects": {"object_containers": [[2, -1, -1]] * 12},
     "a grasped object from -1 to 2": {"grasped_object": 3},
@@ -71,6 +72,20 @@ def test_contradictions_are_refused(tmp_path, monkeypatch, message):
         write_records(tmp_path / "some.parquet", [make_record(), record])
     with pytest.raises(RecordError, match=message):
         read_records(tmp_path / "some.parquet")
+
+
+def test_an_incomplete_evaluation_is_refused(tmp_path):
+    record = make_record()
+    with pytest.raises(RecordError, match="lacks something"):
+        write_records(tmp_path / "some.parquet", [replace(record, episodes=record.episodes[:-1])])
+
+
+def test_datasets_below_a_folder_are_passed_over_and_those_above_do_not_matter(tmp_path):
+    folder = tmp_path / "data" / "run"
+    write_records(folder / "some.parquet", [make_record()])
+    (folder / "dataset" / "meta").mkdir(parents=True)
+    pd.DataFrame({"task_id": [4]}).to_parquet(folder / "dataset" / "meta" / "episodes.parquet")
+    assert len(read_records(folder)) == 1
 
 
 def test_what_is_no_file_of_records_is_named(tmp_path):

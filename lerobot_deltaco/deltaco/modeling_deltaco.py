@@ -310,7 +310,9 @@ class DeltacoPolicy(TaskConditionedPolicy):
         config = self.config
         encoder = self._load_vision_encoder()
         padding, frames, rows = config.demo_shift_padding, config.n_demo_frames, config.demo_rows
-        return encode_bank(bank, encoder, frames, rows, n_variants, padding, config.seed)
+        # The features do not depend on the precision of the training.
+        with torch.autocast(self.step.device.type, enabled=False):
+            return encode_bank(bank, encoder, frames, rows, n_variants, padding, config.seed)
 
     def _load_vision_encoder(self) -> VisionEncoder:
         config = self.config

@@ -246,7 +246,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         condition = self._condition(instructions, device)
         plain = bank.frames[rows, 0].float() / 255  # (batch, 3, H, W)
         plain, locations = _shifted(plain, known.locations[rows], generator)
-        scenes, found, description, demonstrated = plain, known.found[rows], None, None
+        scenes, description, demonstrated = plain, None, None
+        found = (rows >= 0) & known.found[rows]
         attention_losses = torch.zeros(len(rows), device=device)
         if config.uses_demonstrations:
             # By an instruction alone, colors are what they are.

@@ -1,0 +1,326 @@
+"""Checkpoints: saved and loaded to the bit, checked when they are loaded, pushed to the Hub and described."""
+
+import copy
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from fake_hub import USER, WITHOUT_CARD_CHECK, FakeHub
+from fresh_python import run_python
+from huggingface_hub import ModelCard
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from small_policies import (
+    REPO_ID,
+    TASKS,
+    batch_of,
+    demos_of,
+    fake_encoder,
+    observation,
+    random_moves,
+    small_policy,
+    use_fake_encoder,
+    write_dataset,
+    write_table,
+)
+
+from lerobot_deltaco.base_config import SOURCES
+from lerobot_deltaco.base_policy import TrainingDivergedError
+from lerobot_deltaco.deltaco.configuration_deltaco import METHODS
+from lerobot_deltaco.deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.deltaco_match.configuration_deltaco_match import TASK_INPUTS
+from lerobot_deltaco.language import LANGUAGE_ENCODERS, InstructionEmbeddings
+from lerobot_deltaco.task_bank import TASK_BANK, TaskBankError, read_task_bank
+
+pytestmark = pytest.mark.usefixtures("fake_language")
+
+POLICY_ID = f"{USER}/policy"
+N_DEMONSTRATIONS = 2
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """A checkpoint with two demonstrations, and the action of its policy for an observation."""
+    with pytest.MonkeyPatch.context() as patch:
+        use_fake_encoder(patch)
+        folder = tmp_path_factory.mktemp("checkpoint")
+        dataset = write_dataset(folder / "data", TASKS[:N_DEMONSTRATIONS])
+        policy, before, _ = small_policy(dataset, **demos_of(dataset))
+        policy(before(batch_of(dataset, [0, 5])))
+        policy.save_pretrained(folder / "policy")
+        seen = before(observation(dataset, TASKS[:N_DEMONSTRATIONS]))
+        return folder / "policy", seen, policy.eval().select_action(seen)
+
+
+@pytest.fixture
+def checkpoint(saved, tmp_path):
+    """A copy of the checkpoint, to be damaged."""
+    return shutil.copytree(saved[0], tmp_path / "copy")
+
+
+def edit(path, change):
+    """Edits the tensors and the metadata of a safetensors file; `change` gets both."""
+    tensors = load_file(path)
+    with safe_open(path, framework="pt") as file:
+        known = dict(file.metadata() or {})
+    change(tensors, known)
+    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path, metadata=known)
+
+
+def test_checkpoint_is_complete_and_names_no_sources(saved):
+    folder, seen, expected = saved
+    assert {path.name for path in folder.iterdir()} == {"config.json", "model.safetensors", TASK_BANK}
+    assert str(folder.parent) not in (folder / "config.json").read_text()
+    loaded = DeltacoPolicy.from_pretrained(folder)
+    assert [getattr(loaded.config, name) for name in SOURCES] == [None] * 3
+    assert torch.equal(loaded.select_action(seen), expected)
+    assert int(loaded.step) == 1
+    assert fake_encoder.calls == []
+    assert loaded.demonstrations.tasks == TASKS[:N_DEMONSTRATIONS]
+
+
+def test_configuration_keeps_its_sources_when_it_is_saved(make, dataset, tmp_path):
+    policy, _, _ = make(**demos_of(dataset))
+    config = copy.deepcopy(policy.config)
+    policy.save_pretrained(tmp_path)
+    assert policy.config == config
+    loaded = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=["--demo_episode=2", "--seed=7"])
+    assert (loaded.demo_episode, loaded.seed, loaded.demo_repo_id) == (2, 7, None)
+
+
+def test_demonstrations_of_the_command_line_come_before_those_of_the_checkpoint(saved, dataset):
+    config = PreTrainedConfig.from_pretrained(saved[0])
+    config.demo_repo_id, config.demo_root = REPO_ID, str(dataset.root)
+    loaded = DeltacoPolicy.from_pretrained(saved[0], config=config)
+    assert set(loaded.demonstrations.tasks) == set(TASKS)
+
+
+@pytest.mark.parametrize("with_state_dict", [True, False], ids=["LeRobot 0.6.1", "later"])
+def test_policy_is_saved_by_either_signature_of_lerobot(make, tmp_path, with_state_dict):
+    policy, _, _ = make(method="language_only")
+    policy._save_pretrained(tmp_path, **({"state_dict": None} if with_state_dict else {}))
+    loaded = DeltacoPolicy.from_pretrained(tmp_path)
+    assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in policy.state_dict().items())
+
+
+# The task bank
+
+
+def set_tensor(name, function):
+    return lambda tensors, known: tensors.update({name: function(tensors[name])})
+
+
+def set_known(name, value):
+    return lambda tensors, known: known.update({name: value})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (set_tensor("embeddings", lambda x: 1000 * x), "its embeddings are not unit vectors"),
+        (set_tensor("embeddings", lambda x: x * torch.nan), "its embeddings are not unit vectors"),
+        (set_tensor("embeddings", lambda x: x[:1]), "its instructions and embeddings differ in number"),
+        (set_tensor("embeddings", lambda x: x.double()), "it has the tensor `embeddings` of torch.float64"),
+        (set_tensor("frames", lambda x: x.float()), "it has the tensor `frames` of torch.float32"),
+        (set_tensor("frames", lambda x: x[..., :8]), "its demonstrations have the shape"),
+        (set_tensor("frames", lambda x: x[:1]), "its demonstrations differ in number"),
+        (set_tensor("episodes", lambda x: x[:1]), "its demonstrations differ in number"),
+        (lambda tensors, known: tensors.pop("episodes"), "its demonstrations differ in number"),
+        (lambda tensors, known: tensors.update(more=torch.zeros(2)), "it has the tensor `more`"),
+        (set_known("instructions", '["same", "same"]'), "its instructions and embeddings differ in number"),
+        (set_known("instructions", "[1, 2]"), "its instructions and embeddings differ in number"),
+        (set_known("instructions", "no JSON"), "Expecting value"),
+        (set_known("tasks", "[]"), "its demonstrations differ in number"),
+        (set_known("target_objects", "[1]"), "its target objects and demonstrations differ in number"),
+        (
+            set_known("language_encoder", "all-MiniLM-L6-v2"),
+            "its instructions were embedded by all-MiniLM-L6",
+        ),
+    ],
+)
+def test_damaged_task_bank_is_an_error(checkpoint, change, message):
+    edit(checkpoint / TASK_BANK, change)
+    with pytest.raises(
+        TaskBankError, match=f"{TASK_BANK} cannot be used: {message}.*Save or fetch the check"
+    ):
+        DeltacoPolicy.from_pretrained(checkpoint)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no tensors at all"])
+def test_task_bank_that_is_none_is_an_error(checkpoint, content):
+    (checkpoint / TASK_BANK).unlink()
+    if content is not None:
+        (checkpoint / TASK_BANK).write_bytes(content)
+    with pytest.raises(TaskBankError, match=f"{TASK_BANK} cannot be used"):
+        DeltacoPolicy.from_pretrained(checkpoint)
+
+
+@pytest.mark.parametrize("encoder", ["all-MiniLM-L6-v2", "all-distilroberta-v1"], ids=["as large", "larger"])
+def test_another_language_encoder_is_an_error(make, tmp_path, encoder):
+    policy, _, _ = make()
+    policy.save_pretrained(tmp_path)
+    policy.config.language_encoder = encoder
+    with pytest.raises(ValueError, match="L3-v2, and `language_encoder` is all|does not have the weights"):
+        DeltacoPolicy.from_pretrained(tmp_path, config=policy.config)
+
+
+def test_task_bank_of_another_robot_is_an_error(tmp_path):
+    table = write_table(tmp_path / "data", random_moves(2))
+    policy, _, _ = small_policy(table, "deltaco_match", feature_matching=False, **demos_of(table))
+    policy.save_pretrained(tmp_path / "policy")
+    shape = (2, 3, policy.config.image_size, policy.config.image_size)
+
+    def read(state_dim):
+        instructions = InstructionEmbeddings(policy.config.language_encoder)
+        return read_task_bank(tmp_path / "policy" / TASK_BANK, instructions, shape, state_dim)
+
+    assert torch.equal(read(3).pick_states, policy.demonstrations.pick_states)
+    with pytest.raises(TaskBankError, match="its grasps have 3 numbers, and the robot's state 5"):
+        read(5)
+
+
+# Weights
+
+
+def test_weights_that_do_not_fit_are_an_error(checkpoint):
+    edit(checkpoint / "model.safetensors", lambda tensors, _: tensors.pop("model.raw_log_std"))
+    with pytest.raises(
+        ValueError, match="does not have the weights of this policy: .*raw_log_std.*config.js"
+    ):
+        DeltacoPolicy.from_pretrained(checkpoint)
+
+
+def test_weights_that_are_not_finite_are_neither_loaded_nor_saved(checkpoint, make, tmp_path):
+    edit(checkpoint / "model.safetensors", lambda tensors, _: tensors["model.raw_log_std"].fill_(torch.nan))
+    with pytest.raises(ValueError, match="is damaged: the weight model.raw_log_std has numbers that are not"):
+        DeltacoPolicy.from_pretrained(checkpoint)
+    policy, _, _ = make()
+    with torch.no_grad():
+        policy.model.raw_log_std.fill_(torch.inf)
+    with pytest.raises(
+        TrainingDivergedError, match="weight model.raw_log_std is not finite, and no checkpoin"
+    ):
+        policy.save_pretrained(tmp_path / "new")
+    assert not (tmp_path / "new" / "model.safetensors").exists()
+
+
+def test_one_hot_policy_remembers_its_tasks(make, dataset, tmp_path):
+    policy, before, _ = make(method="one_hot")
+    policy.save_pretrained(tmp_path)
+    loaded = DeltacoPolicy.from_pretrained(tmp_path)
+    assert loaded.config.one_hot_tasks == TASKS
+    with pytest.raises(
+        ValueError, match="does not know the task 'juggle'. It knows the 3 tasks .*'stack the"
+    ):
+        loaded.select_action(before(observation(dataset, ["juggle"])))
+
+
+# The card
+
+
+def card_of(dataset, policy_type="deltaco", train_config=None, **options):
+    policy, _, _ = small_policy(dataset, policy_type, repo_id=POLICY_ID, **options)
+    config = policy.config
+    return policy.generate_model_card(
+        REPO_ID, config.type, config.license, config.tags, train_config, dataset.meta
+    )
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "options"),
+    [
+        *(("deltaco", {"method": method}) for method in METHODS),
+        *(("deltaco_match", {"inputs": inputs}) for inputs in TASK_INPUTS),
+    ],
+)
+def test_every_kind_of_policy_has_a_card(dataset, policy_type, options):
+    card = card_of(dataset, policy_type, **options)
+    (name,) = options.values()
+    assert f"# {policy_type}, trained on {REPO_ID}\n" in card.text
+    assert "3 tasks" in card.text
+    if policy_type == "deltaco":
+        assert f"| method | {name} |".replace("_", r"\_") in card.text
+    takes_demonstrations = name in ("deltaco", "demo_only", "bc_z", "mcil", "both", "demonstration")
+    assert ("--policy.demo_repo_id" in card.text) == takes_demonstrations
+    assert "number 1 is the gripper, which small values close" in card.text
+    assert str(dataset.root) not in card.text
+    assert "None" not in card.text
+
+
+def test_card_names_options_demonstrations_and_training(dataset):
+    train_config = TrainPipelineConfig(DatasetConfig(REPO_ID), steps=12_345, batch_size=24, seed=77)
+    options = {"license": "mit", "tags": ["cups", "lerobot"], "temperature": 0.2, **demos_of(dataset)}
+    card = card_of(dataset, train_config=train_config, **options)
+    for row in ("| steps | 12345 |", "| batch\\_size | 24 |", "| temperature | 0.2 |"):
+        assert row.replace("\\_", "_") in card.text.replace("\\_", "_")
+    assert 'the checkpoint has some of 3 tasks, such as "stack the cups"' in card.text
+    assert "| `observation.images.top` | (3, 20, 28) |" in card.text
+    assert LANGUAGE_ENCODERS["paraphrase-MiniLM-L3-v2"].repo_id in card.text
+    assert "@inproceedings{yu2023deltaco" in card.text
+    data = ModelCard(str(card)).data
+    assert (data.library_name, data.pipeline_tag, data.license) == ("lerobot", "robotics", "mit")
+    assert (data.datasets, data.model_name) == ([REPO_ID], "deltaco")
+    assert {"lerobot", "robotics", "deltaco", "cups"} <= set(data.tags)
+    assert len(data.tags) == len(set(data.tags))
+
+
+# The Hub
+
+PUSH_AND_FETCH = """
+import sys
+from pathlib import Path
+
+import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies import make_pre_post_processors
+from small_policies import *
+
+root, policy_id = Path(sys.argv[1]), sys.argv[2]
+fake_encoder.calls = []
+language.load_language_encoder = fake_encoder
+dataset = write_dataset(root / "train", [*TASKS, *TASKS])
+demos = write_dataset(root / "demos", [*TASKS, "juggle"])
+policy, before, after = small_policy(dataset, repo_id=policy_id, push_to_hub=True, **demos_of(demos))
+policy(before(batch_of(dataset, [0, 7])))
+policy.eval()
+seen = observation(dataset, ["juggle", "wave"])
+expected = after(policy.select_action(before(seen)))
+
+# As `lerobot-train` does at its end.
+train_config = TrainPipelineConfig(DatasetConfig(REPO_ID, root=str(dataset.root)), policy=policy.config)
+policy.push_model_to_hub(train_config, dataset_meta=dataset.meta)
+before.push_to_hub(policy_id)
+after.push_to_hub(policy_id)
+
+fake_encoder.calls = []
+fetched = type(policy).from_pretrained(policy_id)
+before, after = make_pre_post_processors(fetched.config, policy_id)
+assert torch.equal(after(fetched.select_action(before(seen))), expected)
+assert fake_encoder.calls == []
+assert fetched.demonstrations.tasks == policy.demonstrations.tasks
+assert fetched.config.demo_repo_id is None
+"""
+
+
+def test_pushed_policy_is_fetched_by_its_id(tmp_path):
+    python_path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    with FakeHub() as hub:
+        result = run_python(
+            *(WITHOUT_CARD_CHECK + PUSH_AND_FETCH, tmp_path, POLICY_ID),
+            env={**hub.environment(tmp_path / "home"), "PYTHONPATH": python_path},
+        )
+        assert result.returncode == 0, result.stderr[-3000:]
+        files = hub.repos["model", POLICY_ID].files()
+        weights = {"config.json", "model.safetensors", TASK_BANK}
+        processors = {"policy_preprocessor.json", "policy_postprocessor.json"}
+        assert {*weights, *processors, "train_config.json", "README.md"} <= set(files)
+        for name in ("README.md", "config.json"):
+            assert str(tmp_path) not in files[name].decode()
+        assert json.loads(files["config.json"])["demo_root"] is None

@@ -1,0 +1,385 @@
+"""Frozen encoders of sentences and images: the packaged ones, tiny models of transformers, and errors."""
+
+import functools
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+import torchvision
+from safetensors.torch import save_file
+from small_policies import TASKS, batch_of, demos_of, observation
+from tokenizers import Tokenizer, models, pre_tokenizers
+from transformers import (
+    AutoTokenizer,
+    BitImageProcessor,
+    CLIPConfig,
+    CLIPImageProcessor,
+    CLIPModel,
+    Dinov2Config,
+    Dinov2Model,
+    PreTrainedTokenizerFast,
+    ResNetConfig,
+    ResNetModel,
+    SiglipConfig,
+    SiglipImageProcessor,
+    SiglipModel,
+)
+
+from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
+from lerobot_deltaco import efficientnet_lite, language
+from lerobot_deltaco.deltaco.demo_encoders import encode_bank
+from lerobot_deltaco.deltaco.modeling_deltaco import DeltacoPolicy
+from lerobot_deltaco.demonstrations import DemonstrationBank
+from lerobot_deltaco.efficientnet_lite import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    EfficientNetLite0,
+    PretrainedWeightsError,
+)
+from lerobot_deltaco.language import (
+    CLIP,
+    LANGUAGE_ENCODERS,
+    MINILM_L3,
+    MINILM_L6,
+    InstructionEmbeddings,
+    LanguageEncoderError,
+    LanguageEncoderSpec,
+    load_language_encoder,
+)
+from lerobot_deltaco.vision import load_vision_encoder, r3m_weights
+
+# Sentences
+
+
+def test_packaged_l3_computes_what_its_published_graph_does():
+    instructions = [task.instruction for task in BENCHMARK_TASKS[::10]]
+    session = onnxruntime.InferenceSession(str(language.l3_onnx_file()))
+    tokens = AutoTokenizer.from_pretrained(language._l6_folder())(
+        instructions, padding=True, return_tensors="np"
+    )
+    inputs = {name: tokens[name].astype(np.int64) for name in ("input_ids", "attention_mask")}
+    (expected,) = (out for out in session.run(None, inputs) if out.shape == (30, 384))
+    np.testing.assert_allclose(load_language_encoder(MINILM_L3)(instructions).numpy(), expected, atol=1e-5)
+    assert len(np.unique(expected.round(4), axis=0)) == 30
+
+
+@pytest.mark.parametrize("name", [MINILM_L3, MINILM_L6])
+def test_packaged_encoders_need_no_network(monkeypatch, name):
+    monkeypatch.setattr("socket.socket.connect", lambda *_: pytest.fail("asked the network"))
+    encode = load_language_encoder(name)
+    sentences = ["Put blue object in front bin.", "put the blu thing in the fornt bin", "Sing."]
+    embeddings = encode([*sentences, "put it in the bin " * 200])  # a very long one is cut
+    assert embeddings.shape == (4, LANGUAGE_ENCODERS[name].embedding_dim)
+    assert embeddings.isfinite().all()
+    cosine = torch.nn.functional.cosine_similarity(embeddings[:1], embeddings[1:3])
+    assert cosine[0] > cosine[1]
+    # Other sentences of the batch, and their lengths, do not matter.
+    torch.testing.assert_close(encode(["Sing."])[0], embeddings[2], atol=1e-5, rtol=0)
+
+
+def test_instructions_are_embedded_once_as_unit_vectors(monkeypatch):
+    calls = []
+
+    def encode(sentences):
+        calls.append(list(sentences))
+        return torch.full((len(sentences), 384), 3.0)
+
+    monkeypatch.setattr(language, "load_language_encoder", lambda _: encode)
+    instructions = InstructionEmbeddings(MINILM_L3)
+    embeddings = instructions(["wave", "sing", "wave", ""], "cpu")
+    torch.testing.assert_close(embeddings.norm(dim=1), torch.tensor([1.0, 1, 1, 0]))
+    assert torch.equal(instructions(["", "wave"], "cpu"), embeddings[[3, 2]])
+    assert calls == [["wave", "sing"]]
+    assert list(instructions.rows) == ["wave", "sing"]
+
+
+@pytest.mark.parametrize("name", [MINILM_L3, MINILM_L6])
+def test_other_weights_in_a_language_package_are_an_error(monkeypatch, tmp_path, name):
+    for file in ("model.safetensors", "model.onnx"):
+        (tmp_path / file).write_bytes(b"other weights")
+    monkeypatch.setattr(language, "_l6_folder", lambda: tmp_path)
+    monkeypatch.setattr(language, "l3_onnx_file", lambda: tmp_path / "model.onnx")
+    with pytest.raises(LanguageEncoderError, match="not the published ones.*install the package again"):
+        load_language_encoder(name)
+
+
+def test_graph_of_another_model_is_an_error():
+    graph = onnx.helper.make_graph([], "empty", [], [])
+    with pytest.raises(LanguageEncoderError, match="does not hold a BERT as expected"):
+        language.read_bert(onnx.helper.make_model(graph).SerializeToString())
+
+
+@pytest.mark.parametrize("name", LANGUAGE_ENCODERS)
+def test_error_without_network_and_packages_says_what_to_do(monkeypatch, name):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(language, "_l6_folder", lambda: None)
+    monkeypatch.setattr(language, "l3_onnx_file", lambda: None)
+    with pytest.raises(LanguageEncoderError, match=f"{name} cannot be loaded.*extra `offline`"):
+        load_language_encoder(name)
+
+
+# Images: tiny models of transformers
+
+SIZE = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
+TEXT = {**SIZE, "vocab_size": 40, "bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 0}
+VISION = {**SIZE, "image_size": 32, "patch_size": 16}
+TINY_MODELS = {  # with the size of their features
+    "clip": (
+        lambda: CLIPModel(
+            CLIPConfig(
+                text_config={**TEXT, "projection_dim": 8},
+                vision_config={**VISION, "projection_dim": 8},
+                projection_dim=8,
+            )
+        ),
+        functools.partial(CLIPImageProcessor, crop_size={"height": 32, "width": 32}),
+        8,
+    ),
+    "siglip": (
+        lambda: SiglipModel(SiglipConfig(text_config={**SIZE, "vocab_size": 40}, vision_config=VISION)),
+        functools.partial(SiglipImageProcessor, size={"height": 32, "width": 32}),
+        16,
+    ),
+    "dinov2": (
+        lambda: Dinov2Model(
+            Dinov2Config(hidden_size=16, num_hidden_layers=1, num_attention_heads=2, image_size=28)
+        ),
+        functools.partial(BitImageProcessor, crop_size={"height": 28, "width": 28}),
+        16,
+    ),
+    "resnet": (
+        lambda: ResNetModel(
+            ResNetConfig(embedding_size=8, hidden_sizes=[8, 12], depths=[1, 1], layer_type="basic")
+        ),
+        functools.partial(BitImageProcessor, crop_size={"height": 32, "width": 32}),
+        12,
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """A folder for each tiny model."""
+    torch.manual_seed(0)
+    found = {}
+    for name, (make_model, make_processor, _) in TINY_MODELS.items():
+        found[name] = tmp_path_factory.mktemp(name)
+        make_model().save_pretrained(found[name])
+        make_processor().save_pretrained(found[name])
+    return found
+
+
+@pytest.mark.parametrize("name", TINY_MODELS)
+def test_any_image_model_of_transformers_is_loaded(folders, name):
+    encoder = load_vision_encoder(str(folders[name]))
+    images = torch.rand(3, 3, 20, 40)
+    features = encoder(images)
+    assert features.shape == (3, TINY_MODELS[name][2])
+    assert encoder.feature_dim == TINY_MODELS[name][2]
+    assert features.isfinite().all()
+    assert not features.requires_grad
+    torch.testing.assert_close(encoder(images[1:]), features[1:], atol=1e-5, rtol=1e-4)
+    # The middle square alone is seen.
+    images[..., :9] = images[..., 31:] = 0
+    torch.testing.assert_close(encoder(images), features, atol=1e-5, rtol=1e-4)
+
+
+def test_features_of_clip_are_those_of_its_own_pipeline(folders):
+    image = torch.randint(0, 256, (3, 32, 32), dtype=torch.uint8)
+    processor = CLIPImageProcessor.from_pretrained(folders["clip"], do_resize=False)
+    model = CLIPModel.from_pretrained(folders["clip"]).eval()
+    with torch.no_grad():
+        pixels = processor(image, return_tensors="pt")["pixel_values"]
+        expected = model.visual_projection(model.vision_model(pixels).pooler_output)
+    encoder = load_vision_encoder(str(folders["clip"]))
+    torch.testing.assert_close(encoder(image[None] / 255), expected, atol=1e-5, rtol=1e-4)
+
+
+def test_clip_encodes_sentences(folders, monkeypatch):
+    words = {word: n for n, word in enumerate(["<pad>", "<s>", "</s>", "put", "it", "there", "<unk>"])}
+    tokenizer = Tokenizer(models.WordLevel(words, unk_token="<unk>"))
+    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    tokenizer = PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", unk_token="<unk>")
+    tokenizer.save_pretrained(folders["clip"])
+    specs = {**LANGUAGE_ENCODERS, CLIP: LanguageEncoderSpec(str(folders["clip"]), 8)}
+    monkeypatch.setattr(language, "LANGUAGE_ENCODERS", specs)
+    embeddings = load_language_encoder(CLIP)(["put it there", "it there put", "put " * 200])
+    assert embeddings.shape == (3, 8)
+    assert embeddings.isfinite().all()
+    assert not torch.allclose(embeddings[0], embeddings[1], atol=1e-5)
+
+
+# Images: R3M and EfficientNet-Lite0
+
+
+@pytest.mark.parametrize(("layers", "suffix"), [(18, ".pt"), (18, ".safetensors"), (50, ".pt")])
+def test_r3m_is_read_from_its_file(tmp_path, layers, suffix):
+    network = getattr(torchvision.models, f"resnet{layers}")(weights=None).eval()
+    weights = {f"module.convnet.{name}": value for name, value in network.state_dict().items()}
+    weights["module.lang_rew.pred.0.weight"] = torch.zeros(2)
+    file = tmp_path / f"model{suffix}"
+    if suffix == ".pt":
+        torch.save({"r3m": weights, "global_step": 7}, file)
+    else:
+        save_file(weights, file)
+    network.fc = torch.nn.Identity()
+    images = torch.rand(2, 3, 32, 32)
+    mean, std = (torch.tensor(values)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD))
+    with torch.no_grad():
+        published = load_vision_encoder(f"r3m-resnet{layers}", str(file), image_size=32)
+        torch.testing.assert_close(published(images), network((images - mean) / std), atol=1e-4, rtol=1e-3)
+        authors = load_vision_encoder(f"r3m-resnet{layers}", str(file), input_kind="authors")
+        expected = network((images / 255 - mean) / std)
+        torch.testing.assert_close(authors(images), expected, atol=1e-4, rtol=1e-3)
+
+
+def test_files_without_weights_of_r3m_are_errors(tmp_path):
+    torch.save({"r3m": {"module.convnet.conv1.weight": torch.zeros(1)}}, tmp_path / "other.pt")
+    torch.save(functools.partial(print, "run me"), tmp_path / "program.pt")
+    (tmp_path / "text.pt").write_text("no weights")
+    for name in ("other", "program", "text", "missing"):
+        with pytest.raises(PretrainedWeightsError, match=f"cannot be read from .*{name}.pt"):
+            load_vision_encoder("r3m-resnet18", str(tmp_path / f"{name}.pt"))
+    assert set(r3m_weights({"conv1.weight": torch.zeros(1), "fc.bias": torch.zeros(1)})) == {"conv1.weight"}
+
+
+def ramp():
+    """A normalized image of 64 x 96 px: red increases to the right, green downwards, blue with both."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, 64), torch.linspace(0, 1, 96), indexing="ij")
+    mean, std = (torch.tensor(values)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD))
+    return ((torch.stack([x, y, x * y]) - mean) / std)[None]
+
+
+# Means, standard deviations and sums of absolute values, by the package efficientnet_lite_pytorch 0.1.0.
+@pytest.mark.parametrize(
+    ("n_blocks", "shape", "mean", "std", "total"),
+    [
+        (5, (1, 40, 8, 12), -0.0341668, 10.691614, 32079.106),
+        (7, (1, 80, 4, 6), 0.2069152, 8.395786, 12612.469),
+        (16, (1, 1280, 2, 3), 0.0896977, 0.4400109, 688.87854),
+    ],
+)
+def test_maps_of_efficientnet_are_those_of_its_publishers(n_blocks, shape, mean, std, total):
+    network = EfficientNetLite0().train()
+    network.load_imagenet_weights()
+    maps = network(ramp(), n_blocks)
+    assert maps.shape == shape
+    assert maps.mean().item() == pytest.approx(mean, rel=1e-3)
+    assert maps.std().item() == pytest.approx(std, rel=1e-4)
+    assert maps.abs().sum().item() == pytest.approx(total, rel=1e-4)
+    first_blocks = EfficientNetLite0(7)
+    first_blocks.load_imagenet_weights()
+    if n_blocks <= 7:
+        assert torch.equal(first_blocks(ramp(), n_blocks), maps)
+
+
+def test_efficientnet_needs_no_network_and_draws_nothing(monkeypatch):
+    monkeypatch.setattr("socket.socket.connect", lambda *_: pytest.fail("asked the network"))
+    state = torch.get_rng_state()
+    encoder = load_vision_encoder("efficientnet-lite0", image_size=64)
+    assert torch.equal(torch.get_rng_state(), state)
+    features = encoder(torch.rand(2, 3, 64, 64))
+    assert features.shape == (2, 1280)
+    # The last convolution ends in ReLU6.
+    assert 0 <= features.min() < features.max() <= 6
+    assert not torch.allclose(features[0], features[1], atol=0.05)
+
+
+def test_missing_or_other_weights_of_efficientnet_are_errors(monkeypatch):
+    monkeypatch.setattr(efficientnet_lite, "_SHA256", "0" * 64)
+    with pytest.raises(PretrainedWeightsError, match="not the published ones.*Do not use them"):
+        load_vision_encoder("efficientnet-lite0")
+    monkeypatch.setattr(efficientnet_lite, "_PACKAGE", "no_such_package")
+    with pytest.raises(PretrainedWeightsError, match="needs the package no-such-package.*extra `offline`"):
+        load_vision_encoder("efficientnet-lite0")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (("no/model/here",), PretrainedWeightsError, "Valid are clip-vit-base-patch32.*efficientnet-lite0"),
+        (("clip-vit-base-patch32",), PretrainedWeightsError, "extra `offline` and choose efficientnet-lite0"),
+        (("efficientnet-lite0", "file.pt"), ValueError, "are for R3M alone"),
+        (("efficientnet-lite0", None, None, "authors"), ValueError, "are for R3M alone"),
+        (("r3m-resnet18",), PretrainedWeightsError, "name the file .* with `vision_encoder_weights`"),
+    ],
+)
+def test_encoders_that_cannot_be_loaded_are_explained(monkeypatch, arguments, error, message):
+    def refuse(*_, **__):
+        raise OSError("no network")
+
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with pytest.raises(error, match=message):
+        load_vision_encoder(*arguments)
+
+
+# Features of demonstrations
+
+
+def test_bank_is_encoded_without_a_shift_and_in_random_variants():
+    torch.manual_seed(0)
+    frames = torch.randint(0, 256, (5, 6, 3, 8, 8), dtype=torch.uint8)
+    bank, shapes = DemonstrationBank(frames, ["a", "a", "b", "b", "b"], range(5)), []
+
+    def encoder(images):
+        shapes.append(tuple(images.shape))
+        return images.mean(dim=(2, 3))
+
+    features = encode_bank(bank, encoder, n_frames=4, rows=2, n_variants=3, padding=2, seed=0)
+    assert features.shape == (5, 4, 3)
+    assert set(shapes) == {(5, 3, 16, 16)}
+    assert len(features[0].unique(dim=0)) == 4
+    again = encode_bank(bank, encoder, n_frames=4, rows=2, n_variants=3, padding=2, seed=0)
+    assert torch.equal(features, again)
+    plain = encode_bank(bank, encoder, n_frames=2, rows=1, n_variants=0, padding=2, seed=0)
+    expected = frames[:, [0, -1]].float().div(255).mean(dim=(1, 3, 4))
+    torch.testing.assert_close(plain[:, 0].float(), expected, atol=1e-3, rtol=0)
+
+
+@pytest.fixture
+def pretrained(make, dataset, folders, fake_language):
+    options = {"demo_encoder": "pretrained", "vision_encoder": str(folders["resnet"]), "demo_variants": 2}
+    return functools.partial(make, **options, **demos_of(dataset))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"demo_rows": 2, "demo_head": [8]},
+        {"demo_head": [], "dtype": "bfloat16"},
+        {"method": "demo_only", "encoder_loss": "none"},
+        {"film": "demo+language", "concat": "none", "encoder_loss": "none", "shift_padding": 0},
+        {"method": "mcil", "demo_head": [8]},
+    ],
+    ids=str,
+)
+def test_policies_with_a_pretrained_encoder_do_not_need_it_in_their_checkpoints(
+    pretrained, dataset, options, monkeypatch, tmp_path
+):
+    policy, before, _ = pretrained(**options)
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    batch = before(batch_of(dataset, [0, 7, 12, 20, 29]))
+    for _ in range(2):
+        loss, _ = policy(batch)
+        assert torch.isfinite(loss)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    policy.eval()
+    assert torch.isfinite(policy(batch)[0])
+    seen = before(observation(dataset, [TASKS[0], TASKS[2]]))
+    expected = policy.select_action(seen)
+    policy.save_pretrained(tmp_path / "policy")
+    monkeypatch.setattr(
+        "lerobot_deltaco.deltaco.modeling_deltaco.load_vision_encoder", lambda *_: pytest.fail("loaded")
+    )
+    loaded = DeltacoPolicy.from_pretrained(tmp_path / "policy")
+    torch.testing.assert_close(loaded.select_action(seen), expected, atol=1e-3, rtol=1e-3)
+
+
+def test_embeddings_of_different_sizes_are_not_compared(pretrained):
+    with pytest.raises(ValueError, match="have 12 numbers, and the instructions' have 384.*`demo_head`"):
+        pretrained()
