@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-# Before anything imports huggingface_hub, which reads it once. `HF_HUB_OFFLINE=0 pytest -m hub` goes online.
+# Before anything imports huggingface_hub, which reads it once.
 for name in ("HF_HUB_OFFLINE", "HF_DATASETS_OFFLINE", "TRANSFORMERS_OFFLINE"):
     os.environ.setdefault(name, "1")
 os.environ.setdefault("WANDB_MODE", "disabled")

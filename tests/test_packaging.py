@@ -195,5 +195,5 @@ def test_the_wheel_works_in_a_fresh_environment(wheel, tmp_path):
     checkpoint = site / "lerobot_deltaco" / "checkpoints" / "pick_place"
     found = run(*deltaco, "evaluate", checkpoint, "--tasks", "24", "--trials", "2", "--out", "run")
     assert "of 2 episodes of 24 succeeded" in found
-    card = "import pathlib, lerobot_deltaco.cards as c; print(c.dataset_card(pathlib.Path('data')))"
+    card = "import pathlib, lerobot_deltaco.dataset_card as c; print(c.dataset_card(pathlib.Path('data')))"
     assert "yu2023deltaco" in run("-c", card)

@@ -60,7 +60,7 @@ def test_a_random_configuration_works_or_is_refused_by_name(policy_type, tmp_pat
         batch_of(dataset, [0, 200, 400]),
     )
     n_trained = 0
-    for _ in range(60):
+    for _ in range(25):
         options = {name: rng.choice(values[name]) for name in rng.sample(sorted(values), 3)}
         try:
             config = make_policy_config(policy_type, device="cpu", **fixed, **options)
@@ -79,4 +79,4 @@ def test_a_random_configuration_works_or_is_refused_by_name(policy_type, tmp_pat
         assert action.shape == (3, 4)
         assert torch.isfinite(action).all(), options
         n_trained += 1
-    assert n_trained > 10
+    assert n_trained > 4

@@ -80,13 +80,13 @@ def test_training_equals_that_of_lerobot_train(train, policy):
         options["policy.tasks_per_batch"] = 0
     if policy == "deltaco_match":
         options["policy.frames_after_release"] = "null"
-    stock = train(options, "stock", in_memory=False)
-    memory = train(options, "memory")
-    assert_same(state_of(stock, 4), state_of(memory, 4))
+    stock = train(options, "stock", in_memory=False, steps=2)
+    memory = train(options, "memory", steps=2)
+    assert_same(state_of(stock, 2), state_of(memory, 2))
 
 
-# Episodes whose 120 frames are 3 batches of 40, and so a few epochs of a short run.
-FEW = {"dataset.episodes": "[0,6,12,18]", "batch_size": 40}
+# Two episodes, of different tasks, whose 60 frames are 3 batches: a short run has a few epochs.
+FEW = {"dataset.episodes": "[0,6]", "batch_size": 20}
 RESUMABLE = {
     "tasks": {**DELTACO, **FEW},
     "frames": {**DELTACO, **FEW, "policy.tasks_per_batch": 0},
@@ -98,25 +98,21 @@ RESUMABLE = {
 
 @pytest.mark.parametrize("name", RESUMABLE)
 def test_a_resumed_run_equals_an_uninterrupted_one(train, tmp_path, seen, name):
-    whole = train(RESUMABLE[name], "whole", steps=8, save_freq=4)
+    whole = train(RESUMABLE[name], "whole", steps=6, save_freq=4)
     indices = [batch["index"].tolist() for _, batch in seen]
     # What is there if the run was killed after step 4, in the second epoch.
     killed = tmp_path / "killed" / "checkpoints"
     shutil.copytree(whole / "000004", killed / "000004")
     seen.clear()
     config = killed / "000004" / "pretrained_model" / "train_config.json"
-    train({}, "killed", config_path=config, resume=True, save_freq=8)
+    train({}, "killed", config_path=config, resume=True, save_freq=6)
     # accelerate 1.15 would begin with the order of the first epoch.
     assert [batch["index"].tolist() for _, batch in seen] == indices[4:]
-    assert_same(state_of(whole, 8), state_of(killed, 8))
-
-
-def test_an_epoch_has_every_frame_once_in_an_order_of_its_own(train, seen):
-    train({**ACT, **FEW}, steps=6, save_freq=6)
-    indices = [batch["index"].tolist() for _, batch in seen]
-    assert indices[:3] != indices[3:]
-    for epoch in (indices[:3], indices[3:]):
-        assert len(set(sum(epoch, []))) == 120
+    assert_same(state_of(whole, 6), state_of(killed, 6))
+    if name != "deltaco_match":
+        assert indices[:3] != indices[3:]
+        for epoch in (indices[:3], indices[3:]):
+            assert len(set(sum(epoch, []))) == 60
 
 
 @pytest.mark.parametrize(("policy", "in_memory"), [("deltaco", False), ("deltaco_match", True)])
@@ -163,7 +159,7 @@ def test_two_processes_train_alike_from_the_disk_and_from_memory(root, tmp_path)
 def test_episodes_and_the_split_are_respected(train, seen, policy):
     chosen = {0, 1, 2, 6, 7, 8, 12, 13, 18, 19}
     split = {"dataset.episodes": f"{sorted(chosen)}", "dataset.eval_split": 0.3, "eval_steps": 2}
-    train({**POLICIES[policy], **split}, steps=4, save_freq=4, batch_size=24)
+    train({**POLICIES[policy], **split}, steps=2, save_freq=2, batch_size=12)
     trained, held_back = (
         {index for training, batch in seen if training == wanted for index in batch["episode_index"].tolist()}
         for wanted in (True, False)
