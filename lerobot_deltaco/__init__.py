@@ -1,1 +1,1 @@
-"""DeL-TaCo for LeRobot: the policies, and what collects, trains, evaluates and reports."""
+"""DeL-TaCo for LeRobot: policies, data collection, training, evaluation and reports."""

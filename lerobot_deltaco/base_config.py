@@ -1,4 +1,4 @@
-"""Options that both policies share, and what is inferred from the training dataset."""
+"""Options shared by both policies, and values inferred from the training dataset."""
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
@@ -19,7 +19,7 @@ from lerobot_deltaco.optimization import CosineSchedulerConfig, FusedAdamWConfig
 logger = logging.getLogger(__name__)
 
 PARAPHRASE_SPLITS = ("all", "train", "held_out")
-# Options whose contents a checkpoint holds: files and datasets of the machine that made it.
+# Options that name files and datasets of the training machine, whose contents are in the checkpoint.
 SOURCES = ("paraphrases", "demo_repo_id", "demo_root")
 
 
@@ -29,8 +29,8 @@ class TaskConditionedConfig(PreTrainedConfig):
 
     Args:
         language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'), all-MiniLM-L6-v2,
-            all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `offline` brings
-            the first two.
+            all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `offline`
+            includes the first two.
         paraphrases: CSV file with sentences for the benchmark's tasks. In training, each sample's instruction
             is drawn from the sentences of its task.
         paraphrases_split: Split of the file's sentences for training: train, the sentences that are not held
@@ -41,7 +41,7 @@ class TaskConditionedConfig(PreTrainedConfig):
             that are equally good; of several, the policy takes the likeliest.
         gripper: Gripper's dimension of the action: an index, "auto" (the last one whose name contains
             "gripper", if any) or "none".
-        gripper_closed: Which values of the gripper's dimension mean closed: low or high.
+        gripper_closed: Whether low or high values of the gripper's dimension mean closed.
         demo_camera: Name of the camera of demonstrations, such as "observation.images.front". By default, the
             first.
         demo_repo_id: Dataset of demonstrations for evaluation, with at least one episode of each task. The
@@ -49,16 +49,16 @@ class TaskConditionedConfig(PreTrainedConfig):
         demo_root: Folder of that dataset, if it is not in LeRobot's cache.
         demo_episode: Episode of that dataset to use as the demonstration of every instruction, such as a
             sentence of your own.
-        demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default, those
-            that are trained on.
+        demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default, all
+            training episodes.
         tasks_per_batch: Largest number of tasks in a batch of `deltaco train`, with equally many samples of
             each (the paper: 16 tasks x 64 samples); 0 for samples of any tasks.
         upsampled_tasks: Regular expression for the instructions of the tasks that get `upsampled_fraction` of
             each batch of `deltaco train`.
         upsampled_fraction: Fraction of each batch for the upsampled tasks; 0.5 in the paper's scenario B.
-        seed: Seed of the draws of demonstrations and shifts, which also depend on the step.
-        dtype: Precision of training: float32 or bfloat16; the last layers always use float32, and acting
-            does. Without instructions for bfloat16, a CPU uses float32.
+        seed: Seed for drawing demonstrations and shifts; the draws also depend on the step.
+        dtype: Precision of training: float32 or bfloat16; the last layers, and evaluation, always use
+            float32. So does a CPU without bfloat16 instructions.
         optimizer_lr: Learning rate of AdamW.
         optimizer_weight_decay: Weight decay of AdamW.
         scheduler_warmup_steps: Number of warmup steps of the cosine schedule.
@@ -95,15 +95,13 @@ class TaskConditionedConfig(PreTrainedConfig):
             "ACTION": NormalizationMode.MIN_MAX,
         }
     )
-    # Filled in by training: the tasks that a one-hot policy knows.
+    # Filled in by training: the tasks known to a one-hot policy.
     one_hot_tasks: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.dtype == "bfloat16" and self.device == "cpu" and not _has_bfloat16():
-            logger.warning(
-                "This processor has no instructions for bfloat16. The policy is trained in float32."
-            )
+            logger.warning("This CPU has no bfloat16 instructions. The policy is trained in float32.")
             self.dtype = "float32"
         try:
             self.check()
@@ -159,7 +157,7 @@ class TaskConditionedConfig(PreTrainedConfig):
                 raise ValueError(f"`{name}` must be one of {names}. Got {getattr(self, name)!r}.")
 
     def check_ranges(self, **ranges: tuple[float, float]) -> None:
-        """Checks that options are between their least and greatest valid values.
+        """Checks that options are between their minimum and maximum valid values.
 
         Raises:
             ValueError: One is not.
@@ -169,7 +167,7 @@ class TaskConditionedConfig(PreTrainedConfig):
             if not least <= value <= greatest:
                 raise ValueError(f"`{name}` must be from {least} to {greatest}. Got {value}.")
 
-    # What the dataset says
+    # From the dataset
 
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
         """Finds out which dimension is the gripper, and how actions are scaled.
@@ -224,7 +222,7 @@ class TaskConditionedConfig(PreTrainedConfig):
                 f"{action_dim - 1}. Name one of these, or 'none'."
             )
         if action_dim == 1 and self.gripper_index is not None:
-            raise ValueError("The action is nothing but a gripper. Set `gripper` to 'none' to learn it.")
+            raise ValueError("The action consists only of the gripper. Set `gripper` to 'none' to learn it.")
         if self.demo_camera is not None and self.demo_camera not in self.image_features:
             raise ValueError(
                 f"`demo_camera` must be one of the dataset's cameras, {', '.join(self.image_features)}. Got "
@@ -233,7 +231,7 @@ class TaskConditionedConfig(PreTrainedConfig):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras, that of the demonstrations first."""
+        """Names of the cameras; the one used for demonstrations comes first."""
         names = list(self.image_features)
         if self.demo_camera is not None:
             names.sort(key=lambda name: name != self.demo_camera)
@@ -245,7 +243,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         return int(self.gripper) if self.gripper.isdecimal() else None
 
     def gripper_opening(self, actions: torch.Tensor) -> torch.Tensor:
-        """Returns the gripper's commands in actions (frames, action), greater for more open, (frames,)."""
+        """Returns the gripper commands in actions (frames, action); larger is more open, (frames,)."""
         command = actions[:, self.gripper_index]
         return command if self.gripper_closed == "low" else -command
 
@@ -259,7 +257,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         """Size of an instruction's embedding."""
         return LANGUAGE_ENCODERS[self.language_encoder].embedding_dim
 
-    # Each policy says these of itself
+    # Implemented by each policy
 
     @property
     def uses_demonstrations(self) -> bool:
@@ -280,7 +278,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         PreTrainedConfig._save_pretrained(saved, save_directory)
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:
-        """Returns AdamW; without weight decay, it is Adam."""
+        """Returns AdamW, which equals Adam without weight decay."""
         return FusedAdamWConfig(
             lr=self.optimizer_lr,
             weight_decay=self.optimizer_weight_decay,
@@ -293,7 +291,7 @@ class TaskConditionedConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self) -> None:
-        """Only the present observation is used."""
+        """Only the current observation is used."""
         return
 
     @property
@@ -320,5 +318,5 @@ def check_pattern(name: str, pattern: str | None) -> None:
 
 
 def _has_bfloat16() -> bool:
-    """Returns whether this processor has instructions for bfloat16; without them, it is emulated, slowly."""
+    """Returns whether this CPU has bfloat16 instructions; without them, bfloat16 is emulated, slowly."""
     return torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()

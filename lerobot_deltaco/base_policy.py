@@ -1,4 +1,4 @@
-"""What both policies share: tasks of an episode, banks of demonstrations, checkpoints."""
+"""The base class of both policies: tasks of an episode, demonstration banks, checkpoints."""
 
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
@@ -32,7 +32,7 @@ DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
 
 
 class TrainingDivergedError(FloatingPointError):
-    """Raised when the loss or a weight is not finite; the message says what the cause may be."""
+    """Raised when the loss or a weight is not finite; the message names the likely cause."""
 
 
 class TaskConditionedPolicy(PreTrainedPolicy):
@@ -44,8 +44,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     Args:
         config: Configuration of the policy. LeRobot fills in its input and output features beforehand.
-        dataset_stats: Statistics of the training dataset, by which the processors normalize; None in
-            evaluation.
+        dataset_stats: Statistics of the training dataset, used for normalization; None in evaluation.
         dataset_meta: Metadata of the training dataset; None in evaluation.
 
     Attributes:
@@ -79,7 +78,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
 
     def get_optim_params(self) -> list[nn.Parameter]:
-        """Returns all weights that are trained. Frozen encoders are not among them."""
+        """Returns all trained weights, without those of frozen encoders."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     # Episodes
@@ -150,7 +149,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     # Observations
 
     def _images(self, batch: dict[str, Any]) -> Tensor:
-        """Returns the images of all cameras, that of the demonstrations first, (batch, cameras, 3, S, S)."""
+        """Returns the images of all cameras, the demonstration camera first, (batch, cameras, 3, S, S)."""
         return torch.stack([self._camera_image(batch, name) for name in self.config.cameras], dim=1)
 
     def _camera_image(self, batch: dict[str, Any], name: str) -> Tensor:
@@ -163,7 +162,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     # Training
 
     def set_training_data(self, bank: DemonstrationBank, robot_data: RobotData | None) -> None:
-        """Sets the demonstrations for training, which are otherwise read with the first batch.
+        """Sets the demonstrations for training; otherwise, they are read at the first batch.
 
         Args:
             bank: The training episodes.
@@ -172,15 +171,15 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self.training_bank = bank.to(self.step.device)
 
     def _prepare_training(self) -> None:
-        """Reads the training episodes, unless they are there."""
+        """Reads the training episodes unless they have been read."""
         if self.training_bank is None:
-            # The loop's mixed precision is not for what is fitted to them.
+            # Models fitted to them do not use the training loop's mixed precision.
             with torch.autocast(self.step.device.type, enabled=False):
                 self._read_training_data()
 
     def _read_training_data(self) -> None:
         if self._meta is None:
-            raise ValueError("A policy is trained with its dataset's metadata. Pass them as `dataset_meta`.")
+            raise ValueError("Training needs the metadata of the dataset. Pass them as `dataset_meta`.")
         frames = getattr(self._meta, "frames_in_memory", None)
         if frames is not None and self.config.demo_episodes is None:
             bank = frames.demonstrations(
@@ -208,7 +207,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         return self._read_bank(dataset, None)
 
     def _step_generator(self) -> torch.Generator:
-        """Returns the source of a training step's draws, on the CPU."""
+        """Returns the random generator of a training step, on the CPU."""
         step = int(self.step) if self.training else 0
         rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
         sequence = np.random.SeedSequence((self.config.seed, step, rank))
@@ -238,7 +237,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         return loss, dict(zip(logged, scalars, strict=True))
 
     def _autocast(self, device: torch.device) -> contextlib.AbstractContextManager:
-        """Returns the context in which training computes in the configured precision."""
+        """Returns a context in which training uses the configured precision."""
         if self.config.dtype == "float32":
             return contextlib.nullcontext()
         return torch.autocast(device.type, torch.bfloat16)
@@ -251,7 +250,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             raise TrainingDivergedError(
                 f"After training step {int(self.step)}, the weight {name} is not finite, and no checkpoint "
                 "is saved. Lower --policy.optimizer_lr, or limit the gradient with "
-                "--policy.grad_clip_norm=10, and go on from the last checkpoint with --resume=true."
+                "--policy.grad_clip_norm=10, and continue from the last checkpoint with --resume=true."
             )
         # LeRobot 0.6.1 may pass a `state_dict`; later versions do not, and call this on every process.
         super()._save_pretrained(save_directory, *args, **kwargs)
@@ -274,7 +273,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         n_kept = len(kept_frames(0, 0, config.n_demo_frames))
         shape = (n_kept, 3, config.image_size, config.image_size)
         bank = read_task_bank(path, policy.instructions, shape, config.state_dim)
-        # Demonstrations that the command line names come before those of the checkpoint.
+        # Demonstrations named on the command line replace those of the checkpoint.
         if policy.demonstrations is None and bank is not None:
             policy.demonstrations = bank.to(config.device)
         return policy
@@ -330,7 +329,7 @@ def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) ->
 
 
 def known_tasks(meta: LeRobotDatasetMetadata | None) -> list[str]:
-    """Returns the task strings of the training dataset, which a one-hot policy knows.
+    """Returns the task strings of the training dataset, for a one-hot policy.
 
     Raises:
         ValueError: There are no metadata.
@@ -343,7 +342,7 @@ def known_tasks(meta: LeRobotDatasetMetadata | None) -> list[str]:
 
 
 def _read_paraphrases(config: TaskConditionedConfig) -> Paraphrases | None:
-    """Reads the sentences that training draws from, by task string."""
+    """Reads the sentences for training, by task string."""
     if config.paraphrases is None:
         return None
     from gym_deltaco.tasks import get_task
@@ -363,7 +362,7 @@ def _non_finite_weight(module: nn.Module) -> str | None:
 
 
 def _why_not_finite(batch: dict[str, Any], step: int) -> str:
-    """Returns the message of a loss that is not finite."""
+    """Returns an error message for a loss that is not finite."""
     damaged = [
         name
         for name, values in batch.items()
@@ -377,6 +376,6 @@ def _why_not_finite(batch: dict[str, Any], step: int) -> str:
         "gradient with --policy.grad_clip_norm=10."
     )
     return (
-        f"The loss of training step {step + 1} is not finite. {cause} A checkpoint that was saved is from "
-        "before that: go on from it with --resume=true."
+        f"The loss of training step {step + 1} is not finite. {cause} If a checkpoint was saved "
+        "before, continue from it with --resume=true."
     )

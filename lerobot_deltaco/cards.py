@@ -1,4 +1,4 @@
-"""Cards for the Hugging Face Hub, filled in from the templates in `datasets_cards/`: that of a policy."""
+"""The card of a policy on the Hugging Face Hub, from a template in `datasets_cards/`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _SUMMARIES = {
     "demonstration": "It looks in the scene for what a demonstration moved, and places it as shown.",
     "instruction": "It looks in the scene for what an instruction names, and places it where it says.",
 }
-# Options of a policy that its card does not show: LeRobot's own, and what is shown elsewhere.
+# Options of a policy that its card omits: LeRobot's own, and those shown elsewhere.
 _HIDDEN = {
     "input_features",
     "output_features",
@@ -44,7 +44,7 @@ _HIDDEN = {
 
 
 def render(template: str, **values: Any) -> str:
-    """Fills in a template; a value that it lacks is an error.
+    """Fills in a template; a missing value is an error.
 
     Templates lie beside the package in a clone, and inside it in a wheel.
     """
@@ -70,16 +70,16 @@ def policy_card(
     train_config: TrainPipelineConfig | None = None,
     meta: LeRobotDatasetMetadata | None = None,
 ) -> ModelCard:
-    """Returns the card of a policy, as far as it is known at the push: without success rates.
+    """Returns the card of a policy as known when it is pushed, without success rates.
 
     Args:
         config: Configuration of the policy.
         demonstrated_tasks: Tasks that the checkpoint has demonstrations of.
         n_instructions: Number of instructions whose embeddings the checkpoint has.
         dataset_repo_id: Repository id of the training dataset.
-        license: License of the weights, by its name on the Hub; None for Apache 2.0.
+        license: License of the weights, as named on the Hub; None for Apache 2.0.
         tags: Additional tags.
-        train_config: Configuration of the training.
+        train_config: Configuration of the training run.
         meta: Metadata of the training dataset.
     """
     import draccus
@@ -137,6 +137,6 @@ def policy_card(
 
 
 def markdown(text: str) -> str:
-    """Escapes a string for Markdown and HTML, in one line."""
+    """Escapes a string for Markdown and HTML, on one line."""
     line = html.escape(" ".join(text.split()), quote=False)
     return re.sub(r"([\\`*_\[\]|~])", r"\\\1", line)

@@ -19,7 +19,7 @@ _RENAMING_STEP = "rename_observations_processor"
 
 
 class Checkpoint(NamedTuple):
-    """A checkpoint of a training run, or a policy that was published without its run.
+    """A checkpoint of a training run, or a policy published without its run.
 
     Attributes:
         folder: Folder of the policy.
@@ -48,14 +48,14 @@ def find_checkpoints(path: Path) -> list[Checkpoint]:
     """Returns the checkpoints of a run, ascending by step, or the one in a folder.
 
     Args:
-        path: Output folder of a training, or folder of a policy.
+        path: Output folder of a training run, or folder of a policy.
 
     Raises:
         ValueError: There are none, or one is damaged.
     """
     if (path / WEIGHTS).is_file() and (path / CONFIG).is_file():
         return [_read_checkpoint(path)]
-    # What is beyond the link `last`, which LeRobot sets when a checkpoint is complete, is being written.
+    # LeRobot sets the link `last` when a checkpoint is complete; later checkpoints are still being written.
     last = (path / "checkpoints" / "last").resolve().name
     found = [
         _read_checkpoint(folder / "pretrained_model")
@@ -65,7 +65,7 @@ def find_checkpoints(path: Path) -> list[Checkpoint]:
     ]
     if not found:
         raise ValueError(
-            f"{path} has no checkpoints. Name the `--output_dir` of a training, or the folder of a policy "
+            f"{path} has no checkpoints. Name the `--output_dir` of a training run, or a policy's folder "
             f"({CONFIG}, {WEIGHTS})."
         )
     return sorted(found, key=lambda checkpoint: checkpoint.step)
@@ -110,7 +110,7 @@ class LoadedPolicy(NamedTuple):
 
     @property
     def rename_map(self) -> Mapping[str, str]:
-        """Names that the preprocessor gives to observations."""
+        """Renaming of observations by the preprocessor."""
         return next((step.rename_map for step in self.preprocessor.steps if hasattr(step, "rename_map")), {})
 
 
@@ -124,10 +124,10 @@ def load_policy(
         overrides: Options of the policy, as on LeRobot's command line but without `policy.`:
             "--device=cpu", "--demo_root=DIR".
         rename_map: Names under which the policy knows the environment's observations, by the environment's
-            names; None takes those with which it was trained.
+            names; None for those used in training.
 
     Raises:
-        ValueError: The overrides do not fit the policy, or packages of its type are missing.
+        ValueError: The overrides do not fit the policy, or packages that its type needs are missing.
     """
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies import get_policy_class, make_pre_post_processors
@@ -138,11 +138,11 @@ def load_policy(
     register_third_party_plugins()
     config = PreTrainedConfig.from_pretrained(folder, cli_overrides=list(overrides))
     if getattr(config, "pretrained_backbone_weights", None) is not None:
-        # Those of the checkpoint take their place, so they need not be downloaded.
+        # The checkpoint's weights replace them, so they need not be downloaded.
         config.pretrained_backbone_weights = None
     try:
         policy_class = get_policy_class(config.type)
-        # The steps of its processors are registered there, if it has some of its own.
+        # If it has processor steps of its own, they are registered there.
         importlib.import_module(type(config).__module__.replace("configuration_", "processor_"))
     except ImportError as error:
         raise ValueError(

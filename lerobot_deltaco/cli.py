@@ -1,6 +1,6 @@
 """The command `deltaco`: each subcommand is a function, whose arguments tyro turns into options."""
 
-# No `from __future__ import annotations`: tyro reads the annotations of functions inside of functions.
+# No `from __future__ import annotations`: tyro reads the annotations of nested functions.
 
 import ast
 import json
@@ -32,7 +32,7 @@ _POLICIES = {
 
 
 def main() -> None:
-    """Runs the subcommand that the command line names."""
+    """Runs the subcommand given on the command line."""
     name, arguments = (sys.argv[1:2] or ["--help"])[0], sys.argv[2:]
     if name in ("-h", "--help"):
         _print(_overview())
@@ -64,8 +64,8 @@ def main() -> None:
 def _is_ours(error: BaseException) -> bool:
     """Returns whether an error was raised on purpose, with a message for the user, by this project.
 
-    Other errors are reported with their traceback. One that was raised on purpose may be the cause of one of
-    LeRobot's parser.
+    Other errors are reported with their traceback. LeRobot's parser may wrap an error that was raised on
+    purpose.
     """
     frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, OSError):
@@ -86,10 +86,10 @@ def _collect() -> Callable[..., Any]:
         repo_id: str | None = None,
         private: bool = False,
     ) -> str:
-        """Collects successful episodes of the expert. After an interruption, the same command continues.
+        """Collects successful episodes of the expert, or continues an interrupted collection.
 
         Args:
-            plan: What is collected.
+            plan: Episodes to collect.
             root: Folder of the dataset.
             workers: Number of processes; the dataset is the same with any number.
             push_to_hub: Whether to publish the finished dataset with its card; needs HF_TOKEN.
@@ -139,15 +139,15 @@ def _evaluate() -> Callable[..., Any]:
         """Evaluates a policy of any LeRobot type. Without options, this is the leaderboard's protocol.
 
         Args:
-            checkpoint: Output folder of a training, or folder of a policy.
+            checkpoint: Output folder of a training run, or folder of a policy.
             plan: Episodes to run.
-            steps: Checkpoints of a training to evaluate: all, last, or steps such as 4000,8000.
-            out: Folder of the records; by default, that of the training, or outputs/evaluate/NAME.
+            steps: Checkpoints of a training run to evaluate: all, last, or steps such as 4000,8000.
+            out: Folder of the records; by default, that of the training run, or outputs/evaluate/NAME.
             processes: Number of processes that share the episodes; by default, one for each core.
             device: Device of the policy, such as cpu.
             demo_repo_id: Dataset of demonstrations, in place of the checkpoint's own.
             demo_root: Folder of that dataset, if it is not in LeRobot's cache.
-            experiment: Name of the policy in tables; by default, the job name of its training.
+            experiment: Name of the policy in tables; by default, the job name of its training run.
             rename_map: Names under which the policy knows the environment's observations, as JSON.
         """
         from lerobot_deltaco.evaluate import evaluate_checkpoints
@@ -176,7 +176,7 @@ def _report() -> Callable[..., Any]:
         """Writes tables and figures from records.
 
         Args:
-            paths: Files of records, or folders that have some, such as those of trainings.
+            paths: Files of records, or folders that contain some, such as those of training runs.
             out: Folder of the report.
         """
         from lerobot_deltaco.report import write_report
@@ -208,9 +208,9 @@ def _experiment() -> Callable[..., Any]:
             seed: Seeds of the training.
             out: Folder of all outputs.
             set: Settings that override the recipe, such as training.steps=2000.
-            jobs: Number of trainings at a time; each gets its share of the cores.
+            jobs: Number of training runs at a time; each gets its share of the cores.
             only: Run this step alone.
-            dry_run: Print the commands, and run none.
+            dry_run: Print the commands without running them.
             list: Print the names of all experiments.
         """
         from lerobot_deltaco.experiments import run_experiments
@@ -241,7 +241,7 @@ def _demo() -> Callable[..., Any]:
         """Collects, trains and evaluates the project's method, and writes a page.
 
         Args:
-            minutes: Time for it on two idle cores; 25 is the whole recipe.
+            minutes: Duration on two idle cores; 25 is the full recipe.
             out: Folder of all outputs.
         """
         from lerobot_deltaco.demo import run_demo

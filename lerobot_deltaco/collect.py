@@ -1,8 +1,8 @@
 """Collects successful episodes of the scripted expert as a LeRobotDataset.
 
-The dataset is a function of its plan alone. Worker processes write shards, whose episodes and indices are
-known beforehand; the main process writes the dataset's metadata last. A shard is whole or absent, so that the
-same command continues an interrupted collection with the shards that are missing.
+The dataset depends only on its plan. Worker processes write shards, whose episodes and indices are known
+beforehand; the main process writes the dataset's metadata last. A shard is either complete or absent, so the
+same command continues an interrupted collection with the missing shards.
 
 A plan needs no simulator, and nothing here imports LeRobot or torch.
 """
@@ -43,11 +43,11 @@ Split = Literal["train", "validation"]
 ROBOT_TYPE = "widowx_250"
 DESCRIPTION_FILE = "meta/deltaco.json"
 MAX_ATTEMPTS = 100
-# Outside `observation.`, so that no policy takes them for an input.
+# Outside `observation.`, so that no policy takes them as an input.
 PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_container", "benchmark.seed")
 
 _NOVEL_OBJECTS = tuple(task for task in SCENARIOS["a"].test_tasks if TASKS[task].kind == "name")
-# Data sets by name, with the purpose of their episodes. All but T150 and V48 are the authors'.
+# Datasets by name, with the purpose of their episodes. All but T150 and V48 are the authors'.
 DATA_SETS: dict[str, tuple[tuple[int, ...], Split]] = {
     "T198": (SCENARIOS["a"].train_tasks, "train"),
     "T48": (_NOVEL_OBJECTS, "train"),
@@ -61,7 +61,7 @@ DATA_SETS: dict[str, tuple[tuple[int, ...], Split]] = {
 
 
 class CollectionError(RuntimeError):
-    """A collection that cannot begin or go on; the message says what to do."""
+    """Raised when a collection cannot start or continue; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +69,13 @@ class CollectionPlan:
     """Everything that a dataset depends on; equal plans give equal datasets.
 
     Args:
-        tasks: A task set (scenario_a_train, ...), a data set of the authors (T198, T48, T54, E48, E54, E102)
+        tasks: A task set (scenario_a_train, ...), a dataset of the authors (T198, T48, T54, E48, E54, E102)
             or for choosing settings (T150, V48), or indices and ranges such as "4,50-73".
         episodes_per_task: Number of successful episodes of each task.
         seed: Seed of the whole dataset.
         split: Purpose of the episodes; scenes of different splits never coincide. By default, the split of
-            the data set, "validation" for test and validation tasks, and "train" otherwise.
-        noise: Standard deviation of the Gaussian noise on the expert's motions.
+            the dataset, "validation" for test and validation tasks, and "train" otherwise.
+        noise: Standard deviation of the Gaussian noise on the first three numbers of the expert's actions.
         scene: Settings of the scenes.
 
     Raises:
@@ -122,7 +122,7 @@ class CollectionPlan:
         try:
             return select_tasks(self.tasks)
         except ValueError as error:
-            raise ValueError(f"{error} Also valid are the data sets {', '.join(DATA_SETS)}.") from None
+            raise ValueError(f"{error} Also valid are the datasets {', '.join(DATA_SETS)}.") from None
 
     @property
     def n_episodes(self) -> int:
@@ -133,8 +133,8 @@ class CollectionPlan:
     def shards(self) -> list[range]:
         """Indices of the episodes of each shard.
 
-        A shard has at most 100 episodes, about 5 MB. Small datasets have smaller shards, so that all workers
-        have something to do.
+        A shard has at most 100 episodes, about 5 MB. Small datasets have smaller shards, so that every worker
+        gets some.
         """
         size = min(100, max(10, self.n_episodes // 32))
         return [range(first, min(first + size, self.n_episodes)) for first in range(0, self.n_episodes, size)]
@@ -238,7 +238,7 @@ def read_plan(root: Path) -> CollectionPlan:
 
 
 def renderer() -> str:
-    """Returns the name of what renders the images."""
+    """Returns the name of the renderer."""
     return f"PyBullet {version('pybullet')}, TinyRenderer"
 
 
@@ -279,7 +279,7 @@ def _description(plan: CollectionPlan) -> dict[str, Any]:
 
 
 def _outcome(root: Path, plan: CollectionPlan) -> dict[str, Any]:
-    """Counts the attempts that the episodes took: an episode's seed tells which attempt it was."""
+    """Counts the attempts behind the episodes; an episode's seed tells which attempt succeeded."""
     rows = pq.read_table(
         root / "data", columns=["episode_index", "benchmark.seed"], filters=[("frame_index", "==", 0)]
     )
@@ -306,7 +306,7 @@ def _check_folder(root: Path, plan: CollectionPlan) -> None:
             raise CollectionError(f"{root} is not empty: it holds {found.name}. Name a new folder.")
         return
     begun, wanted = (_flat(description) for description in (read_description(root), _description(plan)))
-    # A finished dataset stays what it is when packages are updated.
+    # A finished dataset remains valid when packages are updated.
     ignored = ("benchmark", "renderer") if is_finished(root) else ()
     differences = [
         f"{name}: {begun.get(name)} there, {value} now"
@@ -342,7 +342,7 @@ def _collect_shards(root: Path, plan: CollectionPlan, workers: int) -> float | N
 
 
 def _run(root: Path, plan: CollectionPlan, shards: Sequence[int], workers: int) -> Iterator[int]:
-    """Collects shards, in this process if one is enough, and yields each when it is written."""
+    """Collects shards, in this process if one is enough, and yields each once it is written."""
     if workers <= 1:
         with closing(PickPlaceEnv(scene=plan.scene)) as env:
             for shard in shards:
@@ -364,14 +364,14 @@ _worker: tuple[PickPlaceEnv, Path, CollectionPlan]
 
 def _start_worker(root: Path, plan: CollectionPlan) -> None:
     global _worker
-    # An interrupt in the terminal goes to all processes, and ends this one at once.
+    # An interrupt in the terminal reaches all processes, and ends this one immediately.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     _worker = PickPlaceEnv(scene=plan.scene), root, plan
 
 
 def _exit_with_parent() -> None:
-    """Ends this process with the main one, even if that is killed: it would wait for work forever."""
+    """Ends this process when the main one ends or is killed; otherwise, it would wait for work forever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

@@ -1,4 +1,4 @@
-"""The card of a dataset of the benchmark, with an image of some tasks."""
+"""The card of a benchmark dataset, with an image of some tasks."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def write_dataset_card(root: Path, repo_id: str | None = None) -> None:
 
 
 def _save_tasks_image(root: Path) -> None:
-    """Draws the first image of an episode of each of some tasks, with the instructions."""
+    """Draws the first image of an episode for each of several tasks, with the instructions."""
     from matplotlib.figure import Figure
 
     plan = read_plan(root)

@@ -1,8 +1,8 @@
 """Writes the files of a LeRobotDataset v3, one shard at a time.
 
-LeRobot's own writer takes 60 to 120 ms for an episode and cannot be shared by processes. Here, a shard is one
-data file and one file of episode metadata with the same number. Processes write shards side by side, and
-`write_metadata` then completes the dataset. This module imports neither torch nor LeRobot, which would take
+LeRobot's own writer takes 60 to 120 ms per episode and cannot be shared between processes. Here, a shard is
+one data file and one file of episode metadata with the same number. Processes write shards in parallel, and
+`write_metadata` then completes the dataset. This module imports neither torch nor LeRobot, which would cost
 every worker process 10 s; the tests compare the result with LeRobot's.
 """
 
@@ -50,7 +50,7 @@ class Episode(NamedTuple):
     """An episode to write.
 
     Attributes:
-        frames: Values of each feature but LeRobot's own: (N, ...); images are (N, H, W, 3) uint8.
+        frames: Values of each feature except LeRobot's own: (N, ...); images are (N, H, W, 3) uint8.
         task: Instruction.
         task_index: Row of the instruction in the dataset's table of tasks.
     """
@@ -64,7 +64,7 @@ class Episode(NamedTuple):
 
 
 def is_written(root: Path, shard: int) -> bool:
-    """Returns whether a shard is complete: its episode metadata are written last."""
+    """Returns whether a shard is complete. Its episode metadata are written last."""
     return (root / _numbered(EPISODES_FILE, shard)).exists()
 
 
@@ -135,7 +135,7 @@ def _numbered(file: str, number: int) -> str:
 
 
 def data_schema(features: Features) -> pa.Schema:
-    """Returns the columns of the frames, with the metadata by which Hugging Face's `datasets` reads them."""
+    """Returns the columns of the frames, with the metadata that Hugging Face's `datasets` needs."""
     fields: list[pa.Field] = []
     hugging_face: dict[str, dict[str, Any]] = {}
     for name, feature in features.items():
@@ -178,7 +178,7 @@ def _png(image: NDArray[np.uint8]) -> bytes:
 
 
 def write_metadata(root: Path, features: Features, fps: int, robot_type: str, tasks: Sequence[str]) -> None:
-    """Completes a dataset whose shards are all written; `info.json` comes last.
+    """Completes a dataset once all its shards are written; `info.json` comes last.
 
     Args:
         root: Folder of the dataset.
@@ -250,7 +250,7 @@ def feature_statistics(values: NDArray) -> Statistics:
 
 
 def _image_statistics(images: NDArray[np.uint8]) -> Statistics:
-    # All statistics follow from the histogram of the 256 levels in each channel.
+    # All statistics are computed from a histogram of the 256 levels in each channel.
     levels = np.arange(256) / 255
     histograms = np.stack([np.bincount(images[..., channel].ravel(), minlength=256) for channel in range(3)])
     fractions = histograms / histograms.sum(axis=1, keepdims=True)  # (3, 256)

@@ -203,7 +203,7 @@ def test_held_out_tasks_are_for_validation():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"tasks": "scenario_c"}, "scenario_a_train.*Also valid are the data sets T198"),
+        ({"tasks": "scenario_c"}, "scenario_a_train.*Also valid are the datasets T198"),
         ({"tasks": "300"}, "from 0 to 299"),
         ({"tasks": "24", "scene": SceneConfig(objects="scenario_a_train")}, "Task 24 asks for"),
         ({"episodes_per_task": 0}, "`episodes_per_task` must be at least 1. Got 0"),

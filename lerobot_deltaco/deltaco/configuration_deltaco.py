@@ -32,14 +32,15 @@ METHODS = MappingProxyType(
         "demo_only": Conditioning("demo", "none", "contrastive"),
         "one_hot": Conditioning("one_hot", "none", "none"),
         "bc_z": Conditioning("demo", "none", "cosine"),
-        # The mean of two imitation losses: of the language (through a projection) and of the demonstration.
+        # The mean of two imitation losses: with the instruction (through a projection) and with the
+        # demonstration.
         "mcil": Conditioning("language_or_demo", "none", "none"),
     }
 )
 INPUTS = ("none", "demo", "language", "demo+language")
 ENCODER_LOSSES = ("contrastive", "cosine", "none")
 DEMO_ENCODERS = ("cnn", "attention", "pretrained")
-# Options that have an effect with `demo_encoder=pretrained` alone.
+# Options that have an effect only with `demo_encoder=pretrained`.
 _PRETRAINED_OPTIONS = (
     "vision_encoder",
     "vision_encoder_weights",
@@ -62,17 +63,17 @@ class DeltacoConfig(TaskConditionedConfig):
     Args:
         method: Method of the paper: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
         film: Ablation: input through FiLM, instead of the method's: none, demo, language or demo+language.
-        concat: Ablation: input that is concatenated to the feature points, instead of the method's; the same
-            values.
+        concat: Ablation: input that is concatenated to the feature points, instead of the method's; same
+            values as `film`.
         encoder_loss: Ablation: encoder loss, instead of the method's: contrastive, cosine or none.
         language_head: Sizes of the hidden layers of fully connected layers after the language encoder, whose
-            output has unit length, such as [512]; none by default. MCIL always has such layers; by default
+            output has unit length, such as [512]; none by default. MCIL always has such layers, by default
             [384], as in the authors' code.
-        demo_encoder: Encoder of demonstrations: cnn, the paper's; attention (ours), which compares the frames
-            at each location and attends to a few; or pretrained, a frozen image encoder.
+        demo_encoder: Encoder of demonstrations: cnn, the paper's; attention, this project's, which compares
+            the frames at each location and attends to a few locations; or pretrained, a frozen image encoder.
         vision_encoder: Frozen image encoder for `demo_encoder=pretrained`: clip-vit-base-patch32,
-            r3m-resnet18, r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0 (which
-            the extra `offline` brings), a folder with an image model of transformers, or its name on the Hub.
+            r3m-resnet18, r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0 (in the
+            extra `offline`), a folder with an image model of transformers, or its name on the Hub.
         vision_encoder_weights: File with R3M's weights, which are otherwise downloaded.
         vision_image_size: Height and width to which the grid of a demonstration's frames is scaled for that
             encoder; by default, the size of the images that it was trained on.
@@ -86,12 +87,12 @@ class DeltacoConfig(TaskConditionedConfig):
         demo_columns: Number of columns of that grid, n in the paper. Its m n frames are the first, the last,
             and random ones between them; `attention` takes as many frames, without a grid.
         backbone: Convolutional network: paper or strided.
-        gripper_loss: Loss of the gripper: squared_error, or cross_entropy (ours).
+        gripper_loss: Loss of the gripper: squared_error, the paper's; or cross_entropy.
         encoder_loss_weight: Weight of the encoder loss, alpha_d in the paper's equation 3.
         temperature: Temperature of the contrastive loss.
         shift_padding: Largest random shift of observations in training, px; 0 for none.
         demo_shift_padding: Largest random shift of demonstrations in training, px; 0 for none.
-        drop_n_last_frames: Number of frames at the end of each episode that are not trained on.
+        drop_n_last_frames: Number of frames at the end of each episode that are left out of training.
         initial_weights: Initial weights of the networks: authors, as in the authors' code; or torch,
             PyTorch's. By default, the authors' for the paper's backbone.
         scheduler_name: Schedule of the learning rate: constant, or cosine, which decays to 0.
@@ -209,7 +210,7 @@ class DeltacoConfig(TaskConditionedConfig):
 
     @property
     def conditioning(self) -> Conditioning:
-        """The method's, with what an ablation changes."""
+        """The method's conditioning, with the changes of an ablation."""
         changed = {
             name: getattr(self, name) for name in Conditioning._fields if getattr(self, name) is not None
         }
@@ -239,5 +240,5 @@ class DeltacoConfig(TaskConditionedConfig):
         return self.embedding_dim
 
     def get_scheduler_preset(self) -> CosineSchedulerConfig | None:
-        """Returns the schedule of the learning rate; None is a constant."""
+        """Returns the schedule of the learning rate; None for a constant one."""
         return None if self.scheduler_name == "constant" else super().get_scheduler_preset()

@@ -22,8 +22,8 @@ from lerobot_deltaco.networks import (
 )
 from lerobot_deltaco.vision import VisionEncoder
 
-# Of `AttentionEncoder`: channels of its convolutions, of which the first two halve the maps; locations that
-# are attended to; size of the hidden fully connected layer.
+# `AttentionEncoder`: channels of its convolutions, the first two of which halve the maps; number of locations
+# attended to; size of the hidden fully connected layer.
 _ATTENTION_CHANNELS = (32, 32, 64, 64)
 _ATTENTION_HEADS = 8
 _ATTENTION_HIDDEN_DIM = 512
@@ -80,13 +80,13 @@ class FrameGridEncoder(nn.Module):
 
 
 class AttentionEncoder(nn.Module):
-    """Ours: compares the frames at each location, and attends to a few locations.
+    """Compares the frames at each location, and attends to a few locations; not in the paper.
 
-    A demonstration is what changed: an object has left one location, and one lies in a container at another.
-    The paper's encoder has to learn this for each location separately, since its fully connected layers take
-    the flattened maps. Here, the frames are stacked, convolutions see what changed, and attention reads the
-    maps at the locations that matter, along with their coordinates. So a demonstration in one corner teaches
-    how to read those in all others.
+    A demonstration is defined by what changed: an object has left one location, and lies in a container at
+    another. The paper's encoder has to learn this for each location separately, since its fully connected
+    layers take the flattened maps. Here, the frames are stacked, convolutions see what changed, and attention
+    reads the maps at the locations that matter, along with their coordinates. So what is learned from a
+    demonstration in one corner applies to all others.
 
     Args:
         n_frames: Number of frames of a demonstration.
@@ -126,8 +126,9 @@ def shift_demonstrations(
     Args:
         frames: Frames of demonstrations, (batch, frames, 3, H, W).
         padding: Largest shift in x and in y, px; at 0, nothing is drawn.
-        rows: Number of rows of the grid that is shifted as a whole, as in the authors' code, so that what
-            leaves a frame enters its neighbor; None to shift each frame, all of a demonstration alike.
+        rows: Number of rows of the grid, which is shifted as a whole, as in the authors' code, so that pixels
+            that leave a frame enter its neighbor; None to shift the frames separately, all frames of a
+            demonstration by the same amount.
         generator: Source of the shifts, on the CPU.
 
     Returns:
@@ -151,7 +152,7 @@ def encode_bank(
     padding: int,
     seed: int,
 ) -> Tensor:
-    """Computes the features of all demonstrations by a frozen encoder.
+    """Computes the features of all demonstrations with a frozen encoder.
 
     Args:
         bank: The demonstrations.

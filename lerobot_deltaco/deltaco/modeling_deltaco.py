@@ -65,7 +65,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
     Attributes:
         model: Network that predicts actions.
         demo_encoder: Encoder of demonstrations, or the layers after a frozen one; None without them.
-        language_head: Layers after the language encoder; None for none.
+        language_head: Layers after the language encoder; None without them.
     """
 
     config_class = DeltacoConfig
@@ -133,7 +133,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         if config.uses_demonstrations:
             demo = self._embed_training_demonstrations(batch["episode_index"], tasks, generator)
         if config.uses_language:
-            # With paraphrases, one is drawn for each task, and one for each sample.
+            # With paraphrases, one sentence is drawn for each task, and one for each sample.
             known = self._embed_instructions(
                 self._draw_instructions(list(distinct), generator), images.device
             )
@@ -175,7 +175,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """Returns the mean action; of several mixture components, that of the likeliest one.
+        """Returns the mean action; with several mixture components, the mean of the most likely one.
 
         Args:
             batch: As in `forward`, without `action` and `episode_index`. `task` is not needed if `set_tasks`
@@ -228,10 +228,10 @@ class DeltacoPolicy(TaskConditionedPolicy):
         return Episode(instructions, film, concat, self._acting_network())
 
     def _check_given(self, instructions: Sequence[str], demonstrations: DemonstrationsOfTasks | None) -> None:
-        """Checks that no input of the method is left out; MCIL takes one of both.
+        """Checks that no input of the method is left out; MCIL needs only one of the two.
 
         Raises:
-            ValueError: One is.
+            ValueError: An input is missing.
         """
         lacks_instruction = [not text for text in instructions]
         lacks_demonstration = [not own for own in demonstrations or ()]
@@ -244,8 +244,8 @@ class DeltacoPolicy(TaskConditionedPolicy):
             missing |= self.config.uses_demonstrations and any(lacks_demonstration)
         if missing:
             raise ValueError(
-                f"The method {self.config.method!r} needs what is left out. Pass an instruction and a "
-                "demonstration of each sample's task, as far as the method takes them."
+                f"The method {self.config.method!r} is missing an input. Pass an instruction and a "
+                "demonstration of each sample's task, whichever the method takes."
             )
 
     def _acting_network(self) -> PolicyNetwork:
@@ -276,7 +276,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         return embeddings
 
     def _features(self, demonstration: Demonstration) -> Tensor:
-        """Returns the features of a demonstration by the frozen encoder, (features,)."""
+        """Returns the features of a demonstration from the frozen encoder, (features,)."""
         if demonstration.features is not None:
             return demonstration.features
         bank = DemonstrationBank(demonstration.frames[None], [demonstration.task], [0])
@@ -356,7 +356,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         return source(film), source(concat)
 
     def _concatenated(self, batch: dict[str, Any], embedding: Tensor | None) -> Tensor | None:
-        """Returns what is concatenated to the feature points: an embedding and the robot's state."""
+        """Concatenates an embedding and the robot's state, which join the feature points."""
         parts = [] if embedding is None else [embedding]
         if self.config.state_dim:
             parts.append(batch[OBS_STATE])
@@ -402,7 +402,7 @@ def _make_demo_encoder(config: DeltacoConfig) -> FrameGridEncoder | AttentionEnc
 
 
 def _make_language_head(config: DeltacoConfig) -> UnitHead | None:
-    """Makes the layers after the language encoder; MCIL brings both inputs into one space by them."""
+    """Makes the layers after the language encoder; in MCIL, they map both inputs into one space."""
     hidden_dims = config.language_head
     if config.method == "mcil" and hidden_dims is None:
         hidden_dims = [config.embedding_dim]

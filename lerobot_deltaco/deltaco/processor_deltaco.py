@@ -18,8 +18,8 @@ def make_deltaco_pre_post_processors(
 ]:
     """Returns LeRobot's usual pipelines, with the configuration's normalization.
 
-    Images stay in 0..1; the state has mean 0 and standard deviation 1; actions are in -1..1: those of the
-    benchmark as they are, any other dataset's by their least and greatest values.
+    Images stay in 0..1; the state has mean 0 and standard deviation 1; actions are in -1..1: the benchmark's
+    as they are, those of other datasets scaled by minimum and maximum.
 
     Args:
         config: The configuration.
