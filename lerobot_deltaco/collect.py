@@ -30,7 +30,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from gym_deltaco import CONTROL_FPS, ENV_ID, EXPERT_NOISE
+from gym_deltaco import CONTROL_FPS, ENV_ID, EXPERT_NOISE, pybullet_import
 from gym_deltaco.atomic_files import write_json
 from gym_deltaco.env import ACTION_NAMES, STATE_NAMES, PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
@@ -184,8 +184,7 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
             task; or a worker process was killed.
         ImportError: PyBullet is not installed.
     """
-    import gym_deltaco.env  # noqa: F401  (fails here, before anything is written, if there is no simulator)
-
+    pybullet_import.load()  # fails here, before anything is written, if there is no simulator
     if workers < 1:
         raise CollectionError(f"`workers` must be at least 1. Got {workers}.")
     try:

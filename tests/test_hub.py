@@ -16,8 +16,8 @@ from gym_deltaco.env import ACTION_SCALE
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, TASKS
 from lerobot_deltaco import hub as hub_module
-from lerobot_deltaco.dataset_card import CARD_FILE, TASKS_IMAGE, dataset_card, write_dataset_card
 from lerobot_deltaco.collect import CollectionPlan, collect
+from lerobot_deltaco.dataset_card import CARD_FILE, TASKS_IMAGE, dataset_card, write_dataset_card
 from lerobot_deltaco.dataset_writer import INFO_FILE
 from lerobot_deltaco.hub import HubError, check_push, push
 

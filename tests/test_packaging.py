@@ -135,6 +135,15 @@ def test_without_pybullet_the_environment_says_what_to_install(tmp_path, before,
     assert message in result.stdout
 
 
+def test_policies_need_no_simulator():
+    program = (
+        "import sys; sys.modules['pybullet'] = None; import lerobot_policy_deltaco, lerobot_deltaco.look; "
+        "from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy"
+    )
+    result = run_python(program)
+    assert result.returncode == 0, result.stderr
+
+
 # The wheel
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from gym_deltaco import CONTROL_FPS
+from gym_deltaco import CONTROL_FPS, pybullet_import
 from gym_deltaco import kinematics as kin
 from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene import Scene
@@ -118,6 +118,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             raise ValueError(
                 f"`scene` must be a `SceneConfig`, such as SceneConfig(image_size=96). Got {scene!r}."
             )
+        pybullet_import.load()  # fails here, not at the first reset, if it is missing
         scene.check_tasks([task_id])
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"`render_mode` must be 'rgb_array' or None. Got {render_mode!r}.")

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from gym_deltaco import pybullet_import as pybullet
 from gym_deltaco.camera import Camera
-from gym_deltaco.pybullet_import import pybullet
 from gym_deltaco.solids import Mesh
 
 TIME_STEP = 1 / 240  # s
