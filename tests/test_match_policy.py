@@ -18,7 +18,6 @@ from small_policies import (
     write_table,
 )
 
-from lerobot_deltaco.base_policy import TrainingDivergedError
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.frames import FramesInMemory
@@ -82,7 +81,7 @@ def trained(table):
         policy, before, _ = small_policy(table, "deltaco_match", feature_matching=False)
         optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
         rng = np.random.default_rng(0)
-        for _ in range(60):
+        for _ in range(50):
             batch = before(batch_of(table, first_frames(rng.choice(N_TRAINED, 16))))
             loss, _ = policy(batch)
             optimizer.zero_grad()
@@ -167,20 +166,6 @@ def test_greater_values_of_the_gripper_may_mean_closed(make, table, frames, capl
     assert not torch.equal(locations(inverted), expected)
     assert "closed at the beginning of 48 of 48 episodes" in caplog.text
     assert "--policy.gripper_closed" in caplog.text
-
-
-def test_damaged_data_and_diverged_losses_are_told_apart(make, table):
-    policy = make()
-    batch = batch_of(table, first_frames([0, 1]))
-    damaged = {**batch, "observation.state": batch["observation.state"] * torch.nan}
-    with pytest.raises(
-        TrainingDivergedError, match="step 1 is not finite. In its batch, `observation.state`"
-    ):
-        policy(damaged)
-    with torch.no_grad():
-        policy.model.action_head[-1].bias.fill_(torch.inf)
-    with pytest.raises(TrainingDivergedError, match="The batch was finite, so the training has diverged"):
-        policy(batch)
 
 
 def test_validation_loss_of_held_back_episodes_finds_their_locations(make, table):
