@@ -18,6 +18,7 @@ from small_policies import (
     write_table,
 )
 
+from lerobot_deltaco.base_policy import TrainingDivergedError
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.frames import FramesInMemory
@@ -166,6 +167,20 @@ def test_greater_values_of_the_gripper_may_mean_closed(make, table, frames, capl
     assert not torch.equal(locations(inverted), expected)
     assert "closed at the beginning of 48 of 48 episodes" in caplog.text
     assert "--policy.gripper_closed" in caplog.text
+
+
+def test_damaged_data_and_diverged_losses_are_told_apart(make, table):
+    policy = make()
+    batch = batch_of(table, first_frames([0, 1]))
+    damaged = {**batch, "observation.state": batch["observation.state"] * torch.nan}
+    with pytest.raises(
+        TrainingDivergedError, match="step 1 is not finite. In its batch, `observation.state`"
+    ):
+        policy(damaged)
+    with torch.no_grad():
+        policy.model.action_head[-1].bias.fill_(torch.inf)
+    with pytest.raises(TrainingDivergedError, match="The batch was finite, so the training has diverged"):
+        policy(batch)
 
 
 def test_validation_loss_of_held_back_episodes_finds_their_locations(make, table):
