@@ -137,7 +137,7 @@ def test_one_batch_can_be_overfitted(make, dataset, options):
     batch = before(batch_of(dataset, [1, 6, 11, 16, 21, 26]))
     optimizer = torch.optim.Adam(policy.get_optim_params(), lr=1e-3)
     first = policy(batch)[1]
-    for _ in range(100):
+    for _ in range(80):
         loss, logged = policy(batch)
         optimizer.zero_grad()
         loss.backward()

@@ -335,7 +335,7 @@ def matching(shapes):
     images, locations, tasks = (part[:24] for part in shapes)
     vocabulary = vocabulary_of(SHAPE_TASKS)
     matching = FeatureMatching(len(vocabulary))
-    matching.fit(images, locations, tasks, bag_of_words(vocabulary, tasks).present, seed=0, steps=35)
+    matching.fit(images, locations, tasks, bag_of_words(vocabulary, tasks).present, seed=0, steps=25)
     assert matching.fitted
     return matching
 

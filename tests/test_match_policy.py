@@ -83,7 +83,7 @@ def trained(table):
         policy, before, _ = small_policy(table, "deltaco_match", feature_matching=False)
         optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
         rng = np.random.default_rng(0)
-        for _ in range(60):
+        for _ in range(50):
             batch = before(batch_of(table, first_frames(rng.choice(N_TRAINED, 16))))
             loss, _ = policy(batch)
             optimizer.zero_grad()

@@ -109,7 +109,7 @@ def assert_same(one, other):
 
 def test_training_loss_has_gradients_and_leaves_the_batch_unchanged(make):
     made = make()
-    kept = copy.deepcopy(made.batch)
+    kept, twin = copy.deepcopy(made.batch), copy.deepcopy(made.policy)
     loss, logged = made.policy(made.batch)
     loss.backward()
     assert loss.shape == ()
@@ -122,7 +122,7 @@ def test_training_loss_has_gradients_and_leaves_the_batch_unchanged(make):
     for name, parameter in made.policy.named_parameters():
         assert (parameter.grad is not None) == (id(parameter) in trained), name
     assert_same(kept, made.batch)
-    each, _ = make().policy(made.batch, reduction="none")
+    each, _ = twin(made.batch, reduction="none")
     assert each.shape == (len(kept["task"]),)
     torch.testing.assert_close(each.mean(), loss.detach(), rtol=1e-5, atol=1e-5)
 
