@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def _discarded_stderr() -> Iterator[None]:
-    """Discards what compiled code prints to the standard error."""
+    """Discards output of compiled code to the standard error."""
     saved = os.dup(2)
     null = os.open(os.devnull, os.O_WRONLY)
     try:
