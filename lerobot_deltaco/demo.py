@@ -1,4 +1,4 @@
-"""The demo: from nothing to a trained `deltaco_match` and a page that shows what it does, in a few minutes.
+"""The demo: trains `deltaco_match` from scratch in a few minutes, and writes a page that shows what it does.
 
 It is the experiment `random_objects/deltaco_match` with less data and fewer steps, evaluated on the 102 novel
 tasks of scenario A. Finished steps are skipped, so the same command continues after an interruption.
@@ -57,10 +57,10 @@ class Budget:
     counterfactual_trials: int = 1
 
 
-# By minutes on two idle cores. 25 minutes are enough for the whole recipe.
+# By minutes on two idle cores. 25 minutes are enough for the full recipe.
 BUDGETS: MappingProxyType[Minutes, Budget] = MappingProxyType({8: Budget(5, 2000), 25: Budget(16, 8000)})
 
-# Success rates to compare with, of the novel tasks of scenario A, in %.
+# Success rates to compare with, on the novel tasks of scenario A, in %.
 CHANCE = 16.7  # one of three objects, one of two containers
 PAPER = 25.8  # DeL-TaCo, in the authors' simulation, trained on the 198 tasks
 LONGER = 77.0  # the recipe of this demo in full, three seeds
@@ -87,7 +87,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     """Collects, trains, evaluates, and writes a page.
 
     Args:
-        minutes: Time for it on two idle cores: 8, or 25 for the whole recipe.
+        minutes: Duration on two idle cores: 8, or 25 for the full recipe.
         out: Folder of all outputs.
 
     Returns:
@@ -130,7 +130,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
 
 
 class Clock:
-    """Measures the steps of a demo, and keeps what it measured in a file.
+    """Measures the steps of a demo, and stores the times in a file.
 
     Args:
         path: JSON file with minutes and core-minutes by step, interrupted attempts included.
@@ -172,7 +172,7 @@ def render_page(run: Run, budget: Budget, clock: Clock) -> str:
     """Renders the page, with its images and videos inside.
 
     Args:
-        run: A run whose evaluations and videos are there.
+        run: A run with finished evaluations and videos.
         budget: Sizes of the demo.
         clock: Times of its steps.
     """
@@ -366,7 +366,7 @@ def _commit() -> str:
 
 
 def _calibration() -> float:
-    """Measures this machine by products of float32 matrices, in GFLOP/s."""
+    """Measures the speed of this machine with float32 matrix products, in GFLOP/s."""
     matrix = np.random.default_rng(0).random((CALIBRATION_SIZE, CALIBRATION_SIZE), dtype=np.float32)
     start = time.perf_counter()
     for _ in range(CALIBRATION_REPEATS):

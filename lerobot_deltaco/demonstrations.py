@@ -1,7 +1,7 @@
 """Demonstrations: a few frames of an episode that shows a task, and banks of them.
 
-A demonstration is a value. Training draws those of a batch from a bank of the training episodes; evaluation
-passes them to `set_tasks` of a policy.
+A demonstration is a value. Training draws the demonstrations of a batch from a bank of the training episodes;
+evaluation passes them to the policy's `set_tasks`.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Demonstration:
             (frames, 3, H, W) uint8.
         pick_state: The robot's state when its gripper closed around the object, as in the dataset, (state,);
             None if it is not known.
-        features: Features of the frames by a frozen image encoder, (features,); None without one.
-        episode: Index of the episode in its dataset; None if it is in none.
+        features: Features of the frames from a frozen image encoder, (features,); None without one.
+        episode: Index of the episode in its dataset; None if it is not from a dataset.
         target_object: Index of the object that it moves; None if it is not known.
     """
 
@@ -94,7 +94,8 @@ class DemonstrationBank(torch.nn.Module):
         self.rows: dict[str, list[int]] = {}
         for row, task in enumerate(self.tasks):
             self.rows.setdefault(task, []).append(row)
-        # By row: where the rows of its task begin in `order`; which of them it is, and how many there are.
+        # For each row: where the rows of its task begin in `order`, its position among them, and their
+        # number.
         order = [row for rows in self.rows.values() for row in rows]
         place = {row: (n, len(rows)) for rows in self.rows.values() for n, row in enumerate(rows)}
         starts, start = {}, 0
@@ -173,8 +174,8 @@ class DemonstrationBank(torch.nn.Module):
         """Draws for each sample another episode of its task.
 
         Args:
-            episodes: The samples' own episodes, (batch,), as indices of the dataset. For one that is not
-                in the bank, such as one that is held back, any episode of its task is drawn.
+            episodes: The samples' own episodes, (batch,), as indices of the dataset. For one that is not in
+                the bank, such as a held-out one, any episode of its task is drawn.
             tasks: Task string of each sample.
             generator: Source of the draws, on the CPU.
 
@@ -246,7 +247,7 @@ class RobotData(NamedTuple):
 
 
 def check_dataset_folder(option: str, root: str | Path | None) -> None:
-    """Checks that a folder holds a dataset, if the Hub is off.
+    """Checks that a folder holds a dataset, if the Hub is offline.
 
     Args:
         option: Command-line option that names the folder, for the error.
@@ -271,7 +272,7 @@ def open_dataset(option: str, repo_id: str, root: str | Path | None) -> LeRobotD
         root: Folder of the dataset; None for LeRobot's cache.
 
     Raises:
-        FileNotFoundError: The folder holds no dataset, and the Hub is off.
+        FileNotFoundError: The folder holds no dataset, and the Hub is offline.
     """
     check_dataset_folder(option, root)
     return LeRobotDataset(repo_id, root=root, return_uint8=True)

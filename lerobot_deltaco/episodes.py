@@ -72,8 +72,8 @@ def draw_episodes(plan: EvaluationPlan, bank: DemonstrationBank | None = None) -
 def _counterfactual_task(candidates: Sequence[Task], scene: SceneConfig, task: Task, seed: int) -> Task:
     """Returns another task whose demonstration or instruction fits a scene.
 
-    If there is one, it asks for another object that stands there, and for the other container; else, at least
-    for the other container.
+    If possible, it asks for another object in the scene and for the other container; otherwise, at least for
+    the other container.
 
     Raises:
         ValueError: There is no other task.

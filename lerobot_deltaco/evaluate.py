@@ -44,10 +44,10 @@ from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord, read_recor
 # Most episodes that run at the same time. A policy's step costs little more for 8 than for 2, and each
 # episode needs a simulator of 50 MB, in each process.
 _MAX_BATCH = 8
-# Batches are what processes share, so that small evaluations have some, too.
+# Processes share batches, so small evaluations need several, too.
 _MIN_BATCHES = 4
 _PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
-# Of a policy's configuration: what comes from the data, and where they were.
+# Options of a policy that come from the training data, or say where they were.
 _NOT_RECORDED = (
     "input_features",
     "output_features",
@@ -79,7 +79,7 @@ StepCallback = Callable[[Sequence[PickPlaceEnv], Sequence[Mapping[str, NDArray]]
 
 
 class Simulators:
-    """Environments that the batches of an evaluation take turns to use, whatever their tasks.
+    """Environments that the batches of an evaluation reuse, whatever their tasks.
 
     Args:
         scene: Settings of the scenes.
@@ -147,7 +147,7 @@ class Evaluation:
         demonstrations = [self._demonstrations(episode) for episode in batch]
         with self._computing(batch):
             infos = run_episodes(self.loaded, self.simulators, batch, demonstrations, callback)
-        # Without the demonstrations' tensors, which are not to pass from process to process.
+        # Without the demonstrations' tensors, which should not be sent between processes.
         return [
             Outcome(
                 episode,
@@ -159,7 +159,7 @@ class Evaluation:
         ]
 
     def _demonstrations(self, episode: Episode) -> list[Demonstration]:
-        """Returns the demonstrations of an episode: the trials of a task use those of the task in turn."""
+        """Returns the demonstrations of an episode; the trials of a task use its demonstrations in turn."""
         if self._bank is None or episode.demonstration_task < 0:
             return []
         policy = self._conditioned
@@ -180,7 +180,8 @@ class Evaluation:
                 torch.set_num_threads(1)
                 stack.callback(torch.set_num_threads, n_threads)
             if self._conditioned is None:
-                # Policies that draw, such as diffusion policies, draw for a whole batch, by its first seed.
+                # Policies that sample, such as diffusion policies, do so for a whole batch, seeded by its
+                # first episode.
                 stack.enter_context(seeded_context(batch[0].seed % 2**32))
                 if config.use_amp:
                     stack.enter_context(torch.autocast(torch.device(config.device).type))
@@ -235,7 +236,7 @@ def run_evaluation(evaluation: Evaluation, processes: int = 1) -> list[Outcome]:
 
     Args:
         evaluation: The evaluation.
-        processes: Number of processes; with 1, all is run in this one.
+        processes: Number of processes; with 1, everything runs in this one.
 
     Returns:
         The episodes by task, in the plan's order, and trial. They do not depend on the number of processes.
@@ -268,7 +269,7 @@ def _run_batches(evaluation: Evaluation, processes: int) -> Iterator[list[Outcom
     )
     try:
         with warnings.catch_warnings():
-            # Of threads that hold locks: there are none but idle ones, and each process computes with one.
+            # About threads that hold locks: all others are idle, and each process computes with one thread.
             warnings.filterwarnings("ignore", category=DeprecationWarning, message=".*fork")
             running = [executor.submit(_run_batch, number) for number in numbers]
         for future in as_completed(running):
@@ -287,7 +288,7 @@ _evaluation: Evaluation | None = None  # of this process, if it was forked for o
 
 def _start_process(evaluation: Evaluation) -> None:
     global _evaluation
-    # An interrupt is for the main process, which lets the running batches end.
+    # Interrupts are left to the main process, which lets the running batches finish.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _evaluation = evaluation
 
@@ -315,7 +316,7 @@ def evaluate(
         checkpoint: Where the policy is from, for the record.
         command: Command line, for the record.
         processes: Number of processes that share the episodes.
-        experiment: Name of what was trained, for the record; None for the checkpoint's.
+        experiment: Name of the experiment, for the record; None for the checkpoint's.
         demonstrations: Name of the dataset of demonstrations, and SHA-256 of its metadata, for the record;
             None for those of the checkpoint.
 
@@ -421,19 +422,19 @@ def evaluate_checkpoints(
     experiment: str | None = None,
     rename_map: Mapping[str, str] | None = None,
 ) -> str:
-    """Evaluates the checkpoints of a training, or a policy, that have no record of the plan yet.
+    """Evaluates a policy, or the checkpoints of a training run, that have no record of the plan yet.
 
     Args:
-        path: Output folder of a training, or folder of a policy.
+        path: Output folder of a training run, or folder of a policy.
         plan: Episodes to run.
         steps: "all", "last", or steps such as "4000,8000".
-        out: Folder of the records; None for that of the training, or outputs/evaluate/NAME.
+        out: Folder of the records; None for that of the training run, or outputs/evaluate/NAME.
         command: Command line, for the records.
         processes: Number of processes that share the episodes.
         device: Device of the policy; None for the checkpoint's.
         demo_repo_id: Dataset of demonstrations; None for the checkpoint's own.
         demo_root: Folder of that dataset.
-        experiment: Name for the records; None for the job name of the training.
+        experiment: Name for the records; None for the job name of the training run.
         rename_map: Names under which the policy knows the environment's observations.
 
     Returns:
@@ -500,12 +501,12 @@ def _chosen(found: Sequence[Checkpoint], steps: str) -> list[Checkpoint]:
 
 
 def _with_image_size(scene: SceneConfig, image_size: int) -> SceneConfig:
-    """Returns settings with the image size that a policy was trained on, unless another one is asked for."""
+    """Returns settings with the image size that a policy was trained on, unless another one is set."""
     return replace(scene, image_size=image_size) if scene == replace(scene, image_size=48) else scene
 
 
 def _record_name(checkpoint: Checkpoint, plan: EvaluationPlan, demonstrations: tuple[str, str] | None) -> str:
-    """Returns the file name of a record: the step, and a digest of what else distinguishes evaluations."""
+    """Returns the file name of a record: the step, and a digest of the evaluation's other settings."""
     digest = hashlib.sha256(repr((plan, demonstrations)).encode()).hexdigest()[:8]
     return f"{checkpoint.step:07d}_{digest}.parquet"
 

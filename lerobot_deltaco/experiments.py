@@ -1,4 +1,4 @@
-"""Experiments: the paper's rows and the project's own, from collecting the data to the report.
+"""Experiments: the paper's rows and the project's own, from data collection to the report.
 
     recipe -> collect -> train -> evaluate -> report
 
@@ -38,7 +38,7 @@ class Run:
 
     Args:
         recipe: The recipe.
-        seed: Seed of the training.
+        seed: Training seed.
         out: Folder of all outputs. Experiments share its folder `data`.
     """
 
@@ -54,7 +54,7 @@ class Run:
         return f"{self.recipe.name} {self.seed}"
 
     def dataset(self, plan: CollectionPlan) -> Path:
-        """Returns the folder of a dataset, which follows from its plan."""
+        """Returns the folder of a dataset, named after its plan."""
         name = "_".join(f"{key.rpartition('.')[2]}-{value}" for key, value in plan_options(plan))
         return self.out / "data" / re.sub(r"[^\w.,-]", "-", name)
 
@@ -68,7 +68,7 @@ class Run:
         ]
 
     def train_command(self) -> list[str] | None:
-        """Returns the command that begins or resumes the training; None if it is finished.
+        """Returns the command that starts or resumes training; None if it is finished.
 
         Raises:
             ExperimentError: The experiment that this one starts from was not trained and evaluated.
@@ -114,10 +114,10 @@ class Run:
         return [found.step for found in find_checkpoints(self.folder) if found.step not in done]
 
     def check_settings(self) -> None:
-        """Checks that the run, if it has a checkpoint, was begun with the same settings.
+        """Checks that the run, if it has a checkpoint, began with the same settings.
 
         Raises:
-            ExperimentError: It was begun with others.
+            ExperimentError: It began with others.
         """
         if last_step(self.folder) == 0 or not self.settings_file.is_file():
             return
@@ -130,7 +130,7 @@ class Run:
                 )
 
     def train(self, log: Path | None = None, n_threads: int | None = None) -> None:
-        """Trains, unless the training is finished.
+        """Trains unless training is finished.
 
         Args:
             log: File for the output; None for this terminal.
@@ -140,7 +140,7 @@ class Run:
         if command is None:
             return
         if last_step(self.folder) == 0:
-            # A training that was stopped before its first checkpoint has left a folder.
+            # A run that stopped before its first checkpoint has left a folder.
             shutil.rmtree(self.folder, ignore_errors=True)
             write_json(self.settings_file, self._settings())
         call(command, log, n_threads)
@@ -286,15 +286,15 @@ def run_experiments(
     Args:
         names: Names of experiments, such as "scenario_a/deltaco".
         scale: Amount of data and training.
-        seeds: Seeds of the training; each is a run of its own.
+        seeds: Training seeds; each is a separate run.
         out: Folder of all outputs.
         settings: Settings that take precedence over the recipes, such as "training.steps=2000".
-        jobs: Number of runs at a time. Each has its part of the cores, and its own copy of the frames.
+        jobs: Number of runs at a time. Each has its share of the cores, and its own copy of the frames.
         only: The only step to run; the steps before it must be finished.
         dry_run: Whether to print the commands instead.
 
     Raises:
-        ExperimentError: A setting is invalid, a run was begun with other settings, or a step failed.
+        ExperimentError: A setting is invalid, a run began with other settings, or a step failed.
     """
     if jobs < 1 or not names:
         raise ExperimentError(
@@ -304,7 +304,7 @@ def run_experiments(
     runs = [Run(recipe, seed, out) for seed in dict.fromkeys(seeds) for recipe in recipes]
     for run in runs:
         run.check_settings()
-    # Fine-tuning begins when the runs that it may start from are done.
+    # Fine-tuning starts once the runs that it may start from are done.
     first = [run for run in runs if run.recipe.start_from not in names]
     second = [run for run in runs if run not in first]
     remaining = [command for run in first for command in run.commands(only)]
@@ -327,7 +327,7 @@ def run_experiments(
 
 
 def _train_and_evaluate(runs: Sequence[Run], jobs: int, only: Step | None) -> None:
-    """Trains and evaluates runs, several at a time. After a failure, those that have begun are completed."""
+    """Trains and evaluates runs, several at a time. After a failure, those already started are completed."""
 
     def work(run: Run, log: Path | None = None, n_threads: int | None = None) -> None:
         if only in (None, "train"):

@@ -31,7 +31,7 @@ from lerobot_deltaco.demonstrations import (
     resize_images,
 )
 
-# Rows that are decoded at a time, and those of them that a thread takes at a time.
+# Number of rows decoded at a time, and number of these that a thread takes at a time.
 _CHUNK, _PART = 1024, 32
 _MEMORY_FRACTION = 0.8  # of the free memory, that frames may take
 
@@ -39,16 +39,16 @@ _MEMORY_FRACTION = 0.8  # of the free memory, that frames may take
 class FramesInMemory(torch.utils.data.Dataset):
     """All frames that a dataset has selected, by their index in it.
 
-    It stands for the dataset in LeRobot's training loop. A batch has what LeRobot's data loader would give,
-    the windows of frames that `delta_timestamps` ask for included.
+    It replaces the dataset in LeRobot's training loop. A batch equals that of LeRobot's data loader,
+    including the windows of frames that `delta_timestamps` ask for.
 
     Args:
-        dataset: The dataset; its `episodes` are those that are held.
+        dataset: The dataset; its `episodes` are kept in memory.
         image_size: Height and width to which images are scaled; None for their own.
 
     Raises:
         MemoryError: The frames do not fit into the memory of this machine.
-        ValueError: The dataset changes images when they are read.
+        ValueError: The dataset transforms images when they are read.
     """
 
     def __init__(self, dataset: LeRobotDataset, image_size: int | None = None) -> None:
@@ -74,7 +74,7 @@ class FramesInMemory(torch.utils.data.Dataset):
         self.tasks: NDArray[np.int64] = self.columns["task_index"].reshape(-1).numpy()
         for camera in cameras:
             self.columns[camera] = _camera_images(dataset, camera, image_size)
-        # First and last row of each episode: rows of an episode follow one another.
+        # First and last row of each episode, whose rows are consecutive.
         episodes = self.columns["episode_index"].reshape(-1).numpy()
         numbers, first = np.unique(episodes, return_index=True)
         last = len(episodes) - 1 - np.unique(episodes[::-1], return_index=True)[1]
@@ -82,7 +82,7 @@ class FramesInMemory(torch.utils.data.Dataset):
         self._first, self._last = (
             torch.from_numpy(rows[np.searchsorted(numbers, episodes)]) for rows in (first, last)
         )
-        # Of each feature of which a sample has a window of frames: their distances from the sample's frame.
+        # For each feature with a window of frames: the frames' distances from the sample's frame.
         deltas = get_delta_indices(dataset.delta_timestamps or {}, dataset.fps)
         self._windows = {name: torch.tensor(delta) for name, delta in deltas.items()}
 
@@ -150,7 +150,7 @@ class FramesInMemory(torch.utils.data.Dataset):
 
 
 class _Frame:
-    """A frame that is gathered with the others of its batch, when the data loader collates them."""
+    """A frame that is gathered with the others of its batch when the data loader collates them."""
 
     def __init__(self, frames: FramesInMemory, index: int) -> None:
         self.frames, self.index = frames, index
@@ -205,7 +205,7 @@ def _column(dataset: LeRobotDataset, name: str) -> NDArray[Any]:
 
 
 def _flat_numbers(values: pa.Array) -> NDArray[Any] | None:
-    """Returns numbers and vectors of numbers, one after another; None for anything else.
+    """Returns numbers and vectors of numbers as one flat array; None for anything else.
 
     `datasets` makes arrays row by row, and takes ten seconds for a hundred thousand.
     """
@@ -243,7 +243,7 @@ def _camera_images(dataset: LeRobotDataset, camera: str, image_size: int | None)
     return images
 
 
-# For rows of a dataset, a function that gives the images of some of them, (images, 3, H, W) uint8.
+# Given rows of a dataset, returns a function from some of them to their images, (images, 3, H, W) uint8.
 Reader = Callable[[range], Callable[[range], Tensor]]
 
 
@@ -261,7 +261,7 @@ def _stored_images(dataset: LeRobotDataset, camera: str) -> Reader:
 def _decoded(file: bytes) -> Tensor:
     """Decodes an image, (3, H, W) uint8."""
     try:
-        # Unlike Pillow's, this decoder leaves Python to the other threads; it knows fewer formats.
+        # Unlike Pillow's, this decoder releases the interpreter lock; it supports fewer formats.
         image = decode_image(torch.frombuffer(bytearray(file), dtype=torch.uint8), ImageReadMode.RGB)
     except RuntimeError:
         image = None
@@ -274,7 +274,7 @@ def _video_images(dataset: LeRobotDataset, camera: str) -> Reader:
     """Returns a reader of a `video` feature, which reads as LeRobot does."""
 
     def read(rows: range) -> Callable[[range], Tensor]:
-        # One after another: a decoder is not to be shared by threads.
+        # Sequentially, because threads must not share a decoder.
         with _single_frames(dataset):
             images = []
             for row in rows:

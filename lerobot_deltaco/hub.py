@@ -16,11 +16,11 @@ from lerobot_deltaco.dataset_writer import CODEBASE_VERSION
 
 
 class HubError(RuntimeError):
-    """Something that cannot be published; the message says why, and what to do."""
+    """Raised when something cannot be published; the message says why, and what to do."""
 
 
 def check_push(repo_id: str) -> None:
-    """Checks what a push needs, so that a collection that ends with one fails before it begins.
+    """Checks the requirements of a push, so that a collection that ends with one fails early.
 
     Raises:
         HubError: The repository id is invalid, or there is no token.
@@ -43,11 +43,11 @@ def push(root: Path, repo_id: str, private: bool = False, branch: str | None = N
 
     Args:
         root: Folder of the dataset. The card is written into it.
-        repo_id: "USER/NAME" on the Hub. The repository is created if it does not exist; files that it has of
-            an earlier dataset are deleted.
+        repo_id: "USER/NAME" on the Hub. The repository is created if it does not exist; its files from an
+            earlier dataset are deleted.
         private: Whether to create a new repository as private.
         branch: Branch to upload to, created if it does not exist. None: the main branch, tagged with the
-            version of the format, by which LeRobot fetches datasets.
+            version of the format, which LeRobot looks for.
 
     Returns:
         Address of the dataset.
@@ -60,13 +60,13 @@ def push(root: Path, repo_id: str, private: bool = False, branch: str | None = N
     if not is_finished(root):
         raise HubError(f"{root} holds no finished dataset of `deltaco collect`. Run `deltaco collect` first.")
     write_dataset_card(root, repo_id)
-    # Only here, since it takes 10 s to import.
+    # Imported here, since it takes 10 s.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     api = HfApi()
     try:
         dataset = LeRobotDataset(repo_id, root=root, revision="main")
-        # The tag is set below, on the commit that has our card.
+        # The tag is set below, on the commit with our card.
         dataset.push_to_hub(branch=branch, private=private or None, tag_version=False)
         remote = api.list_repo_files(repo_id, repo_type="dataset", revision=branch)
         # LeRobot reads every file in these folders.

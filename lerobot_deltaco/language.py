@@ -1,4 +1,4 @@
-"""Instructions as embeddings: frozen sentence encoders, their cache, and sentences that people wrote.
+"""Embeddings of instructions: frozen sentence encoders, a cache, and paraphrases.
 
 Two encoders come as Python packages, with the extra `offline`: all-MiniLM-L6-v2, as sentence-transformers
 reads it, and paraphrase-MiniLM-L3-v2, the authors' encoder, as a computation graph (ONNX) whose weights are
@@ -95,7 +95,7 @@ class InstructionEmbeddings:
         return found
 
     def add(self, instructions: Sequence[str]) -> None:
-        """Embeds those that are not known yet, in batches.
+        """Embeds instructions that are not known yet, in batches.
 
         Raises:
             LanguageEncoderError: The encoder cannot be loaded.
@@ -120,7 +120,7 @@ class Paraphrases:
 
     Args:
         sentences: Sentences by task string.
-        with_templates: Whether the task string itself is drawn as often as each of its sentences.
+        with_templates: Whether to also draw the task string itself, as often as each of its sentences.
     """
 
     def __init__(self, sentences: Mapping[str, Sequence[str]], with_templates: bool = False) -> None:
@@ -225,7 +225,7 @@ def _clip() -> LanguageEncoder:
 def _packaged_l3() -> LanguageEncoder | None:
     """Loads paraphrase-MiniLM-L3-v2 from its package; None if one of its two packages is not installed.
 
-    Its vocabulary is that of bert-base-uncased, which the package of all-MiniLM-L6-v2 brings.
+    Its vocabulary is that of bert-base-uncased, which is in the package of all-MiniLM-L6-v2.
     """
     file, vocabulary = l3_onnx_file(), _l6_folder()
     if file is None or vocabulary is None:
@@ -259,10 +259,10 @@ def _in_batches(
 
 
 def read_bert(graph_file: bytes) -> BertModel:
-    """Reads the weights of an exported BERT into the transformer.
+    """Reads the weights of an exported BERT into a transformer.
 
     Biases, norms and embeddings carry their names in the graph. The matrices of linear layers do not, and are
-    transposed; the operation that multiplies by one is named after the layer.
+    transposed; they are identified by the multiplication that uses them, which is named after the layer.
 
     Args:
         graph_file: Content of an ONNX file.

@@ -22,7 +22,7 @@ ROWS_FILE = Path("results", "leaderboard.csv")
 TASKS, AMBIGUITY = "scenario_a_test", "container"  # of the leaderboard
 NOT_RUN = "not run"
 BEGIN, END = "<!-- Made from the records in results/. -->", "<!-- End of what is made from records. -->"
-# DeL-TaCo's row, with which the other rows of a table of the paper are compared.
+# DeL-TaCo's row, the reference for the other rows of a table of the paper.
 _REFERENCES = {
     "scenario_a": "scenario_a/deltaco",
     "scenario_b": "scenario_b/deltaco",
@@ -48,8 +48,8 @@ def leaderboard(root: Path) -> str:
     """Returns the leaderboard in Markdown, best first.
 
     Args:
-        root: Folder of the repository, with the rows in `results/leaderboard.csv`: name of the method, what
-            it is given, file and experiment of its records, and its training.
+        root: Folder of the repository, with the rows in `results/leaderboard.csv`: name of the method, its
+            inputs, file and experiment of its records, and its training.
 
     Raises:
         RecordError: A file has no valid records.

@@ -1,4 +1,4 @@
-"""`--env.type=deltaco`: the benchmark as LeRobot's training and evaluation see it."""
+"""`--env.type=deltaco`: the benchmark as an environment of LeRobot."""
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
@@ -37,7 +37,7 @@ class DeltacoEnv(EnvConfig):
     """The 300 pick-and-place tasks of DeL-TaCo.
 
     LeRobot's evaluation reports a success rate for each kind of task: "name", "color" and "shape". Its seed s
-    gives the scene of trial s - 1000 of `deltaco evaluate`, which the tasks do not share.
+    gives the scene of trial s - 1000 of `deltaco evaluate`, a different one for each task.
 
     Args:
         task: Tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_a_validation,
@@ -50,7 +50,7 @@ class DeltacoEnv(EnvConfig):
         paraphrases: CSV file with sentences for the tasks. The instruction of an episode is then one of its
             task's, drawn by the episode's seed. By default, it is the benchmark's template.
         paraphrases_split: Split of the file's sentences: all; held_out, the last one of each task; or train,
-            those that are held out for no task.
+            those that are not held out for any task.
         instruction: A sentence that replaces the instruction of every task.
     """
 
@@ -90,7 +90,7 @@ class DeltacoEnv(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of the environment; the task is chosen later."""
+        """Arguments of the environment; the task is set later."""
         return {
             "scene": self.scene,
             "render_mode": "rgb_array",
@@ -101,7 +101,7 @@ class DeltacoEnv(EnvConfig):
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Makes a vector environment for each task. None has a simulator until it is first reset.
+        """Makes a vector environment for each task. Its simulators start at the first reset.
 
         Args:
             n_envs: Number of environments for each task.
@@ -124,8 +124,8 @@ class DeltacoEnv(EnvConfig):
 class EvaluationEnv(PickPlaceEnv):
     """The environment with the scenes of the evaluation protocol.
 
-    Seed s of a reset becomes a seed that depends on the task, too, and is that of no training scene. A closed
-    environment leaves its simulator to the next one: starting one takes 50 ms.
+    The seed of a reset is mapped to one that also depends on the task, and that no training scene has. A
+    closed environment passes its simulator on to the next one, since starting one takes 50 ms.
     """
 
     _idle: list[Simulation] = []  # noqa: RUF012
@@ -142,7 +142,7 @@ class EvaluationEnv(PickPlaceEnv):
         return super().reset(seed=seed, options=options)
 
     def close(self) -> None:
-        """Leaves the simulator to the next environment."""
+        """Passes the simulator on to the next environment."""
         if self._simulation is not None:
             self._idle.append(self._simulation)
             self._simulation = None
@@ -150,12 +150,12 @@ class EvaluationEnv(PickPlaceEnv):
 
 
 class _FrozenAfterEpisodeEnd(FreezeAfterEpisodeEnd):
-    """LeRobot's wrapper, which begins a new episode also where a caller resets with a seed."""
+    """LeRobot's wrapper, but a reset with a seed also begins a new episode."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Draws a new scene, unless it is Gymnasium that resets an episode which has ended."""
+        """Draws a new scene, unless Gymnasium resets an episode that has ended."""
         if seed is not None:
             self._frozen = None
         return super().reset(seed=seed, options=options)
@@ -168,9 +168,9 @@ def _make_env(**arguments: Any) -> gym.Env:
 def check_policy_fits(
     policy: PreTrainedConfig, scene: SceneConfig, rename_map: Mapping[str, str] = NO_RENAMING
 ) -> None:
-    """Checks that a policy was trained on the images, the state and the action of the environment.
+    """Checks that a policy was trained on the environment's images, state and action.
 
-    Without this, a policy would act on images of another size than those that it was trained on: LeRobot and
+    Without this check, a policy could act on images of another size than it was trained on, since LeRobot and
     the policy scale them.
 
     Args:
@@ -185,7 +185,7 @@ def check_policy_fits(
     cameras = list(policy.image_features)
     camera = rename_map.get(OBS_IMAGE, OBS_IMAGE)
     # Vision-language-action models (which have this option) leave out cameras that are not there, and keep
-    # the image size of what they were fine-tuned from, whatever that of the dataset was.
+    # the image size of the model that they were fine-tuned from, whatever the dataset's was.
     can_lack_cameras = hasattr(policy, "empty_cameras")
     if camera not in cameras or (len(cameras) > 1 and not can_lack_cameras):
         example = json.dumps({OBS_IMAGE: cameras[0]}) if cameras else "{}"
@@ -200,7 +200,7 @@ def check_policy_fits(
             f"The policy was trained on images of {trained_on} pixels, but those of the environment have "
             f"{scene.image_size}. Set `scene.image_size` to {trained_on}."
         )
-    # Models that pad the state take any that is short enough.
+    # Models that pad the state accept any that is short enough.
     state = None if hasattr(policy, "max_state_dim") else policy.robot_state_feature
     sizes = ((OBS_STATE, state, len(STATE_NAMES)), (ACTION, policy.action_feature, len(ACTION_NAMES)))
     for name, feature, size in sizes:

@@ -40,7 +40,7 @@ from lerobot_deltaco.recording import benchmark_scene, load_conditioned, record_
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
-# Distance from the recorded location within which a found one is right: a tenth of the image's side. In the
+# A location is right within this distance from the recorded one: a tenth of the image's side. In the
 # benchmark, the centers of objects are at least 0.26 apart.
 TOLERANCE = 0.2
 _BENCHMARK_TASKS, _BENCHMARK_SEED = "scenario_a_test", 1000  # the first trial of the evaluation protocol
@@ -66,7 +66,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class DatasetSource:
-    """A LeRobotDataset; neither argument for none.
+    """A LeRobotDataset; without arguments, none.
 
     Args:
         repo_id: Repository id of the dataset; by default, the name of its folder.
@@ -173,7 +173,7 @@ def _benchmark_views(loaded: LoadedPolicy, n_episodes: int, out: Path) -> Iterat
 
 
 def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int) -> Iterator[View]:
-    """Finds the locations in first images of episodes, by demonstrations of other episodes."""
+    """Finds the locations in first images of episodes, with other episodes as demonstrations."""
     policy, config, meta = loaded.policy, loaded.policy.config, dataset.meta
     _check_features(config, dataset)
     tasks = [names[0] for names in meta.episodes["tasks"]]
@@ -219,7 +219,7 @@ def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: in
 
 
 def _check_features(config: TaskConditionedConfig, dataset: LeRobotDataset) -> None:
-    """Checks that a dataset has what a policy observes.
+    """Checks that a dataset has the policy's observations.
 
     Raises:
         ValueError: It does not.

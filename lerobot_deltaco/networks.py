@@ -1,4 +1,4 @@
-"""The policy network of the paper (figure 7, appendix B), which task embeddings or locations condition.
+"""The policy network of the paper (figure 7, appendix B), conditioned on task embeddings or locations.
 
     image (3, H, W), maps of locations
         |
@@ -73,7 +73,7 @@ class ActionDistribution(NamedTuple):
 
 
 class PolicyNetwork(nn.Module):
-    """Predicts an action from images, what specifies the task, and proprioception.
+    """Predicts an action from images, the specification of the task, and proprioception.
 
     Args:
         n_cameras: Number of images of an observation; their feature points are concatenated.
@@ -253,7 +253,7 @@ class SpatialSoftmax(nn.Module):
 
 
 class FullPrecisionLinear(nn.Linear):
-    """A linear layer that computes in its weights' precision, also under mixed precision.
+    """A linear layer that computes in its weights' precision, even under mixed precision.
 
     For outputs: bfloat16 rounds a number close to 1 to a multiple of 1/256 or 1/128.
     """
@@ -324,7 +324,7 @@ def spatial_weights(maps: Tensor) -> Tensor:
 def mean_location(weights: Tensor) -> tuple[Tensor, Tensor]:
     """Returns mean x and y, each (batch, channels) in -1..1, under weights (batch, channels, h, w)."""
     height, width = weights.shape[-2:]
-    # Sums of products, since mixed precision would round the factors of a matrix product.
+    # Sums of products, because mixed precision would round the factors of a matrix product.
     x = torch.linspace(-1, 1, width, device=weights.device)
     y = torch.linspace(-1, 1, height, device=weights.device)
     return (weights.sum(dim=2) * x).sum(-1), (weights.sum(dim=3) * y).sum(-1)

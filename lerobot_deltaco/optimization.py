@@ -1,4 +1,4 @@
-"""The optimizer and the schedule of the learning rate, as configurations of LeRobot."""
+"""The optimizer and the learning rate schedule, as LeRobot configurations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from torch.optim.lr_scheduler import LambdaLR
 
-# Options of glibc's mallopt, and the greatest value that it takes.
+# Options of glibc's mallopt, and its largest value.
 _TRIM_THRESHOLD, _MMAP_MAX, _GREATEST = -1, -4, 2**31 - 1
 
 
@@ -35,7 +35,7 @@ class FusedAdamWConfig(AdamWConfig):
 @LRSchedulerConfig.register_subclass("deltaco_cosine")
 @dataclass
 class CosineSchedulerConfig(LRSchedulerConfig):
-    """A cosine schedule that decays to 0 at the end of the training.
+    """A cosine schedule that decays to 0 at the end of training.
 
     Args:
         num_warmup_steps: Number of steps over which the learning rate rises linearly from 0.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
-# Success of policies that know a part of the task, in ambiguity scheme (i).
+# Success rates of policies that know part of the task, in ambiguity scheme (i).
 CHANCE = 1 / 6
 LEVELS = {
     "random object and container": CHANCE,

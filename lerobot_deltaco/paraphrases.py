@@ -26,8 +26,8 @@ def read_paraphrases(path: str | Path, split: str = "all") -> dict[int, tuple[st
         path: File in UTF-8 with the columns `task_id` (0..299, or 1000..1479 for tasks by color and shape)
             and `instruction`; or the authors' file, with the columns "" (number of the row), "Task ID" and
             "Instruction".
-        split: "all"; "held_out", the last sentence of each task; or "train", the sentences that are held out
-            for no task. Upper and lower case do not distinguish sentences.
+        split: "all"; "held_out", the last sentence of each task; or "train", the sentences that are not held
+            out for any task. Upper and lower case do not distinguish sentences.
 
     Returns:
         Distinct sentences by task index, in the order of the file; tasks ascending, without tasks that have
@@ -68,7 +68,7 @@ def choose_instructions(
         instruction: One sentence for all tasks, instead of a file.
 
     Returns:
-        One or more sentences for each task; None, for the benchmark's templates, without file and sentence.
+        One or more sentences for each task; without file and sentence None, for the benchmark's templates.
 
     Raises:
         ValueError: Both a file and a sentence are given, the sentence is empty, or the file is invalid or

@@ -33,7 +33,7 @@ def draw_found(
     sample: int = 0,
     recorded: Tensor | None = None,
 ) -> Image.Image:
-    """Draws where a policy looked: the scene at its full resolution, and at its left the demonstration.
+    """Draws where a policy looked: the demonstration, and to its right the scene at full resolution.
 
     A magenta ring marks the pick location, a cyan square the place location.
 

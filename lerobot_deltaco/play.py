@@ -1,4 +1,4 @@
-"""`deltaco play`: a page on which a policy acts by demonstrations and sentences that you choose."""
+"""`deltaco play`: a page on which a policy acts on demonstrations and sentences that you choose."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def shipped_checkpoint() -> Path:
 
 
 class Choice(NamedTuple):
-    """What the user has chosen, as it stands in the page's address.
+    """The user's choices, as stored in the page's address.
 
     Attributes:
         task_id: Task that the scene is drawn for.
@@ -82,7 +82,7 @@ class Run(NamedTuple):
     Attributes:
         video: MP4 file.
         picture: Where the policy looked; None for policies that find no locations.
-        verdict: Whether it has done what was asked for.
+        verdict: Whether it did what was asked.
         footnote: Success by the benchmark's own criterion, for the scene's task.
     """
 
@@ -128,7 +128,7 @@ class Player:
         return _FROM_CHECKPOINT if is_known else 0
 
     def parse_choice(self, query: Mapping[str, str]) -> Choice:
-        """Returns the choice in the page's address; for what it lacks or is not valid, a fitting one."""
+        """Returns the choice in the page's address; missing or invalid parts are filled in to fit."""
 
         def number(name: str, end: int, default: int) -> int:
             text = query.get(name, "")
@@ -443,7 +443,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
             return show(player.parse_choice(dict(request.query_params)))
 
         def change_scene(known: tuple[int, int, list[str]], *values: Any) -> dict[Any, Any]:
-            """Shows another scene, with what fits it in place of what was not made by the user."""
+            """Shows another scene, and replaces what the user did not make with what fits the scene."""
             choice = Choice(*values)
             if (choice.task_id, choice.seed) == known[:2]:
                 return {}

@@ -1,7 +1,7 @@
 """Recipes of experiments: the rows of the paper's tables and the project's own.
 
-A recipe in `experiments.yaml` is parsed into the plans and options of the steps of an experiment, so that a
-mistake is found before anything is collected.
+A recipe in `experiments.yaml` is parsed into the plans and options of the steps of an experiment, so that
+mistakes are found before anything is collected.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LEROBOT_POLICY_OPTIONS = {"type": "str", "device": "str"}
 
 
 class ExperimentError(RuntimeError):
-    """An experiment that cannot begin or go on; the message says why."""
+    """Raised when an experiment cannot start or continue; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Recipe:
     Args:
         name: Name of the experiment, such as "scenario_a/deltaco".
         scale: Amount of data and training.
-        data: Collection that is trained on.
+        data: Training data.
         demonstrations: Collection of demonstrations of the test tasks.
         policy: Options of `--policy`, with its type.
         training: Options of the training loop.

@@ -1,4 +1,4 @@
-"""Episodes of the benchmark, recorded to be shown: a policy's, and the expert's demonstrations."""
+"""Recordings of benchmark episodes: a policy's, and the expert's demonstrations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records of evaluations in Parquet: what is run, and what happened in every episode.
+"""Records of evaluations in Parquet: the plan, and the outcome of every episode.
 
 One file holds any number of evaluations. A row is an episode:
 
@@ -16,8 +16,8 @@ One file holds any number of evaluations. A row is an episode:
     right_object            bool     whether the grasped object is the target
     right_container         bool     whether an object lies in the target container, and none in the other one
 
-The metadata of the schema have, under the key `deltaco`, what holds for an evaluation as a whole, as JSON:
-the fields of `EvaluationRecord`. What follows from the plan is not stored: `scene_columns` computes it.
+The schema's metadata contain the fields that describe the whole evaluation, as JSON under the key `deltaco`:
+those of `EvaluationRecord`. Values that follow from the plan are not stored: `scene_columns` computes them.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class EvaluationPlan:
         tasks: Tasks: a task set, or indices and ranges, such as 4,50-73.
         trials: Number of episodes of each task.
         seed: Seed of the scenes: trial i has the scene that `lerobot-eval` shows for its seed `seed` + i.
-        scene_set: Number of a set of scenes, for those of older records: with it, the scenes derive from the
+        scene_set: Number of a set of scenes, to reproduce older records: with it, the scenes derive from the
             seed, this number, the task and the trial.
         scene: Settings of the scenes.
         counterfactual: Input that is replaced by another task's: none, demonstration or instruction. That
@@ -68,7 +68,7 @@ class EvaluationPlan:
         paraphrases: CSV file with sentences for the tasks, which the trials of a task use in turn. By
             default, the instructions are the benchmark's templates.
         paraphrases_split: Split of that file: all; held_out, the last sentence of each task; or train, the
-            sentences that are held out for no task.
+            sentences that are not held out for any task.
         instruction: A sentence that replaces the instruction of every task.
 
     Raises:
@@ -133,7 +133,7 @@ class EvaluationRecord:
     """An evaluation of one checkpoint.
 
     Args:
-        experiment: Name of what was trained; runs of one name differ in their seeds alone.
+        experiment: Name of the experiment; runs of the same name differ only in their seeds.
         policy_type: Type of the policy, such as "deltaco_match".
         train_seed: Seed of the training.
         step: Training step of the checkpoint.
@@ -271,7 +271,7 @@ def _check(record: EvaluationRecord, source: str) -> None:
     """Checks that the rows of an evaluation do not contradict each other or its plan.
 
     Raises:
-        RecordError: They do.
+        RecordError: They contradict each other.
     """
     rows = record.episodes
     containers = rows["object_containers"].map(list)
@@ -304,7 +304,7 @@ def _check(record: EvaluationRecord, source: str) -> None:
 
 
 def scene_columns(record: EvaluationRecord) -> pd.DataFrame:
-    """Computes what follows from the task, the trial and the plan of each episode, without a simulator.
+    """Computes values that follow from the task, trial and plan of each episode, without a simulator.
 
     Returns:
         A row for each episode: `seed`; `template`, the task's instruction; `objects`, indices of the three

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAGE, SUCCESS_FIGURE, CURVES_FIGURE = "report.md", "success.png", "curves.png"
-# Options of a policy that may differ between the trainings of an experiment.
+# Options of a policy that may differ between the training runs of an experiment.
 _OPTIONS_OF_A_RUN = {"seed", "device", "pretrained_path", "demo_root", "repo_id", "push_to_hub"}
 
 # Function, title and explanation of each table, by the name of its CSV file.
@@ -93,7 +93,7 @@ def write_report(paths: Sequence[Path], out: Path) -> Path:
     """Writes tables and figures from records of evaluations.
 
     Args:
-        paths: Files of records, or folders that have some.
+        paths: Files of records, or folders that contain some.
         out: Folder of the report. Files of an earlier report that this one lacks are removed.
 
     Returns:
@@ -279,7 +279,7 @@ def markdown_table(table: pd.DataFrame) -> str:
 
 
 def escape(text: str) -> str:
-    """Returns a text in which Markdown sees no markup."""
+    """Escapes a text for Markdown."""
     return re.sub(r"([\\`*_\[\]<>|#~])", r"\\\1", " ".join(text.split()))
 
 
@@ -299,7 +299,7 @@ _DOTTED = (0, (1, 3))
 
 
 def success_figure(everything: Sequence[Series]) -> Figure:
-    """Draws the success at the last step with its intervals, beside the paper's."""
+    """Draws the success at the last step with its intervals, next to the paper's."""
     figure, panels = _panels(everything, frame=0.8, line=0.4)
     for ax, group in panels:
         rows = np.arange(len(group))
@@ -331,7 +331,7 @@ def success_figure(everything: Sequence[Series]) -> Figure:
 
 
 def curves_figure(everything: Sequence[Series]) -> Figure:
-    """Draws the success over the steps of the training: means over seeds, with a band of one SD."""
+    """Draws the success over training steps: means over seeds, with a band of one SD."""
     everything = [series for series in everything if len(series.steps) > 1]
     figure, panels = _panels(everything, frame=2.4, line=0.205)
     for ax, group in panels:
@@ -369,7 +369,7 @@ def _panels(
     for series in everything:
         groups[series.group].append(series)
     heights = [frame + line * len(group) for group in groups.values()]
-    # Names stand beside the axes.
+    # Names are placed beside the axes.
     width = 6.0 + 0.06 * max(len(line) for series in everything for line in _plain(series.name).split("\n"))
     figure = Figure(figsize=(width, sum(heights)), dpi=140, layout="constrained")
     axes = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]

@@ -1,9 +1,9 @@
 """Tables of a report, each a `pandas.DataFrame` made from records of evaluations.
 
-Rates are fractions, 0..1. A row is an experiment: trainings of one name, which differ in their seeds.
-Experiments whose names begin alike, such as small_a/deltaco and small_a/one_hot, are a group. Evaluations
-with other settings than most of their group, with a counterfactual, with an input left out or in other words
-have rows of their own.
+Rates are fractions, 0..1. A row is an experiment: training runs of the same name, which differ in their
+seeds. Experiments whose names begin alike, such as small_a/deltaco and small_a/one_hot, are a group.
+Evaluations with other settings than most of their group, with a counterfactual, with an input left out or
+with paraphrases have separate rows.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from lerobot_deltaco.statistics import (
 )
 
 KINDS = ("name", "color", "shape", "color_shape")
-# What never belongs to the main settings of a group.
+# Settings that never belong to the main ones of a group.
 _MAIN = {"counterfactual": "none", "without": "none", "wording": TEMPLATES}
 
 
@@ -69,17 +69,17 @@ class Series:
 
     @property
     def name(self) -> str:
-        """Name in the page and in figures."""
+        """Name on the page and in figures."""
         return name_of(self.experiment, self.variant)
 
     @property
     def is_counterfactual(self) -> bool:
-        """Whether demonstration or instruction are another task's."""
+        """Whether the demonstration or the instruction is another task's."""
         return self.settings["counterfactual"] != "none"
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Seeds of the trainings, ascending."""
+        """Training seeds, ascending."""
         return tuple(sorted(self.runs))
 
     @cached_property
@@ -205,7 +205,7 @@ def wording_label(wording: str) -> str:
 
 
 def success_table(everything: Sequence[Series]) -> pd.DataFrame:
-    """Makes the success at the last step, of all training seeds and of each."""
+    """Tabulates the success at the last step, over all training seeds and for each."""
     rows = []
     for series in _regular(everything):
         parts = [(" ".join(map(str, series.seeds)), series.episodes)]
@@ -230,7 +230,7 @@ def success_table(everything: Sequence[Series]) -> pd.DataFrame:
 
 
 def kinds_table(everything: Sequence[Series]) -> pd.DataFrame:
-    """Makes the success by how the task describes its object and its container."""
+    """Tabulates the success by how the task describes its object and its container."""
     rows = []
     for series in _regular(everything):
         tasks = series.episodes["task_id"].map(get_task)
@@ -244,7 +244,7 @@ def kinds_table(everything: Sequence[Series]) -> pd.DataFrame:
 
 
 def outcomes_table(everything: Sequence[Series]) -> pd.DataFrame:
-    """Makes what happened in the episodes: which of the steps to success they reached."""
+    """Tabulates the outcomes of the episodes: which of the steps to success they reached."""
     rows = []
     for series in _regular(everything):
         episodes = series.episodes
@@ -268,10 +268,10 @@ def outcomes_table(everything: Sequence[Series]) -> pd.DataFrame:
 
 
 def differences_table(everything: Sequence[Series]) -> pd.DataFrame:
-    """Makes differences of success, paired by task.
+    """Tabulates differences of success, paired by task.
 
-    An evaluation with other settings is compared with the same trainings' in the main ones, or in the nearest
-    to them; all others with the first experiment of their group in the same settings.
+    An evaluation with other settings is compared with that of the same training runs in the main settings, or
+    in those nearest to them; all others with the first experiment of their group in the same settings.
     """
     rows = []
     for series in _regular(everything):
@@ -309,7 +309,7 @@ def _reference(series: Series, everything: Sequence[Series]) -> Series | None:
 
 
 def novelty_table(everything: Sequence[Series]) -> pd.DataFrame:
-    """Makes the success by what the scenario's training tasks ask for."""
+    """Tabulates the success by what the scenario's training tasks ask for."""
     rows = []
     for series in _regular(everything):
         found = pd.concat([novelties(record) for record in series.last], ignore_index=True)
@@ -324,7 +324,7 @@ def novelty_table(everything: Sequence[Series]) -> pd.DataFrame:
 
 
 def paraphrases_table(everything: Sequence[Series]) -> pd.DataFrame:
-    """Makes the success with people's words beside that with templates, in the same scenes."""
+    """Tabulates the success with paraphrases and with templates, in the same scenes."""
     rows = []
     for series in _regular(everything):
         others = [
@@ -353,7 +353,7 @@ def paraphrases_table(everything: Sequence[Series]) -> pd.DataFrame:
 
 
 def counterfactuals_table(everything: Sequence[Series]) -> pd.DataFrame:
-    """Makes which input behavior follows where demonstration and instruction ask for different things."""
+    """Tabulates which input the policy follows where demonstration and instruction disagree."""
     rows = []
     for series in everything:
         if not series.is_counterfactual:
@@ -375,7 +375,7 @@ def counterfactuals_table(everything: Sequence[Series]) -> pd.DataFrame:
 
 
 def paper_table(everything: Sequence[Series]) -> pd.DataFrame:
-    """Makes the success by the paper's protocol beside the paper's."""
+    """Tabulates the success by the paper's protocol, next to the paper's."""
     rows = []
     for series in _regular(everything):
         published = paper_result(series.experiment)
@@ -397,7 +397,7 @@ def paper_table(everything: Sequence[Series]) -> pd.DataFrame:
 
 
 def curves_table(everything: Sequence[Series]) -> pd.DataFrame:
-    """Makes the success of every evaluation over the steps of the training, where there are several steps."""
+    """Tabulates the success of every evaluation over training steps, where there are several."""
     return pd.DataFrame(
         [
             {

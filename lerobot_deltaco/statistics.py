@@ -1,8 +1,8 @@
-"""Statistics of evaluations: success with intervals, paired differences, and which input behavior follows.
+"""Statistics of evaluations: success with intervals, paired differences, and counterfactuals.
 
-Rates are fractions, 0..1. The episodes of a task are alike, and trainings with different seeds see the same
-scenes: neither are independent trials. Therefore intervals come from a bootstrap over tasks, in which a task
-is drawn with all its episodes of all training seeds.
+Rates are fractions, 0..1. The episodes of a task are alike, and training seeds share the evaluation scenes,
+so neither are independent trials. Therefore, intervals come from a bootstrap over tasks, in which a task is
+drawn with all its episodes of all training seeds.
 """
 
 from __future__ import annotations
@@ -108,11 +108,11 @@ class PaperRate(NamedTuple):
 def paper_rate(rates: ArrayLike) -> PaperRate:
     """Computes the paper's success rate: the mean over the ten evaluation sets with the highest means.
 
-    The sets are chosen by the episodes that are then averaged, which flatters. The standard deviation is the
-    population's: the paper does not say which one it reports.
+    The sets are chosen by the episodes that are then averaged, so the rate is biased upward. The standard
+    deviation is the population's: the paper does not say which one it reports.
 
     Args:
-        rates: (sets, seeds), sets in the order of their steps. Of equally good sets, the earlier ones count.
+        rates: (sets, seeds), sets in the order of their steps. Ties go to the earlier sets.
     """
     rates = np.asarray(rates, dtype=np.float64)
     means = rates.mean(axis=1)
@@ -164,7 +164,7 @@ _TASK_OF_INSTRUCTION = {task.instruction: task for task in (*TASKS, *COLOR_SHAPE
 
 
 def followed(records: Iterable[EvaluationRecord]) -> pd.DataFrame:
-    """Counts which input behavior followed where demonstration and instruction ask for different things.
+    """Counts which input the policy followed where demonstration and instruction disagree.
 
     A task asks for those objects (containers) of the scene that it describes. An episode counts if both
     inputs ask for some of them but not for all, and for none in common. The object is the one that the

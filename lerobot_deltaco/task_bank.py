@@ -1,7 +1,7 @@
 """The task bank of a checkpoint: `tasks.safetensors` beside the weights.
 
-It holds embeddings of instructions, so that no language encoder is needed for those, and the demonstrations
-for evaluation, so that their dataset is not needed:
+It holds embeddings of instructions, so that these need no language encoder, and the demonstrations for
+evaluation, so that these need no dataset:
 
     embeddings     (instructions, embedding) float32, unit vectors
     frames         (demonstrations, frames, 3, H, W) uint8
@@ -69,7 +69,7 @@ def write_task_bank(
 
 
 def find_task_bank(pretrained: str | Path, **options: Any) -> Path:
-    """Returns the path of a checkpoint's task bank, which is downloaded if the checkpoint is on the Hub.
+    """Returns the path of a checkpoint's task bank, downloading it if the checkpoint is on the Hub.
 
     Args:
         pretrained: Folder of the checkpoint, or its repository's id on the Hub.
@@ -96,7 +96,7 @@ def read_task_bank(
         The demonstrations; None if there are none.
 
     Raises:
-        TaskBankError: The file is missing, is no task bank, or belongs to another policy.
+        TaskBankError: The file is missing, is not a task bank, or belongs to another policy.
     """
     try:
         with safe_open(path, framework="pt") as file:

@@ -20,15 +20,15 @@ class TaskBatchSampler:
 
     Args:
         tasks: The task of each frame, (frames,) int64. Frames are numbered as in the dataset.
-        batch_size: Samples of a batch, a multiple of `tasks_per_batch`.
-        tasks_per_batch: k, distinct tasks of a batch.
+        batch_size: Number of samples in a batch, a multiple of `tasks_per_batch`.
+        tasks_per_batch: Number of distinct tasks in a batch, k.
         upsampled: Tasks that get a fraction of each batch; none by default.
         upsampled_fraction: That fraction of `tasks_per_batch`, which must be a whole number of tasks.
         seed: Seed of the order.
         use: Whether each frame may be drawn, (frames,) bool; all by default.
 
     Raises:
-        ValueError: The numbers do not fit; the message says what does.
+        ValueError: The numbers do not fit together; the message says what is valid.
     """
 
     def __init__(
@@ -79,11 +79,11 @@ class TaskBatchSampler:
         return groups
 
     def __len__(self) -> int:
-        """Samples of an epoch: whole batches."""
+        """Number of samples in an epoch of whole batches."""
         return self._n_batches * self.batch_size
 
     def __iter__(self) -> Iterator[int]:
-        """Iterates over the frames of one epoch, or of what is left of it after `load_state_dict`."""
+        """Iterates over the frames of one epoch, or over the rest of it after `load_state_dict`."""
         epoch, start = self._epoch, self._start_index
         self._epoch, self._start_index = epoch + 1, 0
         return iter(self.order(epoch)[start:].tolist())
@@ -117,13 +117,13 @@ class TaskBatchSampler:
 def _rounds(
     members: NDArray[np.int64], per_batch: int, n_batches: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Draws distinct members for each batch, (batches, per_batch): all in turn, in ever new orders."""
+    """Draws distinct members for each batch, (batches, per_batch): all in turn, reshuffled each round."""
     n_chosen = n_batches * per_batch
     turns = [rng.permutation(members)]
     n_drawn = len(members)
     while n_drawn < n_chosen:
         turn = rng.permutation(members)
-        # The batch that the last turn began is not to hold a member twice.
+        # The batch that the last round began must not hold a member twice.
         n_begun = n_drawn % per_batch
         begun = turns[-1][len(members) - n_begun :]
         first = np.flatnonzero(~np.isin(turn, begun))[: per_batch - n_begun]

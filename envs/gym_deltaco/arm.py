@@ -135,9 +135,9 @@ class Arm:
 
 
 def _ramp(time: float) -> float:
-    """Returns the fraction of a motion covered after a fraction of its time.
+    """Returns the fraction of a motion covered after a fraction of its duration.
 
-    The motion starts and ends at rest, with the least acceleration, so that a held object does not slip.
+    The motion starts and ends at rest, with minimal acceleration, so that a held object does not slip.
     """
     return 2 * time**2 if time < 0.5 else 1 - 2 * (1 - time) ** 2
 

@@ -48,7 +48,7 @@ def chance_levels(
         task_ids: Indices of the tasks.
         scene: Settings of the scenes.
         n_trials: Number of scenes of each task, at least 1.
-        first_trial: Number of the first trial; scenes are those of evaluations whose seed it is.
+        first_trial: Number of the first trial; the scenes equal those of an evaluation with this seed.
 
     Returns:
         Expected success rate by name of the rule, 0..1. Objects with the same score are equally likely.

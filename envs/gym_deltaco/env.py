@@ -190,8 +190,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             The first observation and info.
 
         Raises:
-            ValueError: The task does not exist, the objects or instructions have nothing for it, or `options`
-                is not a dictionary. The current scene stays.
+            ValueError: The task does not exist, no object or instruction fits it, or `options` is not a
+                dictionary. The current scene is kept.
             gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """
         self._check_open()
@@ -216,7 +216,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._grasped_object = -1
         self._n_steps = 0
         if self.instructions is not None:
-            # A generator of its own keeps scenes the same with and without instructions.
+            # A separate generator keeps scenes the same with and without instructions.
             (rng,) = self.np_random.spawn(1)
             sentences = self.instructions[task.index]
             self._instruction = sentences[int(rng.integers(len(sentences)))]
@@ -233,8 +233,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             the last step of the episode on), info.
 
         Raises:
-            ValueError: The action has another shape, or numbers that are not real or not finite. The scene
-                stays as it is.
+            ValueError: The action has the wrong shape, or numbers that are not real or not finite. The scene
+                is unchanged.
             gymnasium.error.ResetNeeded: The environment was not reset.
             gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """

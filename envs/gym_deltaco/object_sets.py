@@ -22,7 +22,7 @@ OBJECT_SETS = MappingProxyType(
     }
 )
 MAX_OBJECTS = 10_000
-# Default objects of task sets whose scenes are not drawn from all objects
+# Default objects of task sets that do not draw their scenes from all objects
 _OBJECTS_OF_TASK_SETS = MappingProxyType({"scenario_a_clean_train": "scenario_a_train"})
 
 

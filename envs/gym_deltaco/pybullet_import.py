@@ -14,7 +14,7 @@ from typing import Any
 
 @contextmanager
 def _discarded_stderr() -> Iterator[None]:
-    """Discards what compiled code prints to the standard error."""
+    """Discards output of compiled code to the standard error."""
     saved = os.dup(2)
     null = os.open(os.devnull, os.O_WRONLY)
     try:

@@ -75,7 +75,7 @@ def _pick[T](rng: np.random.Generator, options: Sequence[T]) -> T:
 
 
 def _round_outlines(rng: np.random.Generator, is_tall: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Draws a round outline, and that of its parts; no hexagon if it is tall, since it would fall over."""
+    """Draws a round outline, and one for its parts; no hexagon if it is tall, since it would fall over."""
     fluted = polygon(16, (1.0, 0.92))
     outlines = [(CIRCLE, OCTAGON), (CIRCLE, OCTAGON), (OCTAGON, OCTAGON), (fluted, OCTAGON)]
     return _pick(rng, outlines if is_tall else [*outlines, (_HEXAGON, _HEXAGON)])

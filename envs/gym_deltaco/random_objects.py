@@ -1,8 +1,8 @@
 """Random objects: any number of solids of the ten shapes and eight colors.
 
-An object is a function of its index. Its shape selects a family of profiles, from which its form is drawn.
-Its color selects a range of paints, with bands, stripes or spots of other shades or of a second color. No
-random object has both the shape and the color of a test object of scenario A. Lengths are in millimeters.
+An object depends only on its index. Its shape selects a family of profiles, from which its form is drawn. Its
+color selects a range of paints, with bands, stripes or spots of other shades or of a second color. No random
+object has both the shape and the color of a test object of scenario A. Lengths are in millimeters.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _cut_at_waists(rows: Sequence[Row]) -> list[Sequence[Row]]:
 
 
 def _convex(rows: Sequence[Row]) -> list[Row]:
-    """Removes the rings that lie within the convex hull of their neighbors."""
+    """Removes rings that lie within the convex hull of their neighbors."""
     kept: list[Row] = []
     for row in rows:
         while len(kept) > 1 and not _stands_out(kept[-2], kept[-1], row):
@@ -220,13 +220,13 @@ def _palette(color: str, rng: np.random.Generator) -> tuple[Color, Color, Color]
 
 
 def _snapped(rgb: Sequence[float]) -> Color:
-    """Returns the nearest color of those that the simulation renders: 16 levels of each channel."""
+    """Returns the nearest color that the simulation renders: it has 16 levels of each channel."""
     red, green, blue = (round(15 * channel) / 15 for channel in rgb)
     return red, green, blue
 
 
 def _refined(rows: Sequence[Row], n_rows: int) -> list[Row]:
-    """Adds rings to a profile where they are farthest apart, up to a number of rings."""
+    """Adds rings to a profile where they are farthest apart, until it has `n_rows`."""
     refined = list(rows)
     while len(refined) < n_rows:
         gaps = [ring_height(above) - ring_height(below) for below, above in pairwise(refined)]

@@ -1,4 +1,4 @@
-"""Settings with which scenes are drawn and observed, as one value."""
+"""Settings for drawing and observing scenes, as one value."""
 
 from __future__ import annotations
 

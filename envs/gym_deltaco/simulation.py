@@ -2,7 +2,7 @@
 
 Bodies are made from arrays instead of asset files: triangle meshes with one color per face are rendered,
 boxes and convex hulls collide. A scene is rebuilt for every episode, because a rebuilt world is reproducible
-to the last bit, and one that is restored from a saved state is not.
+to the last bit, whereas one restored from a saved state is not.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _NO_SHAPE = -1
 _ANGULAR_DAMPING = 0.9  # 1/s, of free bodies; without it, round ones rock on their rims for seconds
 _BASE = -1
 _CONTACT_NORMAL = 7  # field of a contact point
-# Depths that differ by less may be equal, up to rounding. Depth is 0 at the near plane and 1 at the far
-# plane; in the scenes, the tolerance is a few micrometers.
+# Depths that differ by less may be equal up to rounding. Depth is 0 at the near plane and 1 at the far plane;
+# in the scenes, the tolerance is a few micrometers.
 _DEPTH_TOLERANCE = 2e-6
 _MAX_BACKGROUNDS = 64
 
@@ -119,7 +119,7 @@ def camera_matrices(camera: Camera) -> tuple[Sequence[float], Sequence[float]]:
 
 
 class Simulation:
-    """A world of PyBullet, without a window.
+    """A PyBullet world without a window.
 
     The constructor connects a client, which takes about 48 MB until `close`.
     """

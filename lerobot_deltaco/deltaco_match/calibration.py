@@ -2,7 +2,7 @@
 
 Where the gripper closed around an object, the image has changed at the end of the episode: the object is
 gone. The map from states to locations sends the states at the grasps to the locations of these changes. So no
-calibrated camera is needed, only one that does not move.
+calibrated camera is needed, only a fixed one.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ class StateToImage(nn.Module):
         changes = _changes(first, last)  # (episodes, H, W)
         x = (states - mean) * self.scale.to(mean)
         centers, members = _clusters(x)
-        # What changes in the episodes of a cluster, and not in the others, is what its states have in common.
+        # A change in the episodes of a cluster, but not in others, belongs to the states of the cluster.
         average = torch.stack([changes[members == k].mean(dim=0) for k in range(len(centers))])
         peaks = _peaks(_blurred(average - average.mean(dim=0)))
         linear = _robust_fit(_linear(centers), peaks)
         locations = _linear(x) @ linear
-        # Each episode's own change near the expected location: that is many more points.
+        # Refine with each episode's own change near the expected location, which gives many more points.
         smooth = _blurred(changes)
         weights = F.pad(linear, (0, 0, 0, len(self.weights) - len(linear)))
         for _ in range(_ROUNDS):
@@ -88,7 +88,7 @@ def _changes(first: Tensor, last: Tensor) -> Tensor:
     changes = torch.stack(
         [(b.float() - a.float()).abs().mean(dim=0) / 255 for a, b in zip(first, last, strict=True)]
     )
-    # What changes in every episode is the robot itself.
+    # The robot itself changes in every episode.
     return (changes - changes.mean(dim=0)) / (changes.std(dim=0) + 0.02)
 
 
@@ -132,8 +132,8 @@ def _peaks(maps: Tensor) -> Tensor:
 def _peaks_near(maps: Tensor, locations: Tensor) -> Tensor:
     """Returns the locations of the maxima within `_REACH` of locations (n, 2).
 
-    For the few locations farther than that outside of the image, it is the top left corner. The fit counts it
-    little, as an outlier.
+    For the few locations farther outside the image, it is the top left corner, which the fit downweights as
+    an outlier.
     """
     grid = _grid(maps)
     peaks = []
@@ -144,7 +144,7 @@ def _peaks_near(maps: Tensor, locations: Tensor) -> Tensor:
 
 
 def _robust_fit(features: Tensor, targets: Tensor) -> Tensor:
-    """Returns the weights (features, targets) of a linear regression in which outliers count little."""
+    """Returns the weights (features, targets) of a linear regression that is robust to outliers."""
     weights = torch.ones(len(features), device=features.device)
     ridge = _RIDGE * len(features) * torch.eye(features.shape[1], device=features.device)
     ridge[0, 0] = 0

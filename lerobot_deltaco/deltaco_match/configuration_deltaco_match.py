@@ -1,4 +1,4 @@
-"""`--policy.type=deltaco_match`: its defaults are the recipe of the project's own checkpoint."""
+"""`--policy.type=deltaco_match`; the defaults are the recipe of the shipped policy."""
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
@@ -12,7 +12,7 @@ from lerobot_deltaco.base_config import TaskConditionedConfig, check_pattern
 
 
 class TaskInputs(NamedTuple):
-    """What tells a policy what to pick and where to place it."""
+    """Inputs that specify what to pick and where to place it."""
 
     picks_by_demonstration: bool
     places_by_demonstration: bool
@@ -34,7 +34,7 @@ TASK_INPUTS = MappingProxyType(
 class DeltacoMatchConfig(TaskConditionedConfig):
     """A policy that finds what a demonstration moved, and places it where an instruction says.
 
-    It needs a camera that does not move, a robot state, and a gripper among the action's dimensions.
+    It needs a fixed camera, a robot state, and a gripper among the action's dimensions.
 
     Args:
         inputs: What specifies a task: both (a demonstration and an instruction), demonstration, instruction,
@@ -42,17 +42,17 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         p_drop_demonstration: With both inputs: probability that a training sample has no demonstration, so
             that the policy can do without.
         p_drop_instruction: The same for the instruction; no sample is without both.
-        feature_matching: Whether what a demonstration moved, and what the instruction names, is also looked
-            for by the features of EfficientNet-Lite0, which was trained on ImageNet. Training begins with a
-            few minutes of fitting, and needs the extra `offline`; afterwards, the checkpoint is enough.
+        feature_matching: Whether to also search for the demonstrated and the named object with features of
+            EfficientNet-Lite0, which was trained on ImageNet. Training begins with a few minutes of fitting,
+            and needs the extra `offline`; afterwards, the checkpoint is enough.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation.
         grasp_height_bias: Height offset that is added to the estimate when the policy acts, in standard
-            deviations over the training episodes; greater is further along the approach. A gripper that
-            closes too early misses flat objects; on a robot, one that goes too far may touch the table.
-        p_hue_augmentation: Probability that one random change of hue, saturation and brightness is applied to
-            the observation and the demonstration of a training sample alike.
-        colorless_tasks: Regular expression for the instructions in which color does not count; the
-            demonstrations of these tasks change their colors in another way than the scene.
+            deviations over the training episodes; larger is farther along the approach. A gripper that closes
+            too early misses flat objects; on a robot, one that goes too far may touch the table.
+        p_hue_augmentation: Probability that a training sample's observation and demonstration undergo the
+            same random change of hue, saturation and brightness.
+        colorless_tasks: Regular expression for the instructions in which color does not count; in these
+            tasks, the demonstration's colors change differently from the scene's.
         frames_after_release: Number of frames after the gripper's last opening in an episode that
             `deltaco train` trains on; None for all.
     """
@@ -71,7 +71,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.2
     scheduler_warmup_steps: int = 200
-    # Filled in by training: the words that feature matching knows.
+    # Filled in by training: the vocabulary of feature matching.
     known_words: list[str] = field(default_factory=list)
 
     def check(self) -> None:
@@ -119,7 +119,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
 
     @property
     def task_inputs(self) -> TaskInputs:
-        """What tells the policy what to pick and where to place it."""
+        """Inputs that specify what to pick and where to place it."""
         return TASK_INPUTS[self.inputs]
 
     @property

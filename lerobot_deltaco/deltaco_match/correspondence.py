@@ -11,7 +11,7 @@ r"""Correspondence: finds in a scene what a demonstration moved, and where an in
                           pick map: where that object is     place map: where it shall go
 
 A task embedding that is pulled towards a sentence cannot say what a novel object looks like. A descriptor
-can: it is made of the same features that the scene has, so what was demonstrated is looked for instead of
+can: it consists of the same features as the scene, so the demonstrated object is searched for instead of
 named.
 """
 
@@ -41,7 +41,7 @@ _PEAK_RADIUS = 1  # of the cells around the maximum whose mean is a location
 
 
 class Description(NamedTuple):
-    """What demonstrations say of their tasks.
+    """Descriptors of what demonstrations show.
 
     Attributes:
         moved: Descriptor of what was moved, (batch, DESCRIPTOR_DIM).
@@ -56,7 +56,7 @@ class Description(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Which inputs are given, for a network that takes either: at least one of both.
+    """Which inputs are given, for a network that takes either: at least one of the two.
 
     Attributes:
         demonstration: Whether there is a demonstration, (batch,) bool.
@@ -126,7 +126,7 @@ class CorrespondenceNetwork(nn.Module):
         return Description(moved, torch.cat([container, location], dim=1), weights)
 
     def no_description(self, n_tasks: int, device: torch.device) -> Description:
-        """Returns what stands for the descriptions of tasks without demonstrations: zeros."""
+        """Returns zeros in place of descriptions, for tasks without demonstrations."""
         zeros = torch.zeros(n_tasks, DESCRIPTOR_DIM + 2, device=device)
         return Description(zeros[:, :-2], zeros, zeros[:, :2, None, None])
 
@@ -199,7 +199,7 @@ class PlaceNetwork(nn.Module):
     """Predicts where in a scene an object is to go: convolutions with coordinates and FiLM.
 
     Args:
-        condition_dim: Size of what says where.
+        condition_dim: Size of the input that specifies the place.
         channels: Number of channels.
     """
 

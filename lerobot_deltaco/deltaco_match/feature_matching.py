@@ -1,8 +1,8 @@
-r"""Feature matching: finds what a task asks for by features learned on ImageNet.
+r"""Feature matching: finds the object that a task asks for with features learned on ImageNet.
 
 A network that learns from a few hundred objects compares them by color: among objects of one color, it picks
 nearly at random. The features of a network that was trained on photographs tell shapes apart, too. They are
-frozen; small networks behind them learn what to compare things by. `fit` trains these before the policy.
+frozen; small networks on top of them learn which features to compare. `fit` trains these before the policy.
 
     demonstration's first image     scene                     instruction
             |                         |                            |
@@ -38,7 +38,7 @@ _COARSE_BLOCKS, _COARSE_STRIDE, _COARSE_CHANNELS = 7, 16, 80
 _DESCRIPTOR_DIM, _HIDDEN_DIM = 64, 128
 _POOLING_STD = 1.2  # of the cells around a grasp that describe what was grasped
 _MIN_STD = 1e-3
-# Cells of a side of the maps. The encoder's work and the memory of a fit grow with its square.
+# Cells per side of the maps. The encoder's work and the memory of a fit grow with its square.
 _MAX_CELLS = 24
 _WORD_WEIGHT = 3.0  # of the words' log probabilities; chosen on validation tasks
 # Of the fit; chosen on validation tasks.
@@ -83,7 +83,7 @@ class FeatureMaps(NamedTuple):
 class FeatureMatching(nn.Module):
     """Finds what a demonstration moved, or what words name, in scenes.
 
-    No gradient reaches it in the training of a policy.
+    It receives no gradient while a policy is trained.
 
     Args:
         n_words: Size of the vocabulary, 0 for a policy without instructions.
@@ -102,7 +102,7 @@ class FeatureMatching(nn.Module):
         self.by_demonstration = ComparedFeatures()
         self.by_words = ComparedFeatures() if n_words else None
         if n_words:
-            # With a bias, which stands for no word.
+            # With a bias, which belongs to no word.
             self.words = nn.Parameter(torch.zeros(n_words + 1, _DESCRIPTOR_DIM))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
         self.register_buffer("image_mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
@@ -120,10 +120,10 @@ class FeatureMatching(nn.Module):
         locations: Tensor | None,
         words: BagOfWords | None,
     ) -> Tensor:
-        """Returns the product of a pick map and what is found by the demonstrations and by the words.
+        """Multiplies a pick map by the maps found from the demonstrations and from the words.
 
-        Words that are not in the vocabulary say nothing. Where a demonstration shows what is meant, an
-        instruction with such words does not count, since the words that remain may fit other things as well.
+        Words outside the vocabulary are ignored. With a demonstration, an instruction with such words is
+        ignored altogether, since its remaining words may fit other objects as well.
 
         Args:
             pick: Pick map of the correspondence network, as logits (batch, h, w).
@@ -164,8 +164,9 @@ class FeatureMatching(nn.Module):
     ) -> None:
         """Fits the compared features and the words to episodes.
 
-        What one episode of a task grasps is to be found in the scene of another, and by some of the words of
-        its task: some are left out at random in each step, so that none is needed.
+        The networks learn to find the object grasped in one episode of a task in the scene of another, and
+        from the words of the task. Some words are left out at random in each step, so that none is
+        indispensable.
 
         Args:
             images: First images of episodes, (episodes, 3, H, W) uint8.
@@ -220,7 +221,7 @@ class FeatureMatching(nn.Module):
         self.fitted.fill_(True)
 
     def _encode(self, images: Tensor) -> FeatureMaps:
-        """Returns maps of images (batch, 3, H, W) in 0..1, which the encoder sees scaled to its strides."""
+        """Returns maps of images (batch, 3, H, W) in 0..1, after scaling them to the encoder's strides."""
         size = [min(_MAX_CELLS, max(1, side // 4)) for side in images.shape[-2:]]
 
         def scaled(stride: int) -> Tensor:
@@ -301,9 +302,9 @@ class FeatureMatching(nn.Module):
 
 
 class ComparedFeatures(nn.Module):
-    """Features that objects are compared by: a linear layer, and a small network of what is around.
+    """Features for comparing objects: a linear layer, and a small network that sees the surroundings.
 
-    With the network, words find shapes. What a demonstration shows is found as well without it.
+    The network lets words find shapes. Finding demonstrated objects works as well without it.
     """
 
     def __init__(self) -> None:

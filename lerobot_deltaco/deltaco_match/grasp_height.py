@@ -3,7 +3,7 @@
 If the demonstration moved the same object, its height is the right one. If it moved another object of that
 color or shape, the appearance of the object in the scene is a better guide. So two estimates are averaged,
 weighted by the inverse of their variances. The variance of the estimate from the demonstration is learned,
-from the kind of instruction and from how similar both objects look. The variance of the other is not:
+from the kind of instruction and the similarity of the two objects. The variance of the other is fixed:
 training objects have hardly any error to learn it from.
 """
 
@@ -99,7 +99,7 @@ class GraspHeightEstimator(nn.Module):
         return weight * demonstrated.nan_to_num() + (1 - weight) * by_appearance
 
     def _log_std(self, here: Tensor, descriptors: Tensor, condition: Tensor | None) -> Tensor:
-        """Returns the log standard deviation of the demonstrations' error, (batch,).
+        """Returns the log standard deviation of the error of the demonstrations' estimate, (batch,).
 
         Its loss does not train the features, which have to tell objects apart.
         """

@@ -1,4 +1,4 @@
-"""Hue augmentation: one random change of color for all images of a sample makes new objects of known ones."""
+"""Hue augmentation: turns known objects into new ones by one random color change per sample."""
 
 from __future__ import annotations
 

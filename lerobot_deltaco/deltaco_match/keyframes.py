@@ -1,7 +1,8 @@
 """Keyframes of an episode: where the gripper closes around an object, and where it opens again.
 
-Each episode is judged by its own course: a gripper may rest open or closed, and open by different amounts. A
-grasp is a valley of the course between two openings; a rest with a closed gripper at either end is none.
+The gripper's commands over an episode are its course. Each episode is judged on its own, since a gripper may
+rest open or closed, and open by different amounts. A grasp is a valley of the course between two openings; a
+gripper that rests closed at either end is not a grasp.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def find_keyframes(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, i
     for (first, _), keyframes in zip(spans, grasp_frames(gripper, spans), strict=True):
         found.append(keyframes is not None)
         grasp, release = (first, first) if keyframes is None else keyframes
-        # One step later, the command to close has been carried out.
+        # The command to close takes effect one step later.
         frames.append((min(grasp + 1, release), release, max(grasp - _APPROACH_FRAMES, first)))
     if not all(found):
         logger.warning(
@@ -113,7 +114,7 @@ def _last_valley(course: NDArray[np.float64]) -> tuple[int, int] | None:
     else:
         return None
     before = _opening(course[frame::-1], level + depth / 2)
-    # The opening that ends the valley may be another one than the last.
+    # The opening that ends the valley need not be the last one.
     rise = bottom + int(np.argmax(course[bottom:] - level >= depth))
     after = _opening(course[rise:], level + depth / 2)
     grasp = frame + int(np.argmax(course[frame:] <= level + _CLOSED * (before - level)))
@@ -128,7 +129,7 @@ def _opening(course: NDArray[np.float64], least: float) -> float:
 
 
 def warn_if_inverted(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> None:
-    """Warns if more episodes have a grasp when low and high are exchanged.
+    """Warns if more episodes have a grasp when low and high are swapped.
 
     Args:
         gripper: Commands to the gripper in all frames, greater for more open, (frames,).
@@ -149,7 +150,7 @@ def warn_if_inverted(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> None:
 def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Tensor:
     """Returns which dimensions of the robot's state tell how far the gripper is open, (state,) bool.
 
-    They are those that follow the gripper's commands, a step later.
+    These are the dimensions that follow the gripper's commands one step later.
 
     Args:
         states: Robot states of all frames, (frames, state).

@@ -12,9 +12,9 @@ Describing and finding happen once, at the start of an episode (`_find`): the de
 by correspondence and by feature matching, and the instruction where to place it. The policy network is given
 the two locations, and how far the robot's state is from where it would be at each of them (`_act`).
 
-In training, the network is given the locations of each sample's own episode, with noise: the robot's states
-when the gripper closed and opened tell them. The correspondence network learns to find them by the
-demonstrations of other episodes. So neither waits for the other.
+In training, the network is given the locations of each sample's own episode, with noise; they follow from the
+robot's states when the gripper closed and opened. The correspondence network learns to find them from
+demonstrations in other episodes. So neither has to wait for the other.
 """
 
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
@@ -71,8 +71,8 @@ class Found(NamedTuple):
         maps: Pick and place maps over the scenes, as logits (batch, 2, h, w).
         attention: Maps of what the (first) demonstration moved and where it was put, (batch, 2, h, w); None
             without demonstrations.
-        by_demonstration: Whether the pick and the place location were found by the demonstration. Attention
-            on what was not says nothing.
+        by_demonstration: Whether the pick and the place location were found by the demonstration. Otherwise,
+            the attention is meaningless.
     """
 
     locations: Tensor
@@ -136,7 +136,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self.model = PolicyNetwork(
             n_cameras=len(config.image_features),
             film_dim=0,
-            # The state, and its distance from the state at each location.
+            # The state, and its offset from the state at each location.
             concat_dim=config.state_dim * (1 + N_LOCATIONS),
             action_dim=config.action_feature.shape[0] - 1,
             has_gripper=True,
@@ -150,7 +150,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self.grasp_height = GraspHeightEstimator(DESCRIPTOR_DIM, condition_dim, config.uses_demonstrations)
         self.feature_matching: FeatureMatching | None = None
         if config.feature_matching and config.uses_demonstrations:
-            # All other weights are the same with and without it.
+            # Forked so that all other weights are the same with and without it.
             with torch.random.fork_rng(devices=[]):
                 self.feature_matching = FeatureMatching(len(config.known_words))
         self.training_locations: TrainingLocations | None = None
@@ -195,7 +195,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         images, rows = self._images(batch), self.training_bank.episode_rows(batch["episode_index"])
         instructions = self._draw_instructions(tasks, generator)
         changes = random_color_changes(len(rows), config.p_hue_augmentation, generator)
-        # The locations are learned to be found on some samples, evenly spaced in the batch.
+        # Some samples, evenly spaced in the batch, train the finding of locations.
         n_some = max(1, round(_LOCATED_FRACTION * len(rows)))
         some = torch.arange(n_some) * len(rows) // n_some
         finding = self._finding_losses(
@@ -250,7 +250,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         found = (rows >= 0) & known.found[rows]
         attention_losses = torch.zeros(len(rows), device=device)
         if config.uses_demonstrations:
-            # By an instruction alone, colors are what they are.
+            # With only an instruction, colors keep their meaning.
             scenes = change_colors(plain, changes)
             if given is not None:
                 scenes = torch.where(given.demonstration[:, None, None, None], scenes, plain)
@@ -264,7 +264,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 changes = torch.where(torch.tensor(colorless)[:, None, None], apart, changes)
             description = self.correspondence.describe(change_colors(ends, changes))
             demonstrated = known.heights[others]
-            # Without this loss, it takes thousands of steps to find what was moved.
+            # Without this loss, learning to find what was moved takes thousands of steps.
             log_attention = description.attention.clamp_min(_MIN_ATTENTION).log()
             attention_losses = location_loss(log_attention, their_locations).sum(dim=1)
         if given is not None:
@@ -286,7 +286,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         return torch.where(found[:, None], torch.cat(losses, dim=1), 0.0)
 
     def _validation_loss(self, batch: dict[str, Any], tasks: list[str]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Returns the imitation loss; locations of episodes that are held back are found in the image."""
+        """Returns the imitation loss; locations in held-out episodes are found in the image."""
         known = self.training_locations
         assert known is not None
         assert self.training_bank is not None
@@ -314,7 +314,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """Returns the mean action; of several mixture components, that of the likeliest one.
+        """Returns the mean action; with several mixture components, the mean of the most likely one.
 
         Args:
             batch: As in `forward`, without `action` and `episode_index`. `task` is not needed if `set_tasks`
@@ -357,11 +357,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         Args:
             scenes: First images of episodes, (batch, 3, H, W) in 0..1.
             instructions: Instruction of each sample; an empty string leaves it out.
-            demonstrations: Demonstrations of each sample, as many of each; an empty list leaves them out.
-                None for a policy that takes none.
+            demonstrations: Demonstrations of each sample, the same number for each; an empty list leaves them
+                out. None for a policy that takes none.
 
         Raises:
-            ValueError: Something is left out that the policy has not learned to do without.
+            ValueError: An input is left out that the policy has not learned to do without.
         """
         device, inputs = scenes.device, self.config.task_inputs
         stacked = self._stacked(demonstrations, device)
@@ -410,10 +410,10 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         )
 
     def _check_given(self, says: Tensor, stacked: StackedDemonstrations | None) -> None:
-        """Checks that nothing is left out that the policy has not learned to do without.
+        """Checks that the policy has learned to do without the inputs that are left out.
 
         Raises:
-            ValueError: Something is.
+            ValueError: It has not.
         """
         config = self.config
         missing = {
@@ -438,7 +438,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """Stacks the demonstrations of a batch; None if they are left out.
 
         Raises:
-            ValueError: The samples have different numbers of them.
+            ValueError: The samples have different numbers of demonstrations.
         """
         if not self.config.uses_demonstrations or demonstrations is None:
             return None
@@ -469,7 +469,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         return self.instructions(instructions, device)
 
     def _concatenated(self, batch: dict[str, Any], locations: Tensor, heights: Tensor) -> Tensor:
-        """Returns the robot's state, and its distance from the states at the locations, (batch, 3 state)."""
+        """Returns the robot's state, and its offsets from the states at the locations, (batch, 3 state)."""
         state = batch[OBS_STATE]
         offsets = self.robot_states(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
@@ -484,7 +484,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     # Training data
 
     def set_training_data(self, bank: DemonstrationBank, robot_data: RobotData | None) -> None:
-        """Finds the locations of the training episodes, and fits what depends on them alone.
+        """Finds the locations of the training episodes, and fits everything that depends only on them.
 
         Args:
             bank: The training episodes.
@@ -537,7 +537,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         return bank
 
     def _check_robot(self, data: RobotData) -> None:
-        """Checks that demonstrations are of the policy's robot.
+        """Checks that demonstrations are from the policy's robot.
 
         Raises:
             ValueError: Their states or actions have another size.

@@ -1,12 +1,12 @@
 """The robot's states at the pick and place locations, and the height offset of a grasp.
 
 A location in an image leaves one number open: how far along the camera's ray it is. At a grasp, that depends
-on the object, and a flat object of an unknown kind looks like a tall one that is farther away. A
-demonstration tells: by the robot's state when its gripper closed.
+on the object, and an unknown flat object looks like a tall one farther away. A demonstration resolves this,
+through the robot's state when its gripper closed.
 
-Grasp height offset: how far the state at a grasp is along the direction in which the robot approaches, beyond
-what the location predicts; in standard deviations over the training episodes, 0 on average. In the benchmark,
-greater is lower.
+Grasp height offset: how far the state at a grasp is along the robot's direction of approach, beyond what the
+location predicts; in standard deviations over the training episodes, 0 on average. In the benchmark, larger
+is lower.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class RobotStates(nn.Module):
             last: Last images of the episodes, (episodes, 3, H, W) uint8.
             scale: The policy's input is `scale * state + shift`, (state,).
             shift: Shift of each dimension, (state,).
-            is_arm: Dimensions of the state that do not tell how far the gripper is open, (state,) bool. At a
-                grasp, that depends on the object's width, and tells nothing about the height.
+            is_arm: Dimensions of the state other than the gripper's opening, (state,) bool. At a grasp, the
+                opening depends on the object's width, and says nothing about the height.
 
         Returns:
             The locations and heights of the episodes.
@@ -130,11 +130,11 @@ class RobotStates(nn.Module):
         return self._project(rest, features)
 
     def pick_locations(self, pick_states: Tensor) -> Tensor:
-        """Returns the locations of grasps, (grasps, 2), by the robot's states there."""
+        """Returns the locations of grasps, (grasps, 2), from the robot's states there."""
         return self.to_image(pick_states).clamp(-1, 1)
 
     def _project(self, rest: Tensor, features: Tensor) -> Tensor:
-        """Returns heights from what locations do not tell of states, (grasps, state)."""
+        """Returns heights from the residuals of states given locations, (grasps, state)."""
         direction = (features[:, :_N_HEIGHT_FEATURES] @ self.height_to_state) * self.rest_scale
         rest = (rest * self.rest_scale).clamp(-_MAX_REST, _MAX_REST)
         return (rest * direction).sum(dim=1) / direction.square().sum(dim=1).clamp_min(1e-12)
