@@ -130,7 +130,13 @@ def test_remarks_on_test_objects_are_true(dataset):
 
 def test_card_of_other_scenes_says_so(dataset, copy):
     usual = dataset_card(dataset)
-    for absent in ("--env.image_size", "--env.ambiguity", "--env.objects", "One draw decides", "identical"):
+    for absent in (
+        "--env.scene.image_size",
+        "--env.scene.ambiguity",
+        "--env.scene.objects",
+        "One draw decides",
+        "identical",
+    ):
         assert absent not in usual
     path = copy / "meta/deltaco.json"
     origin = json.loads(path.read_text())
@@ -146,8 +152,9 @@ def test_card_of_other_scenes_says_so(dataset, copy):
     assert "with probability 0.2** instead of the paper's 0.6" in card
     assert "One draw decides for both distractors" in card
     assert (
-        "--env.task=4 --env.image_size=64 --env.ambiguity=object --env.objects=scenario_a_train "
-        "--env.adversarial_probability=0.2 --env.adversarial_draw=scene --eval.n_episodes" in card
+        "--env.task=4 --env.scene.image_size=64 --env.scene.ambiguity=object "
+        "--env.scene.objects=scenario_a_train --env.scene.adversarial_probability=0.2 "
+        "--env.scene.adversarial_draw=scene --eval.n_episodes" in card
     )
 
 
