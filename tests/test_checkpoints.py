@@ -259,7 +259,7 @@ def test_card_names_options_demonstrations_and_training(dataset):
     card = card_of(dataset, train_config=train_config, **options)
     for row in ("| steps | 12345 |", "| batch\\_size | 24 |", "| temperature | 0.2 |"):
         assert row.replace("\\_", "_") in card.text.replace("\\_", "_")
-    assert 'the checkpoint has some of 3 tasks, such as "stack the cups"' in card.text
+    assert 'the checkpoint has some for 3 tasks, such as "stack the cups"' in card.text
     assert "| `observation.images.top` | (3, 20, 28) |" in card.text
     assert LANGUAGE_ENCODERS["paraphrase-MiniLM-L3-v2"].repo_id in card.text
     assert "@inproceedings{yu2023deltaco" in card.text

@@ -286,7 +286,7 @@ def test_mcil_takes_an_instruction_or_a_demonstration(acting, dataset):
         torch.testing.assert_close(policy.select_action(seen)[0], expected)
     assert fake_encoder.calls == []
     policy.set_tasks([""] * 3, [[]] * 3)
-    with pytest.raises(ValueError, match="'mcil' needs what is left out"):
+    with pytest.raises(ValueError, match="'mcil' is missing an input"):
         policy.select_action(seen)
 
 
@@ -305,9 +305,7 @@ def test_inputs_that_the_method_needs_cannot_be_left_out(
     policy, before = acting(method=method)
     shown = DemonstrationBank(torch.zeros(1, 2, 3, 16, 16, dtype=torch.uint8), [POUR], [0])[0]
     policy.set_tasks([instruction], [[shown] if has_demonstration else []])
-    with pytest.raises(
-        ValueError, match=f"{method!r} needs what is left out. Pass an instruction and a demo"
-    ):
+    with pytest.raises(ValueError, match=f"{method!r} is missing an input. Pass an instruction and a demo"):
         policy.select_action(before(observation(dataset, [POUR])))
 
 
@@ -327,5 +325,5 @@ def test_missing_tasks_are_errors(acting, make, dataset):
     ):
         without.eval().select_action(seen)
     without._meta, batch = None, before(batch_of(dataset, [0]))
-    with pytest.raises(ValueError, match="trained with its dataset's metadata"):
+    with pytest.raises(ValueError, match="needs the metadata of the dataset"):
         without.train()(batch)
