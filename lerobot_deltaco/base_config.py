@@ -31,11 +31,13 @@ class TaskConditionedConfig(PreTrainedConfig):
         language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'), all-MiniLM-L6-v2,
             all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `offline`
             includes the first two.
-        paraphrases: CSV file with sentences for the benchmark's tasks. In training, each sample's instruction
-            is drawn from the sentences of its task.
-        paraphrases_split: Split of the file's sentences for training: train, the sentences that are not held
-            out for any task; held_out, the last sentence of each task; or all.
-        paraphrases_with_templates: Whether to also train on the task string itself.
+        paraphrases: Sentences in people's words for the benchmark's tasks, from which instructions are drawn
+            in training: "grammar" for those that the benchmark makes from phrases, or a CSV file. With
+            "grammar", the tasks of other datasets keep their task strings.
+        paraphrases_split: Split of the sentences for training: train, the sentences that are not held out for
+            any task; held_out; or all.
+        p_paraphrase: Probability that a training sample's instruction is such a sentence; otherwise, it is
+            the task string.
         image_size: Height and width to which images are scaled, px.
         num_mixture_components: Number of Gaussians of the action's distribution. One averages two actions
             that are equally good; of several, the policy takes the likeliest.
@@ -68,7 +70,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     language_encoder: str = MINILM_L6
     paraphrases: str | None = None
     paraphrases_split: str = "train"
-    paraphrases_with_templates: bool = False
+    p_paraphrase: float = 1.0
     image_size: int = 48
     num_mixture_components: int = 1
     gripper: str = "auto"
@@ -125,6 +127,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
             raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
         self.check_ranges(
+            p_paraphrase=(0, 1),
             image_size=(16, 1024),
             num_mixture_components=(1, 1000),
             tasks_per_batch=(0, 1_000_000),

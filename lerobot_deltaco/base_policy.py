@@ -26,6 +26,7 @@ from lerobot_deltaco.demonstrations import (
     read_robot_data,
 )
 from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
+from lerobot_deltaco.normalization import StateLimits
 from lerobot_deltaco.task_bank import TASK_BANK, find_task_bank, read_task_bank, write_task_bank
 
 DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
@@ -67,6 +68,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features)
         config.validate_features()
+        self.state_limits = StateLimits(config.state_dim, dataset_stats)
         self.instructions = InstructionEmbeddings(config.language_encoder)
         self.paraphrases = _read_paraphrases(config)
         self.demonstrations: DemonstrationBank | None = self._read_evaluation_bank()
@@ -256,7 +258,12 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         super()._save_pretrained(save_directory, *args, **kwargs)
         if not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0:
             bank = self.demonstrations if self.config.uses_demonstrations else None
-            write_task_bank(save_directory / TASK_BANK, self.instructions, bank)
+            known = (
+                self.instructions
+                if self.paraphrases is None
+                else self.paraphrases.left_out_of(self.instructions)
+            )
+            write_task_bank(save_directory / TASK_BANK, known, bank)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:
@@ -346,11 +353,11 @@ def _read_paraphrases(config: TaskConditionedConfig) -> Paraphrases | None:
     if config.paraphrases is None:
         return None
     from gym_deltaco.tasks import get_task
-    from lerobot_deltaco.paraphrases import read_paraphrases
+    from lerobot_deltaco.paraphrases import GRAMMAR, read_paraphrases
 
     sentences = read_paraphrases(config.paraphrases, config.paraphrases_split)
     by_task = {get_task(task_id).instruction: own for task_id, own in sentences.items()}
-    return Paraphrases(by_task, config.paraphrases_with_templates)
+    return Paraphrases(by_task, config.p_paraphrase, is_complete=config.paraphrases != GRAMMAR)
 
 
 def _non_finite_weight(module: nn.Module) -> str | None:

@@ -366,7 +366,7 @@ def _start_worker(root: Path, plan: CollectionPlan) -> None:
     # An interrupt in the terminal reaches all processes, and ends this one immediately.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    _worker = PickPlaceEnv(scene=plan.scene), root, plan
+    _worker = PickPlaceEnv(plan.task_ids[0], plan.scene), root, plan
 
 
 def _exit_with_parent() -> None:

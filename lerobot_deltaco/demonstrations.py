@@ -40,6 +40,8 @@ class Demonstration:
             (frames, 3, H, W) uint8.
         pick_state: The robot's state when its gripper closed around the object, as in the dataset, (state,);
             None if it is not known.
+        first_image: The first frame at the camera's own resolution, (3, H', W') uint8; None if that is the
+            resolution of `frames`.
         features: Features of the frames from a frozen image encoder, (features,); None without one.
         episode: Index of the episode in its dataset; None if it is not from a dataset.
         target_object: Index of the object that it moves; None if it is not known.
@@ -48,6 +50,7 @@ class Demonstration:
     task: str
     frames: Tensor
     pick_state: Tensor | None = None
+    first_image: Tensor | None = None
     features: Tensor | None = None
     episode: int | None = None
     target_object: int | None = None
@@ -63,6 +66,8 @@ class DemonstrationBank(torch.nn.Module):
         tasks: Task string of each episode.
         episodes: Index of each episode in its dataset.
         target_objects: Index of the object that each episode moves; None if the dataset does not say.
+        first_images: First frames at the camera's own resolution, (episodes, 3, H', W') uint8; None if that
+            is the resolution of `frames`.
 
     Attributes:
         pick_states: The robot's state when its gripper closed, as in the dataset, (episodes, state) float32;
@@ -73,6 +78,7 @@ class DemonstrationBank(torch.nn.Module):
 
     frames: Tensor
     episodes: Tensor
+    first_images: Tensor | None
     pick_states: Tensor | None
     features: Tensor | None
     _order: Tensor
@@ -87,6 +93,7 @@ class DemonstrationBank(torch.nn.Module):
         tasks: Sequence[str],
         episodes: Sequence[int],
         target_objects: Sequence[int] | None = None,
+        first_images: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.tasks = list(tasks)
@@ -107,6 +114,7 @@ class DemonstrationBank(torch.nn.Module):
         for name, tensor in (
             ("frames", frames),
             ("episodes", torch.as_tensor(episodes)),
+            ("first_images", first_images),
             ("pick_states", None),
             ("features", None),
             ("_order", torch.tensor(order)),
@@ -129,6 +137,7 @@ class DemonstrationBank(torch.nn.Module):
             self.tasks[row],
             self.frames[row],
             pick_state,
+            None if self.first_images is None else self.first_images[row],
             None if self.features is None else self.features[row, 0].float(),
             int(self.episodes[row]),
             None if self.target_objects is None else self.target_objects[row],
@@ -308,16 +317,19 @@ def read_demonstrations(
             f"{repo_id} has the episodes 0 to {meta.total_episodes - 1}. Got {_shortened(episodes)}. "
             "Name others in `demo_episodes`."
         )
-    frames, tasks, target_objects = [], [], []
+    frames, tasks, target_objects, first_images = [], [], [], []
     for episode in tqdm(episodes, desc="Reading demonstrations", unit="episode", leave=False):
         row = meta.episodes[episode]
         indices = kept_frames(row["dataset_from_index"], row["dataset_to_index"] - 1, n_frames).tolist()
         items = [dataset[index] for index in indices]
         if TARGET_OBJECT in items[0]:
             target_objects.append(int(items[0][TARGET_OBJECT]))
-        frames.append(resize_images(torch.stack([item[camera] for item in items]), image_size))
+        images = as_uint8(torch.stack([item[camera] for item in items]))
+        frames.append(resize_images(images, image_size))
+        first_images.append(images[0])
         tasks.append(row["tasks"][0])
-    return DemonstrationBank(torch.stack(frames), tasks, episodes, target_objects or None)
+    native = torch.stack(first_images) if first_images[0].shape != frames[0][0].shape else None
+    return DemonstrationBank(torch.stack(frames), tasks, episodes, target_objects or None, native)
 
 
 def read_robot_data(dataset: LeRobotDataset, episodes: Sequence[int]) -> RobotData:
@@ -348,10 +360,14 @@ def kept_frames(first: int, last: int, n_frames: int) -> Tensor:
     return torch.linspace(first, last, n_kept, dtype=torch.float64).round().long()
 
 
+def as_uint8(images: Tensor) -> Tensor:
+    """Returns images, uint8 or in 0..1, as uint8."""
+    return images if images.dtype == torch.uint8 else (images * 255).round().clamp(0, 255).to(torch.uint8)
+
+
 def resize_images(images: Tensor, size: int) -> Tensor:
     """Resizes images (..., 3, H, W), uint8 or in 0..1, to (..., 3, size, size) uint8."""
-    if images.dtype != torch.uint8:
-        images = (images * 255).round().clamp(0, 255).to(torch.uint8)
+    images = as_uint8(images)
     if images.shape[-2:] == (size, size):
         return images
     flat = images.flatten(0, -4)

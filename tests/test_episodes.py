@@ -156,17 +156,28 @@ def test_paraphrases_are_drawn_evenly():
     counts = Counter(draws[0])
     assert set(counts) == set(SENTENCES[STACK])
     assert min(counts.values()) > 200
-    with_templates = Paraphrases(SENTENCES, with_templates=True)
-    assert set(with_templates.draw([STACK] * 500, torch.Generator())) == {STACK, *SENTENCES[STACK]}
-    with pytest.raises(ValueError, match="no sentence for the task 'sing'.*paraphrases_with_templates"):
+    counts = Counter(Paraphrases(SENTENCES, 0.4).draw([STACK] * 1000, torch.Generator()))
+    assert set(counts) == {STACK, *SENTENCES[STACK]}
+    assert counts[STACK] == pytest.approx(600, abs=60)
+    with pytest.raises(ValueError, match="no sentence for the task 'sing'"):
         paraphrases.draw(["sing"], torch.Generator())
+    assert Paraphrases(SENTENCES, is_complete=False).draw(["sing"], torch.Generator()) == ["sing"]
+
+
+def test_checkpoints_do_not_keep_paraphrases(make, dataset, tmp_path):
+    policy, before, _ = make()
+    policy.paraphrases = Paraphrases(SENTENCES, 0.5)
+    policy(before(batch_of(dataset, list(range(30)))))
+    assert not policy.instructions.rows.keys() <= SENTENCES.keys()
+    policy.save_pretrained(tmp_path)
+    assert type(policy).from_pretrained(tmp_path).instructions.rows.keys() <= SENTENCES.keys()
 
 
 def test_training_embeds_paraphrases_of_its_tasks_alone(make, dataset, tmp_path):
     file = tmp_path / "sentences.csv"
     file.write_text("task_id,instruction\n4,first\n4,second\n")
     policy, before, _ = make(paraphrases=str(file))
-    assert policy.paraphrases.sentences == {get_task(4).instruction: ["first"]}
+    assert policy.paraphrases.sentences == {get_task(4).instruction: ("first",)}
     policy.paraphrases = Paraphrases(SENTENCES)
     losses = []
     for _ in range(2):

@@ -13,8 +13,9 @@ from gym_deltaco import objects
 from gym_deltaco.object_sets import MAX_OBJECTS, OBJECT_SETS, find_label, find_model, select_objects
 from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.random_objects import FIRST_INDEX, random_label
+from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.solids import Loft, merged, polygon
-from gym_deltaco.tasks import COLOR_SHAPE_PAIRS, OBJECTS, SCENARIOS
+from gym_deltaco.tasks import COLOR_SHAPE_PAIRS, FOLDS, OBJECTS, SCENARIOS, TASK_SETS, get_task
 
 # Lengths in m
 GRIPPER_OPENING = 0.074
@@ -314,3 +315,24 @@ def test_merged_keeps_every_solid():
     both = merged([first, second])
     np.testing.assert_array_equal(both.triangles, np.concatenate([first.triangles, second.triangles]))
     assert both.vertices[:, 0].max() == pytest.approx(12)
+
+
+@pytest.mark.parametrize("fold", range(3))
+def test_folds_hold_out_their_objects(fold):
+    held_out, labels = set(FOLDS[fold]), select_objects(f"fold_{fold}:400")
+    pairs = {(OBJECTS[index].color, OBJECTS[index].shape) for index in held_out}
+    assert {label.index for label in labels if label.index < 24} == set(range(24)) - held_out
+    assert 340 < len(labels) < 392
+    assert not any((label.color, label.shape) in pairs for label in labels if label.index >= 24)
+    train, validation = (TASK_SETS[f"scenario_a_fold_{fold}_{kind}"] for kind in ("train", "validation"))
+    SceneConfig(objects=f"fold_{fold}:400").check_tasks(train)
+    SceneConfig(objects="scenario_a_train").check_tasks(validation)
+    assert set(train) < set(TASK_SETS["random_train"])
+    assert all(held_out & set(get_task(index).targets) for index in validation)
+    by_name = {get_task(index).row for index in validation if get_task(index).kind == "name"}
+    assert by_name == held_out
+    assert not by_name & {get_task(index).row for index in train}
+
+
+def test_folds_are_the_training_objects():
+    assert sorted(index for fold in FOLDS for index in fold) == list(range(24))

@@ -10,7 +10,7 @@ import numpy as np
 
 from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.random_objects import FIRST_INDEX, random_label, random_model
-from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel
+from gym_deltaco.tasks import FOLDS, OBJECTS, SCENARIOS, ObjectLabel, fold_pairs
 
 OBJECT_SETS = MappingProxyType(
     {
@@ -30,29 +30,42 @@ def select_objects(name: str) -> tuple[ObjectLabel, ...]:
     """Returns the objects of a set.
 
     Args:
-        name: One of `OBJECT_SETS`; or "random:N" with N from 24 to 10000: scenario A's 24 training objects
-            and N - 24 random ones. A larger set includes the smaller ones.
+        name: One of `OBJECT_SETS`; "random:N" with N from 24 to 10000: scenario A's 24 training objects and
+            N - 24 random ones; or "fold_K:N": the same without the objects of fold K (0, 1 or 2), and without
+            random objects that have the color and the shape of one of them. A larger set includes the
+            smaller ones.
 
     Raises:
         ValueError: The set does not exist.
     """
-    count = re.fullmatch(r"random:(\d+)", name) if isinstance(name, str) else None
+    count = re.fullmatch(r"(random|fold_([0-2])):(\d{1,9})", name) if isinstance(name, str) else None
     if count is not None:
-        return _with_random_objects(int(count[1]))
+        return _with_random_objects(name, int(count[3]), None if count[2] is None else int(count[2]))
     if not isinstance(name, str) or name not in OBJECT_SETS:
-        raise ValueError(f"`objects` must be one of {', '.join(OBJECT_SETS)}, random:N. Got {name!r}.")
+        raise ValueError(
+            f"`objects` must be one of {', '.join(OBJECT_SETS)}, random:N, fold_K:N. Got {name!r}."
+        )
     return OBJECT_SETS[name]
 
 
 @cache
-def _with_random_objects(n_objects: int) -> tuple[ObjectLabel, ...]:
+def _with_random_objects(name: str, n_objects: int, fold: int | None) -> tuple[ObjectLabel, ...]:
     paper = OBJECT_SETS["scenario_a_train"]
     n_random = n_objects - len(paper)
     if not 0 <= n_random <= MAX_OBJECTS - len(paper):
         raise ValueError(
-            f"`objects` must be random:N with N from {len(paper)} to {MAX_OBJECTS}. Got 'random:{n_objects}'."
+            f"`objects` must be random:N or fold_K:N with N from {len(paper)} to {MAX_OBJECTS}. Got {name!r}."
         )
-    return (*paper, *(random_label(FIRST_INDEX + number) for number in range(n_random)))
+    labels = (*paper, *(random_label(FIRST_INDEX + number) for number in range(n_random)))
+    if fold is None:
+        return labels
+    held_out = fold_pairs(fold)
+    return tuple(
+        label
+        for label in labels
+        if label.index not in FOLDS[fold]
+        and not (label.index >= FIRST_INDEX and (label.color, label.shape) in held_out)
+    )
 
 
 def find_label(index: int) -> ObjectLabel:

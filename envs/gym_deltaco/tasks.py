@@ -159,20 +159,20 @@ class Task:
         if self.kind == "name":
             return label.index == self.row
         if self.kind == "color":
-            return label.color == self._color
+            return label.color == self.color
         if self.kind == "shape":
-            return label.shape == self._shape
-        return (label.color, label.shape) == (self._color, self._shape)
+            return label.shape == self.shape
+        return (label.color, label.shape) == (self.color, self.shape)
 
     @property
-    def _color(self) -> str:
+    def color(self) -> str:
         """Color of a task by color, or by color and shape."""
         return COLORS[
             self.row - _FIRST_COLOR_ROW if self.kind == "color" else (self.row - N_ROWS) // len(SHAPES)
         ]
 
     @property
-    def _shape(self) -> str:
+    def shape(self) -> str:
         """Shape of a task by shape, or by color and shape."""
         return SHAPES[
             self.row - _FIRST_SHAPE_ROW if self.kind == "shape" else (self.row - N_ROWS) % len(SHAPES)
@@ -185,10 +185,10 @@ class Task:
             label = OBJECTS[self.row]
             return f"{label.color} colored, {label.shape} shaped {label.name}"
         if self.kind == "color":
-            return f"{self._color} colored object"
+            return f"{self.color} colored object"
         if self.kind == "shape":
-            return f"{self._shape} shaped object"
-        return f"{self._color} colored, {self._shape} shaped object"
+            return f"{self.shape} shaped object"
+        return f"{self.color} colored, {self.shape} shaped object"
 
     @property
     def instruction(self) -> str:
@@ -290,20 +290,6 @@ _COLOR_SHAPE_TASKS = tuple(
     for color, shape in COLOR_SHAPE_PAIRS
 )
 
-TASK_SETS = MappingProxyType(
-    {
-        "all": tuple(range(N_TASKS)),
-        **{f"scenario_{name}_train": scenario.train_tasks for name, scenario in SCENARIOS.items()},
-        **{f"scenario_{name}_test": scenario.test_tasks for name, scenario in SCENARIOS.items()},
-        "scenario_a_selection_train": VALIDATION.train_tasks,
-        "scenario_a_validation": VALIDATION.test_tasks,
-        "scenario_a_clean_train": CLEAN.train_tasks,
-        "scenario_a_clean_test": CLEAN.test_tasks,
-        # For the objects "random:N": scenario A's training tasks, and tasks by color and shape
-        "random_train": (*SCENARIOS["a"].train_tasks, *_COLOR_SHAPE_TASKS),
-    }
-)
-
 
 def get_task(index: int) -> Task:
     """Returns the task of an index.
@@ -321,6 +307,51 @@ def get_task(index: int) -> Task:
             f"{_PAIR_TASKS.stop - 1} for tasks by color and shape. Got {index!r}."
         )
     return TASKS[int(index)] if index < N_TASKS else Task(int(index))
+
+
+# Scenario A's training objects in three folds of eight, for choosing settings on novel objects. Each fold has
+# three brown objects and five of other colors, two vases and six of other shapes.
+FOLDS = ((0, 1, 2, 5, 9, 10, 20, 23), (3, 4, 6, 8, 11, 12, 14, 17), (7, 13, 15, 16, 18, 19, 21, 22))
+
+
+def fold_pairs(fold: int) -> frozenset[tuple[str, str]]:
+    """Returns the pairs of color and shape of a fold's objects, which no training object of it has."""
+    return frozenset((OBJECTS[index].color, OBJECTS[index].shape) for index in FOLDS[fold])
+
+
+def _fold_train_tasks(fold: int) -> tuple[int, ...]:
+    """Returns the training tasks of a fold: those of `random_train` that do not need its objects."""
+    held_out = fold_pairs(fold)
+    kept = [
+        task.index
+        for task in map(get_task, (*SCENARIOS["a"].train_tasks, *_COLOR_SHAPE_TASKS))
+        if task.row not in FOLDS[fold]
+        and not (task.kind == "color_shape" and (task.color, task.shape) in held_out)
+    ]
+    return tuple(kept)
+
+
+def _fold_validation_tasks(fold: int) -> tuple[int, ...]:
+    """Returns the tasks that ask for a fold's objects, by name, color or shape."""
+    return tuple(task.index for task in TASKS if set(task.targets) & set(FOLDS[fold]))
+
+
+TASK_SETS = MappingProxyType(
+    {
+        "all": tuple(range(N_TASKS)),
+        **{f"scenario_{name}_train": scenario.train_tasks for name, scenario in SCENARIOS.items()},
+        **{f"scenario_{name}_test": scenario.test_tasks for name, scenario in SCENARIOS.items()},
+        "scenario_a_selection_train": VALIDATION.train_tasks,
+        "scenario_a_validation": VALIDATION.test_tasks,
+        "scenario_a_clean_train": CLEAN.train_tasks,
+        "scenario_a_clean_test": CLEAN.test_tasks,
+        # For the objects "random:N": scenario A's training tasks, and tasks by color and shape
+        "random_train": (*SCENARIOS["a"].train_tasks, *_COLOR_SHAPE_TASKS),
+        # For the objects "fold_K:N", and for "scenario_a_train"
+        **{f"scenario_a_fold_{fold}_train": _fold_train_tasks(fold) for fold in range(len(FOLDS))},
+        **{f"scenario_a_fold_{fold}_validation": _fold_validation_tasks(fold) for fold in range(len(FOLDS))},
+    }
+)
 
 
 def select_tasks(selection: str) -> tuple[int, ...]:

@@ -359,7 +359,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         """Concatenates an embedding and the robot's state, which join the feature points."""
         parts = [] if embedding is None else [embedding]
         if self.config.state_dim:
-            parts.append(batch[OBS_STATE])
+            parts.append(self.state_limits(batch[OBS_STATE]))
         return torch.cat(parts, dim=-1) if parts else None
 
 

@@ -68,13 +68,13 @@ class StateToImage(nn.Module):
         # A change in the episodes of a cluster, but not in others, belongs to the states of the cluster.
         average = torch.stack([changes[members == k].mean(dim=0) for k in range(len(centers))])
         peaks = _peaks(_blurred(average - average.mean(dim=0)))
-        linear = _robust_fit(_linear(centers), peaks)
+        linear = robust_fit(_linear(centers), peaks)
         locations = _linear(x) @ linear
         # Refine with each episode's own change near the expected location, which gives many more points.
         smooth = _blurred(changes)
         weights = F.pad(linear, (0, 0, 0, len(self.weights) - len(linear)))
         for _ in range(_ROUNDS):
-            weights = _robust_fit(_quadratic(x), _peaks_near(smooth, locations))
+            weights = robust_fit(_quadratic(x), _peaks_near(smooth, locations))
             locations = _quadratic(x) @ weights
         self.weights.copy_(weights)
 
@@ -143,7 +143,7 @@ def _peaks_near(maps: Tensor, locations: Tensor) -> Tensor:
     return torch.cat(peaks)
 
 
-def _robust_fit(features: Tensor, targets: Tensor) -> Tensor:
+def robust_fit(features: Tensor, targets: Tensor) -> Tensor:
     """Returns the weights (features, targets) of a linear regression that is robust to outliers."""
     weights = torch.ones(len(features), device=features.device)
     ridge = _RIDGE * len(features) * torch.eye(features.shape[1], device=features.device)

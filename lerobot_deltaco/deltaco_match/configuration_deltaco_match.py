@@ -42,9 +42,11 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         p_drop_demonstration: With both inputs: probability that a training sample has no demonstration, so
             that the policy can do without.
         p_drop_instruction: The same for the instruction; no sample is without both.
-        feature_matching: Whether to also search for the demonstrated and the named object with features of
-            EfficientNet-Lite0, which was trained on ImageNet. Training begins with a few minutes of fitting,
-            and needs the extra `offline`; afterwards, the checkpoint is enough.
+        feature_matching: Whether to compare the things that could be grasped with the demonstrated and the
+            named object by features of EfficientNet-Lite0, which was trained on ImageNet. Training begins
+            with a few minutes of fitting.
+        crop_size: Side of the square around a thing that is compared, in the middle of the first camera's
+            image and as a fraction of its side: about the size of a large object.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation.
         grasp_height_bias: Height offset that is added to the estimate when the policy acts, in standard
             deviations over the training episodes; larger is farther along the approach. A gripper that closes
@@ -61,12 +63,15 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     p_drop_demonstration: float = 0.25
     p_drop_instruction: float = 0.25
     feature_matching: bool = True
+    crop_size: float = 0.17
     n_demonstrations: int = 1
     num_mixture_components: int = 5
     grasp_height_bias: float = 0.75
     p_hue_augmentation: float = 0.7
     colorless_tasks: str | None = "shaped object"
     frames_after_release: int | None = 2
+    paraphrases: str | None = "grammar"
+    p_paraphrase: float = 0.5
     dtype: str = "bfloat16"
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.2
@@ -85,6 +90,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         self.check_ranges(
             p_drop_demonstration=(0, 1),
             p_drop_instruction=(0, 1),
+            crop_size=(0.01, 1),
             n_demonstrations=(1, 1000),
             grasp_height_bias=(-10, 10),
             p_hue_augmentation=(0, 1),

@@ -1,333 +1,383 @@
-r"""Feature matching: finds the object that a task asks for with features learned on ImageNet.
+r"""Feature matching: finds the object that a task asks for among the things that could be grasped.
 
-A network that learns from a few hundred objects compares them by color: among objects of one color, it picks
-nearly at random. The features of a network that was trained on photographs tell shapes apart, too. They are
-frozen; small networks on top of them learn which features to compare. `fit` trains these before the policy.
+    scene                          demonstration's first image          instruction
+      |                                    |                                |
+    proposals                       where it grasped                     words, weighed
+      |                                    |                                |
+    crops -> EfficientNet-Lite0       crop -> EfficientNet-Lite0            |
+      |               (frozen)             |                                |
+    descriptors -------- cosine ------- descriptor                          |
+      |                    |                                                |
+    log probability of each word of the vocabulary ------------------- those said
+                           |                                                |
+                           +------------ sum: score of a proposal ----------+
 
-    demonstration's first image     scene                     instruction
-            |                         |                            |
-        encoder (frozen) <-------> encoder (frozen)          words it has
-            |                         |        \                   |
-    compared features <- same -> compared   compared        sum of the words' descriptors
-            |                         |           |                |
-    descriptor of what was grasped    |           |                |
-            |________ cosine _________|           |____ cosine ____|
-                        |                                 |
-                by the demonstration                 by the words
+The small networks behind the frozen encoder are fitted before the policy is trained, to the first images of
+the training episodes.
 """
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lerobot_deltaco.efficientnet_lite import IMAGENET_MEAN, IMAGENET_STD, EfficientNetLite0
-from lerobot_deltaco.losses import location_loss
+from lerobot_deltaco.deltaco_match import proposals
+from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, crop_features, fit_perspective
+from lerobot_deltaco.deltaco_match.proposals import ProposalNetwork
+from lerobot_deltaco.deltaco_match.words import UNKNOWN_WORD, WordWeights, encode_words
 from lerobot_deltaco.networks import gaussian_maps
 
-# Blocks of the encoder whose maps are used: of stride 8 and 40 channels, of stride 16 and 80.
-_FINE_BLOCKS, _FINE_STRIDE, _FINE_CHANNELS = 5, 8, 40
-_COARSE_BLOCKS, _COARSE_STRIDE, _COARSE_CHANNELS = 7, 16, 80
-_DESCRIPTOR_DIM, _HIDDEN_DIM = 64, 128
-_POOLING_STD = 1.2  # of the cells around a grasp that describe what was grasped
-_MIN_STD = 1e-3
-# Cells per side of the maps. The encoder's work and the memory of a fit grow with its square.
-_MAX_CELLS = 24
-_WORD_WEIGHT = 3.0  # of the words' log probabilities; chosen on validation tasks
-# Of the fit; chosen on validation tasks.
-FIT_STEPS = 2000
+_DESCRIPTOR_DIM, _HIDDEN_DIM, _DROPOUT = 64, 256, 0.5
+_MIN_STD, _MAX_FEATURE = 1e-3, 6.0
+# Probability that a demonstration shows another object than the one that the words describe, if all of them
+# are known; and how much more its similarity counts than in the fit, where dropout disturbs it. Chosen on
+# folds of the training objects, as are the settings of the fit.
+_P_OTHER_OBJECT, _SHARPNESS = 0.5, 1.5
+# Of the fit.
+FIT_STEPS = 1500
 _MAX_EPISODES = 10_000
-_PAIRS_PER_STEP = 32
-_LEARNING_RATE, _WARMUP_FRACTION, _WEIGHT_DECAY = 2e-3, 0.1, 0.2
+_SCENES_PER_STEP = 64
+_LEARNING_RATE, _WORD_LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 1e-3, 3e-2, 0.2, 0.1
 _P_DROP_WORD = 0.3
-_WORD_STD = 0.1  # of the words' descriptors before the fit
-_ENCODED_AT_A_TIME = 32
-_N_FOR_STATISTICS = 256  # images whose maps give the channels' means and standard deviations
+_WORD_PENALTY = 0.03  # of each word's weight
+_MAP_STD = 0.8  # of a candidate, in cells
+_MAX_DISTANCE = 0.19  # from a grasp, of the proposal that stands for it: 4.5 px of 48
+_ENCODED_AT_A_TIME = 16
 
 
-class BagOfWords(NamedTuple):
-    """A bag-of-words encoding over the training vocabulary.
-
-    Attributes:
-        present: Which words of the vocabulary each instruction has, (instructions, words) float: 0 or 1.
-        is_known: Whether an instruction has words, and no others, (instructions,) bool.
-    """
-
-    present: Tensor
-    is_known: Tensor
-
-
-class FeatureMaps(NamedTuple):
-    """Maps of images, of the size (h, w): a quarter of their sides, at most 24.
+class Candidates(NamedTuple):
+    """What could be picked.
 
     Attributes:
-        fine: (batch, 40, h, w).
-        coarse: (batch, 80, h, w), of images of twice the size.
+        locations: The proposals, (batch, n, 2) in -1..1.
+        log_probabilities: How likely each is what the task asks for, (batch, n).
     """
 
-    fine: Tensor
-    coarse: Tensor
+    locations: Tensor
+    log_probabilities: Tensor
 
-    def rows(self, rows: Tensor) -> FeatureMaps:
-        """Returns the maps of some of the images."""
-        return FeatureMaps(self.fine[rows], self.coarse[rows])
+    @property
+    def best(self) -> Tensor:
+        """The likeliest location, (batch, 2)."""
+        rows = torch.arange(len(self.locations), device=self.locations.device)
+        return self.locations[rows, self.log_probabilities.argmax(dim=1)]
+
+    def map(self, shape: Sequence[int]) -> Tensor:
+        """Returns the candidates as maps of a shape (h, w), as logits (batch, h, w)."""
+        height, width = shape
+        std = 2 * _MAP_STD / torch.tensor([width, height], device=self.locations.device)
+        each = gaussian_maps(self.locations, height, width, std)
+        return (self.log_probabilities.exp()[..., None, None] * each).sum(dim=1).clamp_min(1e-9).log()
 
 
 class FeatureMatching(nn.Module):
-    """Finds what a demonstration moved, or what words name, in scenes.
+    """Finds what demonstrations moved, and what words describe, in scenes.
 
-    It receives no gradient while a policy is trained.
+    It stays in evaluation mode, and receives no gradient while a policy is trained.
 
     Args:
-        n_words: Size of the vocabulary, 0 for a policy without instructions.
+        vocabulary: Known words; empty for a policy without instructions.
+        crop_size: Side of a crop in the middle of an image, as a fraction of the image's.
 
     Attributes:
+        perspective: How the log of the size of things changes along x and y in the image, (2,).
         fitted: Whether it has been fitted, () bool.
     """
 
+    perspective: Tensor
     fitted: Tensor
-    image_mean: Tensor
-    image_std: Tensor
 
-    def __init__(self, n_words: int = 0) -> None:
+    def __init__(self, vocabulary: Sequence[str], crop_size: float) -> None:
         super().__init__()
-        self.encoder = EfficientNetLite0(_COARSE_BLOCKS)
-        self.by_demonstration = ComparedFeatures()
-        self.by_words = ComparedFeatures() if n_words else None
-        if n_words:
-            # With a bias, which belongs to no word.
-            self.words = nn.Parameter(torch.zeros(n_words + 1, _DESCRIPTOR_DIM))
+        self.vocabulary, self.crop_size = list(vocabulary), crop_size
+        self.propose = ProposalNetwork()
+        self.compare = Comparison(len(vocabulary))
+        self.word_weights = WordWeights(len(vocabulary))
+        self.register_buffer("perspective", torch.zeros(2))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("image_mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
-        self.register_buffer("image_std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
-        for name, channels in (("fine", _FINE_CHANNELS), ("coarse", _COARSE_CHANNELS)):
-            self.register_buffer(f"{name}_mean", torch.zeros(channels, 1, 1))
-            self.register_buffer(f"{name}_std", torch.ones(channels, 1, 1))
         self.requires_grad_(False)
+        self.eval()
 
-    def pick_map(
-        self,
-        pick: Tensor,
-        scenes: Tensor,
-        ends: Tensor | None,
-        locations: Tensor | None,
-        words: BagOfWords | None,
-    ) -> Tensor:
-        """Multiplies a pick map by the maps found from the demonstrations and from the words.
+    def train(self, mode: bool = True) -> FeatureMatching:
+        """Stays in evaluation mode."""
+        return super().train(False)
 
-        Words outside the vocabulary are ignored. With a demonstration, an instruction with such words is
-        ignored altogether, since its remaining words may fit other objects as well.
+    @torch.no_grad()
+    def find(
+        self, scenes: Tensor, native: Tensor, described: Tensor | None, instructions: Sequence[str] | None
+    ) -> Candidates:
+        """Finds what tasks ask for.
 
         Args:
-            pick: Pick map of the correspondence network, as logits (batch, h, w).
-            scenes: First images of episodes, (batch, 3, H, W) in 0..1.
-            ends: First and last images of demonstrations, (batch, demonstrations, 2, 3, H, W) in 0..1; None
-                without them.
-            locations: Locations of their grasps, (batch, demonstrations, 2) in -1..1.
-            words: Words of the instructions; None without instructions.
-
-        Returns:
-            Logits, (batch, h, w).
+            scenes: First images of episodes, (batch, 3, H, W) in 0..1, as small as the policy's.
+            native: The same at the camera's own resolution, (batch, 3, H', W').
+            described: Descriptors of the demonstrated objects, (batch, descriptor); None without
+                demonstrations.
+            instructions: Instruction of each sample, "" for none; None for a policy without instructions.
         """
-        total, shape = log_probabilities(pick), pick.shape[1:]
-        with torch.autocast(scenes.device.type, enabled=False):  # it was fitted in float32
-            maps = self._normalized(self._encode(scenes))
-            if ends is not None:
-                assert locations is not None
-                first = self._normalized(self._encode(ends[:, :, 0].flatten(0, 1)))
-                each = F.normalize(self._describe(first, locations.flatten(0, 1)), dim=1)
-                descriptors = each.unflatten(0, (-1, ends.shape[1])).mean(dim=1)
-                found = self.by_demonstration.similarity(self.by_demonstration(maps), descriptors)
-                total = total + log_probabilities(_resized(found, shape))
-            if words is not None and self.by_words is not None:
-                found = self._find_by_words(maps, words.present)
-                counts = words.present.any(dim=1) & (words.is_known | (ends is None))
-                named = _WORD_WEIGHT * log_probabilities(_resized(found, shape))
-                total = total + torch.where(counts[:, None, None], named, 0.0)
-        return total
+        with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
+            locations = self.propose(scenes)
+            descriptors, words = self.compare(self._features(native, locations))
+            scores = torch.zeros_like(locations[..., 0])
+            all_known = torch.zeros(len(scenes), device=scenes.device)
+            if instructions is not None and self.vocabulary and any(instructions):
+                said = encode_words(instructions, self.vocabulary).to(scenes.device)
+                scores = _word_scores(words, said, self.word_weights(said))
+                all_known = ((said != UNKNOWN_WORD).all(dim=1) & (said > UNKNOWN_WORD).any(dim=1)).float()
+            if described is not None:
+                similar = _SHARPNESS * self.compare.similarity(descriptors, described)
+                # A new noun leaves the demonstration in charge.
+                p_other = (_P_OTHER_OBJECT * all_known)[:, None]
+                scores = scores + torch.log(
+                    (1 - p_other) * similar.softmax(dim=1) + p_other / scores.shape[1]
+                )
+            return Candidates(locations, scores.log_softmax(dim=1))
+
+    @torch.no_grad()
+    def describe(self, images: Tensor, native: Tensor, locations: Tensor) -> Tensor:
+        """Returns unit descriptors of what was grasped in demonstrations, (batch, descriptor).
+
+        Args:
+            images: First images, (batch, 3, H, W) in 0..1, as small as the policy's.
+            native: The same at the camera's own resolution, (batch, 3, H', W').
+            locations: Locations of the grasps, (batch, 2) in -1..1.
+        """
+        with torch.autocast(images.device.type, enabled=False):
+            # A gripper is not always above the middle of an object, but a proposal is.
+            near, distance = _nearest(self.propose(images), locations)
+            locations = torch.where(distance[:, None] < _MAX_DISTANCE, near, locations)
+            return self.compare(self._features(native, locations[:, None]))[0][:, 0]
+
+    def _features(self, native: Tensor, locations: Tensor) -> Tensor:
+        """Returns features of the crops at locations (batch, n, 2), (batch, n, FEATURE_DIM)."""
+        sizes = self.crop_size * (locations @ self.perspective).exp()
+        return crop_features(native, locations, sizes)
 
     def fit(
         self,
         images: Tensor,
+        last: Tensor,
+        native: Tensor,
         locations: Tensor,
         tasks: Sequence[str],
-        present: Tensor | None,
+        sentences: Mapping[str, Sequence[str]],
         seed: int,
         steps: int = FIT_STEPS,
     ) -> None:
-        """Fits the compared features and the words to episodes.
+        """Fits the proposals, and then the comparison.
 
-        The networks learn to find the object grasped in one episode of a task in the scene of another, and
-        from the words of the task. Some words are left out at random in each step, so that none is
-        indispensable.
+        The comparison learns to tell the object grasped in one episode of a task from the other proposals in
+        the scene of another episode, by the demonstration and by words. Some words are left out at random in
+        each step, so that none is indispensable.
 
         Args:
-            images: First images of episodes, (episodes, 3, H, W) uint8.
+            images: First images of episodes, (episodes, 3, H, W) uint8, as small as the policy's.
+            last: Last images of the same episodes.
+            native: The first images at the camera's own resolution, (episodes, 3, H', W') uint8.
             locations: Locations of their grasps, (episodes, 2) in -1..1; NaN where there is none.
             tasks: Task of each episode.
-            present: Which words of the vocabulary each task has, (episodes, words); None without words.
+            sentences: Instructions of each task, one of which is drawn for an episode in each step.
             seed: Seed of the initial weights and of the draws.
-            steps: Number of training steps.
+            steps: Number of steps of the comparison.
 
         Raises:
             ValueError: No task has two episodes with a grasp.
             PretrainedWeightsError: The encoder's weights are missing.
         """
-        self.encoder.load_imagenet_weights()
         generator, device = torch.Generator().manual_seed(seed), images.device
         grasps = (~locations.isnan().any(dim=1)).nonzero().flatten().cpu()
         drawn = grasps[torch.randperm(len(grasps), generator=generator)[:_MAX_EPISODES]].sort().values
-        pairs = _Pairs([tasks[row] for row in drawn.tolist()])
-        images, locations = images[drawn.to(device)], locations[drawn.to(device)]
-        present = None if present is None else present[drawn.to(device)]
-        with torch.enable_grad(), torch.autocast(device.type, enabled=False):
-            maps = self._encode_all(images)
-            self._set_statistics(maps)
-            self._initialize(generator)
-            frozen = {id(weights) for weights in self.encoder.parameters()}
-            learned = [weights for weights in self.parameters() if id(weights) not in frozen]
-            for weights in learned:
-                weights.requires_grad_(True)
-            optimizer = torch.optim.AdamW(learned, lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
-            schedule = torch.optim.lr_scheduler.OneCycleLR(
-                optimizer, _LEARNING_RATE, steps, pct_start=_WARMUP_FRACTION
+        _Pairs([tasks[row] for row in drawn.tolist()])  # fails before the slow part
+        with torch.random.fork_rng(devices=[]), torch.enable_grad():
+            torch.manual_seed(seed)
+            self._initialize()
+            self.requires_grad_(True)
+            with torch.autocast(device.type, enabled=False):
+                known = grasps.to(device)
+                self.perspective.copy_(fit_perspective(images[known], last[known], locations[known]))
+                n_steps = min(proposals.FIT_STEPS, 2 * steps)
+                self.propose.fit(images[drawn.to(device)], locations[drawn.to(device)], generator, n_steps)
+            features, target, kept = self._crops_of_proposals(images, native, locations, drawn)
+            self._fit_comparison(
+                features, target, [tasks[row] for row in kept.tolist()], sentences, generator, steps
             )
-            for _ in tqdm(range(steps), desc="Fitting the feature matching", unit="step", leave=False):
-                scenes, others = (rows.to(device) for rows in pairs.draw(_PAIRS_PER_STEP, generator))
-                here, scene_maps = locations[scenes][:, None], self._normalized(maps.rows(scenes))
-                descriptors = self._describe(self._normalized(maps.rows(others)), locations[others])
-                found = self.by_demonstration.similarity(self.by_demonstration(scene_maps), descriptors)
-                loss = location_loss(found[:, None], here).mean()
-                if present is not None:
-                    kept = torch.rand(_PAIRS_PER_STEP, present.shape[1], generator=generator) >= _P_DROP_WORD
-                    found = self._find_by_words(scene_maps, present[scenes] * kept.to(present))
-                    loss = loss + location_loss(found[:, None], here).mean()
-                optimizer.zero_grad()
-                loss.backward()
-                optimizer.step()
-                schedule.step()
-            for weights in learned:
-                weights.requires_grad_(False)
-                weights.grad = None
-            if present is not None:
-                self.words[:-1][~present.any(dim=0)] = 0  # words of no episode say nothing
+        self.requires_grad_(False)
+        for weights in self.parameters():
+            weights.grad = None
+        self.eval()
         self.fitted.fill_(True)
 
-    def _encode(self, images: Tensor) -> FeatureMaps:
-        """Returns maps of images (batch, 3, H, W) in 0..1, after scaling them to the encoder's strides."""
-        size = [min(_MAX_CELLS, max(1, side // 4)) for side in images.shape[-2:]]
+    def _initialize(self) -> None:
+        """Draws initial weights."""
+        for layer in self.modules():
+            if isinstance(layer, (nn.Conv2d, nn.Linear, nn.BatchNorm2d)):
+                layer.reset_parameters()
 
-        def scaled(stride: int) -> Tensor:
-            sides = [stride * cells for cells in size]
-            is_smaller = any(new < old for new, old in zip(sides, images.shape[-2:], strict=True))
-            resized = F.interpolate(
-                images.float(), size=sides, mode="bicubic", align_corners=False, antialias=is_smaller
-            )
-            return (resized.clamp(0, 1) - self.image_mean) / self.image_std
+    @torch.no_grad()
+    def _crops_of_proposals(
+        self, images: Tensor, native: Tensor, locations: Tensor, drawn: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns features of the proposals in scenes, which of them was grasped, and the scenes' rows.
 
-        return FeatureMaps(
-            self.encoder(scaled(_FINE_STRIDE), _FINE_BLOCKS),
-            self.encoder(scaled(_COARSE_STRIDE), _COARSE_BLOCKS),
-        )
-
-    def _encode_all(self, images: Tensor) -> FeatureMaps:
-        """Returns maps of images (n, 3, H, W) uint8, not normalized, in float16."""
-        found: FeatureMaps | None = None
-        with tqdm(total=len(images), desc="Encoding scenes", unit="image", leave=False) as progress:
-            for first in range(0, len(images), _ENCODED_AT_A_TIME):
-                some = images[first : first + _ENCODED_AT_A_TIME]
-                maps = self._encode(some.float() / 255)
-                if found is None:
-                    # At once, since there is no room for two copies of many large maps.
-                    found = FeatureMaps(
-                        *(kind.new_empty(len(images), *kind.shape[1:], dtype=torch.half) for kind in maps)
-                    )
-                for all_maps, kind in zip(found, maps, strict=True):
-                    all_maps[first : first + len(some)] = kind
+        A scene in which no proposal is near the grasp is left out.
+        """
+        features, targets, kept = [], [], []
+        with tqdm(total=len(drawn), desc="Encoding crops", unit="scene", leave=False) as progress:
+            for some in drawn.split(_ENCODED_AT_A_TIME):
+                rows = some.to(images.device)
+                proposed = self.propose(images[rows].float() / 255)
+                distance, nearest = (proposed - locations[rows, None]).norm(dim=2).min(dim=1)
+                near = distance < _MAX_DISTANCE
+                if bool(near.any()):
+                    of_some = native[rows[near].to(native.device)]
+                    features.append(self._features(of_some, proposed[near]).half())
+                    targets.append(nearest[near])
+                    kept.append(some[near.cpu()])
                 progress.update(len(some))
-        assert found is not None
-        return found
+        if not kept:
+            raise ValueError("no proposal is near a grasp")
+        return torch.cat(features), torch.cat(targets), torch.cat(kept)
 
-    @torch.no_grad()
-    def _set_statistics(self, maps: FeatureMaps) -> None:
-        """Sets the means and standard deviations of the channels to those of some of the maps."""
-        n_maps = len(maps.fine)
-        rows = torch.arange(0, n_maps, math.ceil(n_maps / _N_FOR_STATISTICS), device=maps.fine.device)
-        for name, kind in zip(("fine", "coarse"), maps.rows(rows), strict=True):
-            values = kind.float().transpose(0, 1).flatten(1)  # (channels, images * cells)
-            self.get_buffer(f"{name}_mean").copy_(values.mean(dim=1)[:, None, None])
-            self.get_buffer(f"{name}_std").copy_(values.std(dim=1).clamp_min(_MIN_STD)[:, None, None])
-
-    @torch.no_grad()
-    def _initialize(self, generator: torch.Generator) -> None:
-        """Draws initial weights as PyTorch's layers do, but from a generator."""
-        for network in (self.by_demonstration, self.by_words):
-            for layer in [] if network is None else network.modules():
-                if isinstance(layer, nn.Conv2d):
-                    bound = layer.weight[0].numel() ** -0.5
-                    for weights in layer.parameters():
-                        weights.copy_(bound * (2 * torch.rand(weights.shape, generator=generator) - 1))
-        if self.by_words is not None:
-            self.words.copy_(_WORD_STD * torch.randn(self.words.shape, generator=generator))
-            self.words[-1] = 0
-
-    def _normalized(self, maps: FeatureMaps) -> FeatureMaps:
-        """Returns maps with channels of mean 0 and standard deviation 1, in float32."""
-        return FeatureMaps(
-            (maps.fine.float() - self.get_buffer("fine_mean")) / self.get_buffer("fine_std"),
-            (maps.coarse.float() - self.get_buffer("coarse_mean")) / self.get_buffer("coarse_std"),
+    def _fit_comparison(
+        self,
+        features: Tensor,
+        target: Tensor,
+        tasks: Sequence[str],
+        sentences: Mapping[str, Sequence[str]],
+        generator: torch.Generator,
+        steps: int,
+    ) -> None:
+        pairs, device = _Pairs(tasks), features.device
+        self.compare.set_statistics(features)
+        said, first = self._encoded_sentences(tasks, sentences, device)
+        groups: list[dict[str, Any]] = [
+            {"params": self.compare.parameters(), "lr": _LEARNING_RATE, "weight_decay": _WEIGHT_DECAY},
+            {"params": self.word_weights.parameters(), "lr": _WORD_LEARNING_RATE, "weight_decay": 0.0},
+        ]
+        optimizer = torch.optim.AdamW(groups)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, [group["lr"] for group in groups], steps, pct_start=_WARMUP_FRACTION
         )
+        for _ in tqdm(range(steps), desc="Fitting the comparison", unit="step", leave=False):
+            scenes, others = (rows.to(device) for rows in pairs.draw(_SCENES_PER_STEP, generator))
+            crops = torch.cat([features[scenes], features[others, target[others]][:, None]], dim=1)
+            descriptors, words = self.compare(crops, generator)
+            similar = self.compare.similarity(descriptors[:, :-1], descriptors[:, -1])
+            loss = F.cross_entropy(similar, target[scenes])
+            if self.vocabulary:
+                draws = torch.rand(len(scenes), generator=generator)
+                drawn = (first[scenes.cpu(), 0] + draws * first[scenes.cpu(), 1]).long()
+                dropped = torch.rand(len(scenes), said.shape[1], generator=generator) < _P_DROP_WORD
+                sentence = said[drawn.to(device)]
+                sentence = torch.where(dropped.to(device) & (sentence > 0), UNKNOWN_WORD, sentence)
+                loss = loss + self._word_losses(words[:, :-1], sentence, target[scenes])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
 
-    def _describe(self, maps: FeatureMaps, locations: Tensor) -> Tensor:
-        """Returns descriptors of what was grasped at locations (batch, 2), (batch, descriptor)."""
-        features = self.by_demonstration(maps)
-        height, width = features.shape[-2:]
-        std = 2 * _POOLING_STD / torch.tensor([width, height], device=features.device)
-        weights = gaussian_maps(locations[:, None], height, width, std)  # (batch, 1, h, w)
-        weights = weights / weights.sum(dim=(2, 3), keepdim=True).clamp_min(1e-6)
-        return (features * weights).sum(dim=(2, 3))
+    def _word_losses(self, words: Tensor, said: Tensor, target: Tensor) -> Tensor:
+        """Returns the losses of choosing a proposal by words, and of naming what was grasped."""
+        weights = self.word_weights(said)
+        loss = F.cross_entropy(_word_scores(words, said, weights), target)
+        named = words[torch.arange(len(words)), target]  # (batch, vocabulary)
+        known = weights.detach() * (said > UNKNOWN_WORD)
+        log_probabilities = named.gather(1, (said - UNKNOWN_WORD - 1).clamp_min(0))
+        naming = -(known * log_probabilities).sum(dim=1) / known.sum(dim=1).clamp_min(1e-6)
+        # Words that tell nothing would only add noise.
+        return loss + naming.mean() + _WORD_PENALTY * weights.sum(dim=1).mean()
 
-    def _find_by_words(self, maps: FeatureMaps, present: Tensor) -> Tensor:
-        """Returns where scenes look like what words (batch, words) name, as logits (batch, h, w)."""
-        assert self.by_words is not None
-        descriptors = present @ self.words[:-1] + self.words[-1]
-        return self.by_words.similarity(self.by_words(maps), descriptors)
+    def _encoded_sentences(
+        self, tasks: Sequence[str], sentences: Mapping[str, Sequence[str]], device: torch.device
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the words of all sentences, and the first row and the number of those of each episode."""
+        spans: dict[str, tuple[int, int]] = {}
+        every: list[str] = []
+        for task in dict.fromkeys(tasks):
+            spans[task] = (len(every), len(sentences[task]))
+            every.extend(sentences[task])
+        return encode_words(every, self.vocabulary).to(device), torch.tensor([spans[task] for task in tasks])
 
 
-class ComparedFeatures(nn.Module):
-    """Features for comparing objects: a linear layer, and a small network that sees the surroundings.
+class Comparison(nn.Module):
+    """Maps features of crops to descriptors, and to log probabilities of words.
 
-    The network lets words find shapes. Finding demonstrated objects works as well without it.
+    Args:
+        n_words: Size of the vocabulary.
     """
 
-    def __init__(self) -> None:
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, n_words: int) -> None:
         super().__init__()
-        channels = _FINE_CHANNELS + _COARSE_CHANNELS
-        self.linear = nn.Conv2d(channels, _DESCRIPTOR_DIM, 1)
-        self.around = nn.Sequential(
-            nn.Conv2d(channels, _HIDDEN_DIM, 1),
-            nn.ReLU(),
-            nn.Conv2d(_HIDDEN_DIM, _DESCRIPTOR_DIM, 3, padding=1),
-        )
+        self.register_buffer("mean", torch.zeros(FEATURE_DIM))
+        self.register_buffer("std", torch.ones(FEATURE_DIM))
+        self.hidden = nn.Linear(FEATURE_DIM, _HIDDEN_DIM)
+        self.linear = nn.Linear(FEATURE_DIM, _DESCRIPTOR_DIM)
+        self.from_hidden = nn.Linear(_HIDDEN_DIM, _DESCRIPTOR_DIM)
+        self.words = nn.Linear(_HIDDEN_DIM, n_words)
         self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
 
-    def forward(self, maps: FeatureMaps) -> Tensor:
-        """Maps normalized maps (batch, channels, h, w) to features (batch, descriptor, 2 h, 2 w)."""
-        both = torch.cat(maps, dim=1)
-        features = self.linear(both) + self.around(both)
-        return F.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
+    def set_statistics(self, features: Tensor) -> None:
+        """Sets the mean and the standard deviation of features (scenes, n, FEATURE_DIM)."""
+        some = features[:: max(1, len(features) // 1000)].flatten(0, 1).float()
+        self.mean.copy_(some.mean(dim=0))
+        self.std.copy_(some.std(dim=0).clamp_min(_MIN_STD))
 
-    def similarity(self, features: Tensor, descriptors: Tensor) -> Tensor:
-        """Returns the scaled cosine of features and descriptors (batch, descriptor), (batch, h, w)."""
-        cosine = torch.einsum("bchw,bc->bhw", F.normalize(features, dim=1), F.normalize(descriptors, dim=1))
-        return self.log_scale.exp() * cosine
+    def forward(self, features: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Describes crops.
+
+        Args:
+            features: (batch, n, FEATURE_DIM).
+            generator: Source of dropout's draws, on the CPU; None for no dropout.
+
+        Returns:
+            Unit descriptors, (batch, n, descriptor), and log probabilities of words, (batch, n, words).
+        """
+        inputs = ((features.float() - self.mean) / self.std).clamp(-_MAX_FEATURE, _MAX_FEATURE)
+        inputs = _dropout(inputs, generator)
+        hidden = _dropout(F.relu(self.hidden(inputs)), generator)
+        descriptors = F.normalize(self.linear(inputs) + self.from_hidden(hidden), dim=-1)
+        return descriptors, self.words(hidden).log_softmax(dim=-1)
+
+    def similarity(self, descriptors: Tensor, demonstrated: Tensor) -> Tensor:
+        """Returns scaled cosines, (batch, n), of descriptors (batch, n, d) with one of each (batch, d)."""
+        return self.log_scale.exp() * torch.einsum(
+            "bnd,bd->bn", descriptors, F.normalize(demonstrated, dim=1)
+        )
+
+
+def _word_scores(words: Tensor, said: Tensor, weights: Tensor) -> Tensor:
+    """Returns weighed sums of the log probabilities of the words said, (batch, n).
+
+    Args:
+        words: Log probabilities of the vocabulary, (batch, n, vocabulary).
+        said: Indices of the words said, (batch, length).
+        weights: Their weights, (batch, length).
+    """
+    index = (said - UNKNOWN_WORD - 1).clamp_min(0)[:, None].expand(-1, words.shape[1], -1)
+    known = weights * (said > UNKNOWN_WORD)
+    return (words.gather(2, index) * known[:, None]).sum(dim=2)
+
+
+def _nearest(proposed: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the proposals nearest to locations (batch, 2), (batch, 2), and their distances, (batch,)."""
+    distance, nearest = (proposed - locations[:, None]).norm(dim=2).min(dim=1)
+    return proposed[torch.arange(len(proposed), device=proposed.device), nearest], distance
+
+
+def _dropout(values: Tensor, generator: torch.Generator | None) -> Tensor:
+    if generator is None:
+        return values
+    kept = torch.rand(values.shape, generator=generator).to(values) >= _DROPOUT
+    return values * kept / (1 - _DROPOUT)
 
 
 class _Pairs:
@@ -362,44 +412,3 @@ class _Pairs:
             scenes.append(rows[first])
             demonstrations.append(rows[(first + further) % len(rows)])
         return torch.stack(scenes), torch.stack(demonstrations)
-
-
-def log_probabilities(logits: Tensor) -> Tensor:
-    """Returns the log probabilities of the cells of maps (batch, h, w), of the same shape."""
-    return logits.flatten(1).log_softmax(dim=1).view_as(logits)
-
-
-def words_of(sentence: str) -> frozenset[str]:
-    """Returns the words of a sentence, in lower case, without digits and punctuation."""
-    return frozenset(re.findall(r"[^\W\d_]+", sentence.lower()))
-
-
-def vocabulary_of(sentences: Iterable[str]) -> list[str]:
-    """Returns all words of sentences, in alphabetical order."""
-    return sorted(frozenset[str]().union(*map(words_of, sentences)))
-
-
-def bag_of_words(vocabulary: Sequence[str], instructions: Sequence[str]) -> BagOfWords:
-    """Encodes instructions as bags of words.
-
-    Args:
-        vocabulary: Words.
-        instructions: Instructions.
-    """
-    index = {word: n for n, word in enumerate(vocabulary)}
-    present = torch.zeros(len(instructions), len(vocabulary))
-    for row, instruction in enumerate(instructions):
-        for word in words_of(instruction) & index.keys():
-            present[row, index[word]] = 1
-    is_known = torch.tensor([frozenset() < words_of(text) <= index.keys() for text in instructions])
-    return BagOfWords(present, is_known.reshape(len(instructions)))
-
-
-def _resized(logits: Tensor, shape: torch.Size) -> Tensor:
-    """Returns maps (batch, h, w) at another height and width.
-
-    They differ if an image's side is no multiple of 4, or so large that the encoder sees it scaled down.
-    """
-    if logits.shape[1:] == shape:
-        return logits
-    return F.interpolate(logits[:, None], size=tuple(shape), mode="bilinear", align_corners=False)[:, 0]

@@ -20,7 +20,8 @@ demonstrations in other episodes. So neither has to wait for the other.
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
@@ -39,11 +40,12 @@ from lerobot_deltaco.deltaco_match.correspondence import (
     Given,
     peak_locations,
 )
-from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching, bag_of_words, vocabulary_of
+from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
 from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes, follows_gripper, warn_if_inverted
 from lerobot_deltaco.deltaco_match.robot_states import N_LOCATIONS, RobotStates, TrainingLocations
+from lerobot_deltaco.deltaco_match.words import vocabulary_of
 from lerobot_deltaco.demonstrations import DemonstrationBank, RobotData, open_dataset, read_robot_data
 from lerobot_deltaco.losses import GRIPPER_LOSSES, imitation_loss, join_action, location_loss
 from lerobot_deltaco.networks import (
@@ -95,11 +97,13 @@ class StackedDemonstrations(NamedTuple):
 
     Attributes:
         ends: First and last images, (batch, demonstrations, 2, 3, H, W) in 0..1.
+        first_images: First images at the camera's own resolution, (batch, demonstrations, 3, H', W') uint8.
         pick_states: The robot's states at the grasps, as in the dataset, (batch, demonstrations, state); NaN
             where they are not known.
     """
 
     ends: Tensor
+    first_images: Tensor
     pick_states: Tensor
 
 
@@ -129,7 +133,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if config.inputs == "one_hot" and not config.one_hot_tasks:
             config.one_hot_tasks = known_tasks(dataset_meta)
         if config.feature_matching and inputs.uses_language and dataset_meta is not None:
-            config.known_words = config.known_words or vocabulary_of(dataset_meta.tasks.index)
+            sentences = self._sentences(dataset_meta.tasks.index)
+            config.known_words = config.known_words or vocabulary_of(chain.from_iterable(sentences.values()))
         condition_dim = config.embedding_dim if inputs.uses_language else len(config.one_hot_tasks)
         backbone = BACKBONES["strided"]
         assert config.action_feature is not None
@@ -152,7 +157,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if config.feature_matching and config.uses_demonstrations:
             # Forked so that all other weights are the same with and without it.
             with torch.random.fork_rng(devices=[]):
-                self.feature_matching = FeatureMatching(len(config.known_words))
+                self.feature_matching = FeatureMatching(config.known_words, config.crop_size)
         self.training_locations: TrainingLocations | None = None
 
     # The loss
@@ -295,7 +300,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         locations, heights = known.locations[rows], known.heights[rows]
         if not is_known.all():
             demonstrations = self.banked_demonstrations(tasks) if self.config.uses_demonstrations else None
-            found = self._find(self._camera_image(batch, self.config.cameras[0]), tasks, demonstrations)
+            found = self._find(batch, tasks, demonstrations)
             locations = torch.where(is_known[:, None, None], locations, found.locations)
             heights = torch.where(is_known, heights, found.heights)
         return self._imitation_loss(batch, self._images(batch), locations, heights)
@@ -330,8 +335,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if self._episode is None or self._episode.instructions != instructions:
             if demonstrations is None and self.config.uses_demonstrations:
                 demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
-            scenes = self._camera_image(batch, self.config.cameras[0])
-            found = self._find(scenes, instructions, demonstrations)
+            found = self._find(batch, instructions, demonstrations)
             network = self.model if self.training else fuse_batch_norms(self.model)
             self._episode = Episode(instructions, found, network)
         episode: Episode = self._episode
@@ -348,14 +352,14 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     @torch.no_grad()
     def _find(
         self,
-        scenes: Tensor,
+        batch: dict[str, Any],
         instructions: Sequence[str],
         demonstrations: DemonstrationsOfTasks | None,
     ) -> Found:
         """Finds the locations of tasks in the first images of episodes.
 
         Args:
-            scenes: First images of episodes, (batch, 3, H, W) in 0..1.
+            batch: As in `select_action`, at the start of the episodes.
             instructions: Instruction of each sample; an empty string leaves it out.
             demonstrations: Demonstrations of each sample, the same number for each; an empty list leaves them
                 out. None for a policy that takes none.
@@ -363,7 +367,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         Raises:
             ValueError: An input is left out that the policy has not learned to do without.
         """
-        device, inputs = scenes.device, self.config.task_inputs
+        camera, inputs = self.config.cameras[0], self.config.task_inputs
+        scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
+        device = scenes.device
         stacked = self._stacked(demonstrations, device)
         says = torch.tensor([bool(text) for text in instructions], device=device)
         self._check_given(says, stacked)
@@ -386,20 +392,22 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 description = self.correspondence.no_description(len(scenes), device)
                 heights = torch.full((len(scenes),), torch.nan, device=device)
         maps, features = self.correspondence(scenes, scenes, description, condition, given)
+        locations = peak_locations(maps)
         if self.feature_matching is not None:
-            words = ends = picks = None
-            if self.config.known_words and bool(says.any()):
-                words = bag_of_words(self.config.known_words, instructions)
-                words = type(words)(*(part.to(device) for part in words))
+            described = None
             if stacked is not None:
                 # Where a grasp is not known, the attention stands in for its location.
                 attended = peak_locations(each.attention.clamp_min(_MIN_ATTENTION).log())[:, 0]
                 by_state = self.robot_states.pick_locations(states)
-                picks = torch.where(by_state.isnan(), attended, by_state).unflatten(0, (-1, n_each))
-                ends = stacked.ends
-            pick = self.feature_matching.pick_map(maps[:, 0], scenes, ends, picks, words)
-            maps = torch.stack([pick, maps[:, 1]], dim=1)
-        locations = peak_locations(maps)
+                picks = torch.where(by_state.isnan(), attended, by_state)
+                described = self.feature_matching.describe(
+                    stacked.ends[:, :, 0].flatten(0, 1), stacked.first_images.flatten(0, 1), picks
+                )
+                described = described.unflatten(0, (-1, n_each)).mean(dim=1)
+            texts = instructions if inputs.uses_language else None
+            candidates = self.feature_matching.find(scenes, batch[camera], described, texts)
+            locations = torch.stack([candidates.best, locations[:, 1]], dim=1)
+            maps = torch.stack([candidates.map(maps.shape[2:]), maps[:, 1]], dim=1)
         descriptors = None if description is None else description.moved
         found_heights = self.grasp_height(features, locations[:, 0], descriptors, heights, condition)
         attention = None if stacked is None or description is None else description.attention
@@ -450,14 +458,21 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if counts == {0}:
             return None
         unknown = torch.full((self.config.state_dim,), torch.nan)
-        ends, states = [], []
+        ends, native, states = [], [], []
         for own in demonstrations:
             ends.append(torch.stack([each.frames[[0, -1]] for each in own]))
+            native.append(
+                torch.stack(
+                    [each.frames[0] if each.first_image is None else each.first_image for each in own]
+                )
+            )
             states.append(
                 torch.stack([unknown if each.pick_state is None else each.pick_state.cpu() for each in own])
             )
         return StackedDemonstrations(
-            torch.stack(ends).to(device).float() / 255, torch.stack(states).to(device)
+            torch.stack(ends).to(device).float() / 255,
+            torch.stack(native).to(device),
+            torch.stack(states).to(device),
         )
 
     def _condition(self, instructions: Sequence[str], device: torch.device) -> Tensor | None:
@@ -470,7 +485,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     def _concatenated(self, batch: dict[str, Any], locations: Tensor, heights: Tensor) -> Tensor:
         """Returns the robot's state, and its offsets from the states at the locations, (batch, 3 state)."""
-        state = batch[OBS_STATE]
+        state = self.state_limits(batch[OBS_STATE])
         offsets = self.robot_states(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
 
@@ -499,6 +514,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert robot_data is not None
         assert self.training_bank is not None
         config, device, frames = self.config, self.step.device, self.training_bank.frames
+        if config.task_inputs.uses_language:
+            sentences = self._sentences(self.training_bank.tasks)
+            self.instructions.add(list(chain.from_iterable(sentences.values())))
         states = robot_data.states.to(device)
         gripper = config.gripper_opening(robot_data.actions).to(device)
         keyframes = find_keyframes(states, gripper, robot_data.spans)
@@ -512,18 +530,30 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         matching = self.feature_matching
         if matching is not None and not bool(matching.fitted):
             picks = torch.where(known.found[:, None], known.locations[:, 0], torch.nan)
-            present = None
-            if config.known_words:
-                present = bag_of_words(config.known_words, self.training_bank.tasks).present.to(device)
-            matching.fit(frames[:, 0], picks, self.training_bank.tasks, present, config.seed)
+            native = self.training_bank.first_images
+            native = frames[:, 0] if native is None else native
+            tasks = self.training_bank.tasks
+            matching.fit(
+                frames[:, 0], frames[:, -1], native, picks, tasks, self._sentences(tasks), config.seed
+            )
+
+    def _sentences(self, tasks: Iterable[str]) -> dict[str, list[str]]:
+        """Returns the instructions of tasks in training; a task string is repeated by its probability."""
+        found = {}
+        for task in dict.fromkeys(tasks):
+            own = [] if self.paraphrases is None else list(self.paraphrases.of(task))
+            p = self.config.p_paraphrase if own else 0.0
+            n_templates = 1 if p == 0 else round(len(own) * (1 - p) / p)
+            found[task] = [task] * n_templates + (own if p else [])
+        return found
 
     def _normalized(self, states: Tensor) -> Tensor:
-        """Normalizes robot states (n, state) as the preprocessor does, on the CPU."""
+        """Normalizes robot states (n, state) as the network gets them, without clipping, on the CPU."""
         step = NormalizerProcessorStep(
             {OBS_STATE: self.config.robot_state_feature}, self.config.normalization_mapping, self._stats
         )
         normalized = step(create_transition(observation={OBS_STATE: states}))
-        return normalized[TransitionKey.OBSERVATION][OBS_STATE]
+        return normalized[TransitionKey.OBSERVATION][OBS_STATE] * self.state_limits.scale.cpu()
 
     def _read_evaluation_bank(self) -> DemonstrationBank | None:
         bank = super()._read_evaluation_bank()

@@ -1,0 +1,89 @@
+"""Paraphrases: the tasks in people's words, from a grammar.
+
+`phrases.yaml` lists phrases for what an instruction says. A sentence draws one for each part, sometimes
+without articles, and sometimes with a typing error.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+
+from gym_deltaco.tasks import OBJECTS, Task
+
+PhraseSplit = Literal["train", "held_out"]
+
+_FILE = Path(__file__).with_name("phrases.yaml")
+_P_NO_ARTICLE, _P_TYPO = 0.3, 0.1
+_MIN_TYPO_LENGTH = 5  # letters, of a word that is misspelled
+_P_HELD_OUT = 0.4  # of each part of a held-out sentence
+_ENDS = ("", "", ".", "!")
+
+
+def paraphrase(task: Task, split: PhraseSplit, rng: np.random.Generator) -> str:
+    """Returns the instruction of a task in people's words.
+
+    Args:
+        task: The task.
+        split: "train"; or "held_out", for a sentence with a phrase that is in no training sentence.
+        rng: Source of the draws.
+    """
+    while True:
+        sentence, has_new_phrase = _draw_sentence(task, split, rng)
+        if has_new_phrase or split == "train":
+            return sentence
+
+
+def _draw_sentence(task: Task, split: PhraseSplit, rng: np.random.Generator) -> tuple[str, bool]:
+    """Draws a sentence, and returns whether it has a held-out phrase."""
+    phrases, is_new = _phrases(), False
+
+    def draw(lists: Mapping[str, list[str]]) -> str:
+        nonlocal is_new
+        new = split == "held_out" and rng.random() < _P_HELD_OUT
+        is_new |= new
+        choice = lists["held_out" if new else "train"]
+        return choice[int(rng.integers(len(choice)))]
+
+    parts: dict[str, str] = {part: draw(phrases[part]) for part in ("verb", "take", "in", "noun")}
+    label = OBJECTS[task.row] if task.kind == "name" else None
+    color = label.color if label is not None else task.color
+    shape = label.shape if label is not None else task.shape
+    words = {
+        "color": draw(phrases["color"][color]) if task.kind != "shape" else "",
+        "shape": draw(phrases["shape"][shape]) if task.kind != "color" else "",
+        "name": label.name if label is not None else "",
+    }
+    parts["object"] = draw(phrases["object"][task.kind]).format(**words)
+    parts["container"] = draw(phrases["container"][task.container]).format(**parts)
+    sentence = draw(phrases["patterns"]).format(**parts)
+    if rng.random() < _P_NO_ARTICLE:
+        sentence = re.sub(r"\b(the|a) ", "", sentence)
+    if rng.random() < _P_TYPO:
+        sentence = _misspell(sentence, rng)
+    if rng.random() < 0.5:
+        sentence = sentence[0].upper() + sentence[1:]
+    return sentence + _ENDS[int(rng.integers(len(_ENDS)))], is_new
+
+
+def _misspell(sentence: str, rng: np.random.Generator) -> str:
+    """Returns a sentence with two letters of a word swapped, or one left out or doubled."""
+    words = [found for found in re.finditer(r"[a-z]+", sentence) if len(found[0]) >= _MIN_TYPO_LENGTH]
+    if not words:
+        return sentence
+    word = words[int(rng.integers(len(words)))]
+    place = word.start() + int(rng.integers(1, len(word[0]) - 1))
+    before, pair, after = sentence[:place], sentence[place : place + 2], sentence[place + 2 :]
+    changed = (pair[::-1], pair[1:], pair[0] + pair)[int(rng.integers(3))]
+    return before + changed + after
+
+
+@cache
+def _phrases() -> dict[str, Any]:
+    return yaml.safe_load(_FILE.read_text(encoding="utf-8"))

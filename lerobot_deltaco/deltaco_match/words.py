@@ -1,0 +1,86 @@
+"""Words of instructions: known ones, misspelled ones, and which of them describe the object."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Sequence
+from functools import cache
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+NO_WORD, UNKNOWN_WORD = 0, 1  # indices of words; those of the vocabulary follow
+_N_SPECIAL = 2
+_N_NEIGHBORS = 2  # words on either side that tell what a word is about
+# A word is taken for a known one if so much of it is the same (as a ratio), and it is not too short.
+_MIN_SIMILARITY, _MIN_LENGTH = 0.8, 4
+
+
+def words_of(sentence: str) -> list[str]:
+    """Returns the words of a sentence in their order, in lower case, without digits and punctuation."""
+    return re.findall(r"[^\W\d_]+", sentence.lower())
+
+
+def vocabulary_of(sentences: Iterable[str]) -> list[str]:
+    """Returns all words of sentences, in alphabetical order."""
+    return sorted(set().union(*map(words_of, sentences)))
+
+
+def understand(sentence: str, vocabulary: Sequence[str]) -> list[str | None]:
+    """Returns each word of a sentence as it is understood: as a known word, or not at all (None).
+
+    A word outside the vocabulary is taken for the most similar known one, if that is similar enough.
+    """
+    return [_understand_word(word, tuple(vocabulary)) for word in words_of(sentence)]
+
+
+@cache
+def _understand_word(word: str, vocabulary: tuple[str, ...]) -> str | None:
+    if word in vocabulary:
+        return word
+    if len(word) < _MIN_LENGTH:
+        return None
+    return next(iter(difflib.get_close_matches(word, vocabulary, 1, _MIN_SIMILARITY)), None)
+
+
+def encode_words(sentences: Sequence[str], vocabulary: Sequence[str]) -> Tensor:
+    """Returns the indices of the words of sentences, (sentences, words) int64.
+
+    `NO_WORD` fills up shorter sentences, and `UNKNOWN_WORD` stands for words that are not understood.
+    """
+    index = {word: n for n, word in enumerate(vocabulary, start=_N_SPECIAL)}
+    rows = [
+        torch.tensor([UNKNOWN_WORD if word is None else index[word] for word in understand(text, vocabulary)])
+        for text in sentences
+    ]
+    return nn.utils.rnn.pad_sequence([torch.as_tensor(row, dtype=torch.int64) for row in rows], True, NO_WORD)
+
+
+class WordWeights(nn.Module):
+    """Weighs words by whether they describe the object: "red" does in "red cup", and not in "red bin".
+
+    A weight depends on the word and on two words at either side.
+
+    Args:
+        n_words: Size of the vocabulary.
+    """
+
+    def __init__(self, n_words: int) -> None:
+        super().__init__()
+        self.own = nn.Embedding(n_words + _N_SPECIAL, 1)
+        self.neighbors = nn.ModuleList(nn.Embedding(n_words + _N_SPECIAL, 1) for _ in range(2 * _N_NEIGHBORS))
+        for table in self.modules():
+            if isinstance(table, nn.Embedding):
+                nn.init.zeros_(table.weight)
+
+    def forward(self, words: Tensor) -> Tensor:
+        """Maps indices of words, (batch, words), to weights in 0..1, (batch, words)."""
+        padded = F.pad(words, (_N_NEIGHBORS, _N_NEIGHBORS), value=NO_WORD)
+        logits = self.own(words)[..., 0]
+        distances = [n for n in range(-_N_NEIGHBORS, _N_NEIGHBORS + 1) if n]
+        for table, distance in zip(self.neighbors, distances, strict=True):
+            first = _N_NEIGHBORS + distance
+            logits = logits + table(padded[:, first : first + words.shape[1]])[..., 0]
+        return torch.sigmoid(logits) * (words != NO_WORD)

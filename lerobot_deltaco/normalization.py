@@ -1,0 +1,56 @@
+"""The robot's state as the networks get it: without the noise of joints that hardly move."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor, nn
+
+logger = logging.getLogger(__name__)
+
+# Least standard deviation of a dimension of the state, as a fraction of the largest one.
+MIN_STD_FRACTION = 0.03
+MAX_STATE = 5.0  # in standard deviations
+
+
+class StateLimits(nn.Module):
+    """Limits normalized states.
+
+    A joint that hardly moves in the training data has a tiny standard deviation, by which its noise is
+    divided: it would decide the action. So no dimension is divided by less than 3 % of the largest standard
+    deviation. States beyond 5 standard deviations are clipped.
+
+    Args:
+        state_dim: Size of the robot's state.
+        stats: Statistics of the training dataset; None in evaluation, where the weights are loaded.
+
+    Attributes:
+        scale: Factors of the dimensions, (state,): 1, or less for one that hardly moves.
+    """
+
+    scale: Tensor
+
+    def __init__(self, state_dim: int, stats: Mapping[str, Mapping[str, Any]] | None) -> None:
+        super().__init__()
+        scale = torch.ones(state_dim)
+        if state_dim and stats is not None and "std" in stats.get(OBS_STATE, {}):
+            std = torch.as_tensor(stats[OBS_STATE]["std"]).float().reshape(state_dim)
+            least = MIN_STD_FRACTION * std.max()
+            scale = torch.where(std < least, std / least, 1.0)
+            still = (scale < 1).nonzero().flatten().tolist()
+            if still:
+                logger.warning(
+                    "Dimensions %s of the robot's state hardly move in the training data, and are divided by "
+                    "%.2g instead of their smaller standard deviations.",
+                    ", ".join(map(str, still)),
+                    least.item(),
+                )
+        self.register_buffer("scale", scale)
+
+    def forward(self, states: Tensor) -> Tensor:
+        """Maps normalized states, (..., state), to limited ones."""
+        return (states * self.scale).clamp(-MAX_STATE, MAX_STATE)
