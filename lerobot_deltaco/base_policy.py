@@ -29,6 +29,9 @@ from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.normalization import StateLimits
 from lerobot_deltaco.task_bank import TASK_BANK, find_task_bank, read_task_bank, write_task_bank
 
+# Normalized actions are in -1..1; a policy may overshoot, but not by that much.
+_ABSURD_ACTION = 100.0
+
 DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
 
 
@@ -122,6 +125,23 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             f"{'none' if tasks is None else repr(tasks)}. LeRobot takes it from the environment's "
             '`task_description`, or from --task; in Python, set observation["task"] before the preprocessor.'
         )
+
+    def _checked_action(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
+        """Returns an action unless it could not be carried out.
+
+        Raises:
+            FloatingPointError: It is not finite, or absurdly far outside of -1..1.
+        """
+        if bool((action.abs() < _ABSURD_ACTION).all()):  # False for NaN
+            return action
+        damaged = _not_finite(batch)
+        cause = (
+            f"In the observation, {', '.join(f'`{name}`' for name in damaged)} has numbers that are not "
+            "finite: check the sensors, and the normalization statistics of the checkpoint."
+            if damaged
+            else "The observation is finite, so the weights of the checkpoint are damaged. Fetch it again."
+        )
+        raise FloatingPointError(f"The policy's action is not finite, or absurdly large. {cause}")
 
     def banked_demonstrations(self, tasks: Sequence[str], n_each: int = 1) -> list[list[Demonstration]]:
         """Returns demonstrations of tasks from the bank; samples of the same task take different ones.
@@ -368,13 +388,18 @@ def _non_finite_weight(module: nn.Module) -> str | None:
     return None
 
 
-def _why_not_finite(batch: dict[str, Any], step: int) -> str:
-    """Returns an error message for a loss that is not finite."""
-    damaged = [
+def _not_finite(batch: dict[str, Any]) -> list[str]:
+    """Returns the names of the tensors of a batch with numbers that are not finite."""
+    return [
         name
         for name, values in batch.items()
         if isinstance(values, Tensor) and values.is_floating_point() and not bool(values.isfinite().all())
     ]
+
+
+def _why_not_finite(batch: dict[str, Any], step: int) -> str:
+    """Returns an error message for a loss that is not finite."""
+    damaged = _not_finite(batch)
     cause = (
         f"In its batch, {', '.join(f'`{name}`' for name in damaged)} has numbers that are not finite: the "
         "dataset or its statistics are damaged."

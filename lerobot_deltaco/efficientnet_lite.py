@@ -113,7 +113,7 @@ class EfficientNetLite0(nn.Module):
 
 
 def imagenet_weights() -> dict[str, Tensor]:
-    """Reads the published weights from the package that the extra `offline` installs.
+    """Reads the published weights from their package.
 
     Raises:
         PretrainedWeightsError: The package is missing, or its weights are not the published ones.
@@ -122,7 +122,7 @@ def imagenet_weights() -> dict[str, Tensor]:
     if spec is None or spec.origin is None:
         raise PretrainedWeightsError(
             f"EfficientNet-Lite0 needs the package {_PACKAGE.replace('_', '-')}, which brings its weights. "
-            "Install this project's extra `offline`."
+            "It is among this project's dependencies; install them again."
         )
     path = Path(spec.origin).parent / _WEIGHTS
     with path.open("rb") as file:

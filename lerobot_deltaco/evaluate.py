@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gym_deltaco import ENV_ID
-from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.env import N_JOINTS, PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.base_config import SOURCES
@@ -146,7 +146,9 @@ class Evaluation:
         batch = self.batches[number]
         demonstrations = [self._demonstrations(episode) for episode in batch]
         with self._computing(batch):
-            infos = run_episodes(self.loaded, self.simulators, batch, demonstrations, callback)
+            infos = run_episodes(
+                self.loaded, self.simulators, batch, demonstrations, callback, self.plan.joint_noise
+            )
         # Without the demonstrations' tensors, which should not be sent between processes.
         return [
             Outcome(
@@ -195,6 +197,7 @@ def run_episodes(
     episodes: Sequence[Episode],
     demonstrations: Sequence[Sequence[Demonstration]],
     callback: StepCallback | None = None,
+    joint_noise: float = 0.0,
 ) -> list[dict[str, Any]]:
     """Runs episodes at the same time.
 
@@ -204,6 +207,7 @@ def run_episodes(
         episodes: The episodes.
         demonstrations: Demonstrations of each.
         callback: Called after the reset and after each step.
+        joint_noise: Standard deviation of the noise on each joint angle that the policy observes, degrees.
 
     Returns:
         Info of each environment after its last step.
@@ -218,10 +222,14 @@ def run_episodes(
     policy.reset()
     if isinstance(policy, TaskConditionedPolicy):
         policy.set_tasks(instructions, demonstrations)
+    noise = [np.random.default_rng(episode.seed) for episode in episodes]
     for _ in range(envs[0].scene_config.episode_length):
         if callback is not None:
             callback(envs, observations)
         stacked = {name: np.stack([each[name] for each in observations]) for name in observations[0]}
+        if joint_noise:
+            drawn = np.stack([rng.normal(0, np.radians(joint_noise), N_JOINTS) for rng in noise])
+            stacked["agent_pos"][:, :N_JOINTS] += drawn.astype(np.float32)
         batch = {**preprocess_observation(stacked), "task": instructions}
         actions = loaded.postprocessor(policy.select_action(loaded.preprocessor(batch)))
         steps = [env.step(action) for env, action in zip(envs, actions.cpu().numpy(), strict=True)]

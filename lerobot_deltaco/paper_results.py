@@ -83,7 +83,7 @@ _OWN_LABELS = {
     "either": "DeL-TaCo, takes either input",
     "deltaco_paraphrases": "DeL-TaCo, trained on paraphrases",
     "deltaco_paraphrases_templates": "DeL-TaCo, trained on paraphrases and templates",
-    "deltaco_matching": "DeL-TaCo, pretrained matching",
+    "deltaco_matching": "DeL-TaCo, feature matching",
     "deltaco_attention": "DeL-TaCo, attention encoder",
     "language_only_paraphrases": "language only, trained on paraphrases",
     "minilm_l3": "DeL-TaCo, MiniLM-L3",
@@ -97,7 +97,7 @@ _OWN_LABELS = {
     "objects_100": "100 training objects",
     "objects_400": "400 training objects",
     "objects_400_either": "400 training objects, takes either input",
-    "objects_400_either_matching": "400 training objects, takes either input, pretrained matching",
+    "objects_400_either_matching": "400 training objects, takes either input, feature matching",
 }
 TITLES = {
     "scenario_a": "Scenario A: novel objects, colors and shapes",

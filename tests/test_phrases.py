@@ -26,7 +26,7 @@ def test_every_task_has_sentences_of_both_splits(sentences):
 
 
 def test_sentences_name_what_the_task_asks_for(sentences):
-    """Up to typing errors, each sentence by name has the name, and none has the other color of a container."""
+    """Up to typing errors, a sentence by name has the name, and none has another container's color."""
     for task in TASKS[: len(TASKS) // 3]:
         for sentence in (*sentences["train"][task.index], *sentences["held_out"][task.index]):
             words = sentence.lower().rstrip(".!").replace(",", "").split()
@@ -41,7 +41,8 @@ def test_sentences_name_what_the_task_asks_for(sentences):
 
 def test_sentences_are_a_function_of_the_generator():
     drawn = [
-        [paraphrase(TASKS[seed], "train", np.random.default_rng(seed)) for seed in range(50)] for _ in range(2)
+        [paraphrase(TASKS[seed], "train", np.random.default_rng(seed)) for seed in range(50)]
+        for _ in range(2)
     ]
     assert drawn[0] == drawn[1]
     held_out = [paraphrase(TASKS[0], "held_out", np.random.default_rng(seed)) for seed in range(50)]

@@ -24,6 +24,7 @@ STATE_NAMES = [
     *("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate"),
     *("end_effector_x", "end_effector_y", "end_effector_z", "gripper_open"),
 ]
+N_JOINTS = 6  # whose angles come first in the state
 ACTION_NAMES = ["delta_x", "delta_y", "delta_z", "gripper"]
 
 # Bounds of `agent_pos`. Joints are within half a turn of their rest position; 0.001 allows for rounding.

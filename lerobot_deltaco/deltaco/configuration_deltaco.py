@@ -72,8 +72,8 @@ class DeltacoConfig(TaskConditionedConfig):
         demo_encoder: Encoder of demonstrations: cnn, the paper's; attention, this project's, which compares
             the frames at each location and attends to a few locations; or pretrained, a frozen image encoder.
         vision_encoder: Frozen image encoder for `demo_encoder=pretrained`: clip-vit-base-patch32,
-            r3m-resnet18, r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0 (in the
-            extra `offline`), a folder with an image model of transformers, or its name on the Hub.
+            r3m-resnet18, r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0, a folder
+            with an image model of transformers, or its name on the Hub.
         vision_encoder_weights: File with R3M's weights, which are otherwise downloaded.
         vision_image_size: Height and width to which the grid of a demonstration's frames is scaled for that
             encoder; by default, the size of the images that it was trained on.

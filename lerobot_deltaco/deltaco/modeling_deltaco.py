@@ -186,6 +186,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
 
         Raises:
             ValueError: There is no instruction, or a task has no demonstration.
+            FloatingPointError: The action is not finite, or absurdly large.
         """
         instructions, demonstrations = self._tasks_of(batch)
         images = self._images(batch)
@@ -196,7 +197,8 @@ class DeltacoPolicy(TaskConditionedPolicy):
         predicted, gripper = episode.network(images, episode.film, concat)
         if gripper is not None:
             gripper = torch.sigmoid(gripper.float())
-        return join_action(predicted.mode.float(), gripper, self.config.gripper_index)
+        action = join_action(predicted.mode.float(), gripper, self.config.gripper_index)
+        return self._checked_action(action, batch)
 
     def _begin_episode(
         self,

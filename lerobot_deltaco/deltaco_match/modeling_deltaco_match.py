@@ -330,6 +330,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
         Raises:
             ValueError: There is no instruction, or a task has no demonstration.
+            FloatingPointError: The action is not finite, or absurdly large.
         """
         instructions, demonstrations = self._tasks_of(batch)
         if self._episode is None or self._episode.instructions != instructions:
@@ -342,7 +343,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         locations, heights = episode.found.locations, episode.found.heights
         concat = self._concatenated(batch, locations, heights)
         predicted, gripper = episode.network(self._images(batch), None, concat, locations)
-        return join_action(predicted.mode.float(), torch.sigmoid(gripper.float()), self.config.gripper_index)
+        gripper = torch.sigmoid(gripper.float())
+        action = join_action(predicted.mode.float(), gripper, self.config.gripper_index)
+        return self._checked_action(action, batch)
 
     @property
     def found(self) -> Found | None:
