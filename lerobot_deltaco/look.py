@@ -165,7 +165,7 @@ def _benchmark_views(loaded: LoadedPolicy, n_episodes: int, out: Path) -> Iterat
         write_video(recording.frames, video)
         is_success = bool(recording.info["is_success"])
         text = "success" if is_success else "failure"
-        text = f"Task {task.index}: {text}"
+        text = f"Task {task.index}: {text}{_how_sure(policy, task.instruction, recording.found)}"
         uri = _data_uri("video/mp4", video.read_bytes())
         video.unlink()
         yield View(task.instruction, _picture_uri(picture), text, is_success, uri)
@@ -211,11 +211,23 @@ def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: in
         if bank is not None:
             own = partners[episode] == episode
             text += ", demonstrated by " + ("itself" if own else f"episode {partners[episode]}")
+        text += _how_sure(policy, tasks[episode], found)
         image = (observation[config.cameras[0]] * 255).round().to(torch.uint8)
         scene = image.permute(1, 2, 0).numpy()
         ends = demonstration_ends(shown[0]) if shown else None
         picture = draw_found(scene, ends, found, 0, recorded)
         yield View(tasks[episode], _picture_uri(picture), f"Episode {episode}: {text}", is_right)
+
+
+def _how_sure(policy: DeltacoMatchPolicy, instruction: str, found: Found) -> str:
+    """Returns how sure a policy is of what to pick, and which words count, as the end of a sentence."""
+    if found.p_pick is None or policy.feature_matching is None:
+        return ""
+    words = [
+        word if word == meant else f"{word} ({meant})"
+        for word, meant in policy.feature_matching.understood(instruction)
+    ]
+    return f"; {100 * found.p_pick[0]:.0f} % sure; words for the object: {', '.join(words) or 'none'}"
 
 
 def _check_features(config: TaskConditionedConfig, dataset: LeRobotDataset) -> None:

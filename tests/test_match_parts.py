@@ -393,9 +393,13 @@ def test_words_that_describe_the_container_do_not_count():
     matching.requires_grad_(True)
     sentences = {text: [text] for text in tasks}
     matching._fit_comparison(features, target, [tasks[n] for n in task], sentences, generator, 150)
-    weights = matching.word_weights(encode_words(["put the red cube in the red bin"], matching.vocabulary))[0]
+    sentence = "Putt the red cubee in the red bin"
+    weights = matching.word_weights(encode_words([sentence], matching.vocabulary))[0]
     assert weights[2] > 0.7
     assert weights[6] < 0.3
+    assert ("red", "red") in matching.understood(sentence)
+    assert len(matching.understood(sentence)) < 4
+    assert matching.understood("") == []
 
 
 def test_fit_needs_a_task_with_two_grasps(shapes):

@@ -30,7 +30,7 @@ from tqdm import tqdm
 from lerobot_deltaco.deltaco_match import proposals
 from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, crop_features, fit_perspective
 from lerobot_deltaco.deltaco_match.proposals import ProposalNetwork
-from lerobot_deltaco.deltaco_match.words import UNKNOWN_WORD, WordWeights, encode_words
+from lerobot_deltaco.deltaco_match.words import UNKNOWN_WORD, WordWeights, encode_words, understand, words_of
 from lerobot_deltaco.networks import gaussian_maps
 
 _DESCRIPTOR_DIM, _HIDDEN_DIM, _DROPOUT = 64, 256, 0.5
@@ -43,9 +43,10 @@ _P_OTHER_OBJECT, _SHARPNESS = 0.5, 1.5
 FIT_STEPS = 1500
 _MAX_EPISODES = 10_000
 _SCENES_PER_STEP = 64
-_LEARNING_RATE, _WORD_LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 1e-3, 3e-2, 0.2, 0.1
+_LEARNING_RATE, _WORD_LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 1e-3, 3e-3, 0.2, 0.1
 _P_DROP_WORD = 0.3
 _WORD_PENALTY = 0.03  # of each word's weight
+_COUNTS = 0.5  # weight from which on a word is shown as one that describes the object
 _MAP_STD = 0.8  # of a candidate, in cells
 _MAX_DISTANCE = 0.19  # from a grasp, of the proposal that stands for it: 4.5 px of 48
 _ENCODED_AT_A_TIME = 16
@@ -138,6 +139,21 @@ class FeatureMatching(nn.Module):
                     (1 - p_other) * similar.softmax(dim=1) + p_other / scores.shape[1]
                 )
             return Candidates(locations, scores.log_softmax(dim=1))
+
+    @torch.no_grad()
+    def understood(self, instruction: str) -> list[tuple[str, str]]:
+        """Returns the words of an instruction that describe the object, and what each is understood as."""
+        said, vocabulary = words_of(instruction), self.vocabulary
+        if not said or not vocabulary:
+            return []
+        device = self.fitted.device
+        weights = self.word_weights(encode_words([instruction], vocabulary).to(device))[0].tolist()
+        known = understand(instruction, vocabulary)
+        return [
+            (word, meant)
+            for word, meant, weight in zip(said, known, weights, strict=True)
+            if meant is not None and weight > _COUNTS
+        ]
 
     @torch.no_grad()
     def describe(self, images: Tensor, native: Tensor, locations: Tensor) -> Tensor:

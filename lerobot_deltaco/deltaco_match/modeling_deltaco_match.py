@@ -45,7 +45,12 @@ from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes, follows_gripper, warn_if_inverted
 from lerobot_deltaco.deltaco_match.robot_states import N_LOCATIONS, RobotStates, TrainingLocations
-from lerobot_deltaco.deltaco_match.words import vocabulary_of
+from lerobot_deltaco.deltaco_match.words import (
+    INSTRUCTION_DIM,
+    InstructionEncoder,
+    encode_words,
+    vocabulary_of,
+)
 from lerobot_deltaco.demonstrations import DemonstrationBank, RobotData, open_dataset, read_robot_data
 from lerobot_deltaco.losses import GRIPPER_LOSSES, imitation_loss, join_action, location_loss
 from lerobot_deltaco.networks import (
@@ -75,6 +80,7 @@ class Found(NamedTuple):
             without demonstrations.
         by_demonstration: Whether the pick and the place location were found by the demonstration. Otherwise,
             the attention is meaningless.
+        p_pick: Probability of the pick location among the proposals, (batch,); None without feature matching.
     """
 
     locations: Tensor
@@ -82,6 +88,7 @@ class Found(NamedTuple):
     maps: Tensor
     attention: Tensor | None
     by_demonstration: tuple[bool, bool]
+    p_pick: Tensor | None = None
 
 
 class Episode(NamedTuple):
@@ -115,6 +122,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         correspondence: Predicts pick and place maps.
         robot_states: The robot's states at locations.
         grasp_height: Estimates height offsets of grasps.
+        instruction_encoder: Embeds instructions; None without them.
         feature_matching: Finds what to pick by pretrained features; None without it.
     """
 
@@ -132,10 +140,10 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         inputs = config.task_inputs
         if config.inputs == "one_hot" and not config.one_hot_tasks:
             config.one_hot_tasks = known_tasks(dataset_meta)
-        if config.feature_matching and inputs.uses_language and dataset_meta is not None:
+        if inputs.uses_language and dataset_meta is not None:
             sentences = self._sentences(dataset_meta.tasks.index)
             config.known_words = config.known_words or vocabulary_of(chain.from_iterable(sentences.values()))
-        condition_dim = config.embedding_dim if inputs.uses_language else len(config.one_hot_tasks)
+        condition_dim = INSTRUCTION_DIM if inputs.uses_language else len(config.one_hot_tasks)
         backbone = BACKBONES["strided"]
         assert config.action_feature is not None
         self.model = PolicyNetwork(
@@ -149,6 +157,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             stem_stride=backbone.stem_stride,
             num_components=config.num_mixture_components,
             n_locations=N_LOCATIONS,
+        )
+        self.instruction_encoder = (
+            InstructionEncoder(len(config.known_words)) if inputs.uses_language else None
         )
         self.correspondence = CorrespondenceNetwork(*inputs[:2], condition_dim, config.takes_either)
         self.robot_states = RobotStates(config.state_dim)
@@ -248,7 +259,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert known is not None
         rows, device = bank.episode_rows(episodes), episodes.device
         given = self._draw_given(len(rows), generator, device)
-        condition = self._condition(instructions, device)
+        condition = self._condition(instructions, device, generator)
         plain = bank.frames[rows, 0].float() / 255  # (batch, 3, H, W)
         plain, locations = _shifted(plain, known.locations[rows], generator)
         scenes, description, demonstrated = plain, None, None
@@ -395,7 +406,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 description = self.correspondence.no_description(len(scenes), device)
                 heights = torch.full((len(scenes),), torch.nan, device=device)
         maps, features = self.correspondence(scenes, scenes, description, condition, given)
-        locations = peak_locations(maps)
+        locations, p_pick = peak_locations(maps), None
         if self.feature_matching is not None:
             described = None
             if stacked is not None:
@@ -409,6 +420,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 described = described.unflatten(0, (-1, n_each)).mean(dim=1)
             texts = instructions if inputs.uses_language else None
             candidates = self.feature_matching.find(scenes, batch[camera], described, texts)
+            p_pick = candidates.log_probabilities.amax(dim=1).exp()
             locations = torch.stack([candidates.best, locations[:, 1]], dim=1)
             maps = torch.stack([candidates.map(maps.shape[2:]), maps[:, 1]], dim=1)
         descriptors = None if description is None else description.moved
@@ -416,9 +428,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         attention = None if stacked is None or description is None else description.attention
         places = inputs.places_by_demonstration or not bool(says.all())
         by_demonstration = (stacked is not None, stacked is not None and places)
-        return Found(
-            locations, found_heights + self.config.grasp_height_bias, maps, attention, by_demonstration
-        )
+        found_heights = found_heights + self.config.grasp_height_bias
+        return Found(locations, found_heights, maps, attention, by_demonstration, p_pick)
 
     def _check_given(self, says: Tensor, stacked: StackedDemonstrations | None) -> None:
         """Checks that the policy has learned to do without the inputs that are left out.
@@ -478,13 +489,22 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             torch.stack(states).to(device),
         )
 
-    def _condition(self, instructions: Sequence[str], device: torch.device) -> Tensor | None:
-        """Returns embeddings of instructions, or one-hot tasks, (batch, condition); None without either."""
+    def _condition(
+        self, instructions: Sequence[str], device: torch.device, generator: torch.Generator | None = None
+    ) -> Tensor | None:
+        """Returns embeddings of instructions, or one-hot tasks, (batch, condition); None without either.
+
+        Args:
+            instructions: Instruction of each sample.
+            device: Device of the result.
+            generator: In training, source of the draws of words that are left out, on the CPU.
+        """
         if self.config.inputs == "one_hot":
             return one_hot(instructions, self.config.one_hot_tasks, device)
-        if not self.config.task_inputs.uses_language:
+        if self.instruction_encoder is None:
             return None
-        return self.instructions(instructions, device)
+        words = encode_words(instructions, self.config.known_words).to(device)
+        return self.instruction_encoder(words, generator)
 
     def _concatenated(self, batch: dict[str, Any], locations: Tensor, heights: Tensor) -> Tensor:
         """Returns the robot's state, and its offsets from the states at the locations, (batch, 3 state)."""
@@ -517,9 +537,6 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert robot_data is not None
         assert self.training_bank is not None
         config, device, frames = self.config, self.step.device, self.training_bank.frames
-        if config.task_inputs.uses_language:
-            sentences = self._sentences(self.training_bank.tasks)
-            self.instructions.add(list(chain.from_iterable(sentences.values())))
         states = robot_data.states.to(device)
         gripper = config.gripper_opening(robot_data.actions).to(device)
         keyframes = find_keyframes(states, gripper, robot_data.spans)

@@ -13,6 +13,11 @@ from torch import Tensor, nn
 
 NO_WORD, UNKNOWN_WORD = 0, 1  # indices of words; those of the vocabulary follow
 _N_SPECIAL = 2
+WORD_DIM, _N_SUMS = 64, 2
+INSTRUCTION_DIM = _N_SUMS * WORD_DIM
+_WORD_STD, _P_DROP_WORD = 0.3, 0.2
+# Words are rare in batches: their tables learn as much faster than the rest of the network.
+_LEARNING_SPEED = 10.0
 _N_NEIGHBORS = 2  # words on either side that tell what a word is about
 # A word is taken for a known one if so much of it is the same (as a ratio), and it is not too short.
 _MIN_SIMILARITY, _MIN_LENGTH = 0.8, 4
@@ -83,4 +88,34 @@ class WordWeights(nn.Module):
         for table, distance in zip(self.neighbors, distances, strict=True):
             first = _N_NEIGHBORS + distance
             logits = logits + table(padded[:, first : first + words.shape[1]])[..., 0]
-        return torch.sigmoid(logits) * (words != NO_WORD)
+        return torch.sigmoid(_LEARNING_SPEED * logits) * (words != NO_WORD)
+
+
+class InstructionEncoder(nn.Module):
+    """Embeds instructions as two weighted sums of their words' vectors.
+
+    In training, one of the weightings comes to describe the object, the other the place.
+
+    Args:
+        n_words: Size of the vocabulary.
+    """
+
+    def __init__(self, n_words: int) -> None:
+        super().__init__()
+        self.weights = nn.ModuleList(WordWeights(n_words) for _ in range(_N_SUMS))
+        self.vectors = nn.Embedding(n_words + _N_SPECIAL, WORD_DIM)
+        nn.init.normal_(self.vectors.weight, std=_WORD_STD / _LEARNING_SPEED)
+
+    def forward(self, words: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Embeds sentences, (batch, INSTRUCTION_DIM); zeros for an empty one.
+
+        Args:
+            words: Indices of the words, (batch, words).
+            generator: In training, source of the draws of words that are left out, on the CPU.
+        """
+        if generator is not None:
+            dropped = torch.rand(words.shape, generator=generator).to(words.device) < _P_DROP_WORD
+            words = torch.where(dropped & (words != NO_WORD), UNKNOWN_WORD, words)
+        vectors = _LEARNING_SPEED * self.vectors(words) * (words > UNKNOWN_WORD)[..., None]
+        sums = [torch.einsum("bw,bwd->bd", weights(words), vectors) for weights in self.weights]
+        return torch.cat(sums, dim=1)
