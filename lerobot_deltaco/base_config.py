@@ -13,7 +13,6 @@ import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 
 from gym_deltaco.env import ACTION_NAMES
-from lerobot_deltaco.language import LANGUAGE_ENCODERS, MINILM_L6
 from lerobot_deltaco.optimization import CosineSchedulerConfig, FusedAdamWConfig
 
 logger = logging.getLogger(__name__)
@@ -28,9 +27,6 @@ class TaskConditionedConfig(PreTrainedConfig):
     """Options of a policy that performs the task of a demonstration, an instruction, or both.
 
     Args:
-        language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'), all-MiniLM-L6-v2,
-            all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `offline`
-            includes the first two.
         paraphrases: Sentences in people's words for the benchmark's tasks, from which instructions are drawn
             in training: "grammar" for those that the benchmark makes from phrases, or a CSV file. With
             "grammar", the tasks of other datasets keep their task strings.
@@ -67,7 +63,6 @@ class TaskConditionedConfig(PreTrainedConfig):
         grad_clip_norm: Maximum norm of the gradient; 0 for no clipping.
     """
 
-    language_encoder: str = MINILM_L6
     paraphrases: str | None = None
     paraphrases_split: str = "train"
     p_paraphrase: float = 1.0
@@ -119,7 +114,6 @@ class TaskConditionedConfig(PreTrainedConfig):
             ValueError: An option is invalid; the message says what is valid.
         """
         self.check_choices(
-            language_encoder=LANGUAGE_ENCODERS,
             paraphrases_split=PARAPHRASE_SPLITS,
             gripper_closed=("low", "high"),
             dtype=("float32", "bfloat16"),
@@ -254,11 +248,6 @@ class TaskConditionedConfig(PreTrainedConfig):
     def state_dim(self) -> int:
         """Size of the robot's state, 0 without one."""
         return self.robot_state_feature.shape[0] if self.robot_state_feature else 0
-
-    @property
-    def embedding_dim(self) -> int:
-        """Size of an instruction's embedding."""
-        return LANGUAGE_ENCODERS[self.language_encoder].embedding_dim
 
     # Implemented by each policy
 

@@ -52,7 +52,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset_meta: Metadata of the training dataset; None in evaluation.
 
     Attributes:
-        instructions: Embeddings of instructions.
+        instructions: Embeddings of instructions; None if the policy uses no sentence encoder.
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
     """
 
@@ -72,7 +72,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             config.set_dataset_feature_metadata(dataset_meta.features)
         config.validate_features()
         self.state_limits = StateLimits(config.state_dim, dataset_stats)
-        self.instructions = InstructionEmbeddings(config.language_encoder)
+        self.instructions: InstructionEmbeddings | None = None
         self.paraphrases = _read_paraphrases(config)
         self.demonstrations: DemonstrationBank | None = self._read_evaluation_bank()
         self.training_bank: DemonstrationBank | None = None
@@ -278,11 +278,9 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         super()._save_pretrained(save_directory, *args, **kwargs)
         if not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0:
             bank = self.demonstrations if self.config.uses_demonstrations else None
-            known = (
-                self.instructions
-                if self.paraphrases is None
-                else self.paraphrases.left_out_of(self.instructions)
-            )
+            known = self.instructions
+            if known is not None and self.paraphrases is not None:
+                known = self.paraphrases.left_out_of(known)
             write_task_bank(save_directory / TASK_BANK, known, bank)
 
     @classmethod
@@ -333,10 +331,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         from lerobot_deltaco.cards import policy_card
 
         demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
-        n_instructions = len(self.instructions.rows)
-        return policy_card(
-            self.config, demonstrated, n_instructions, dataset_repo_id, license, tags, cfg, dataset_meta
-        )
+        return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
 
 
 def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) -> Tensor:

@@ -63,7 +63,6 @@ def render(template: str, **values: Any) -> str:
 def policy_card(
     config: TaskConditionedConfig,
     demonstrated_tasks: Sequence[str],
-    n_instructions: int,
     dataset_repo_id: str | None,
     license: str | None = None,
     tags: list[str] | None = None,
@@ -75,7 +74,6 @@ def policy_card(
     Args:
         config: Configuration of the policy.
         demonstrated_tasks: Tasks that the checkpoint has demonstrations of.
-        n_instructions: Number of instructions whose embeddings the checkpoint has.
         dataset_repo_id: Repository id of the training dataset.
         license: License of the weights, as named on the Hub; None for Apache 2.0.
         tags: Additional tags.
@@ -88,6 +86,7 @@ def policy_card(
 
     from lerobot_deltaco.language import LANGUAGE_ENCODERS
 
+    encoder = getattr(config, "language_encoder", None)
     kind = getattr(config, "method", None) or config.inputs
     training_tasks = [] if meta is None else list(meta.tasks.index)
     image = {} if meta is None else meta.features.get("observation.image", {}).get("info") or {}
@@ -124,8 +123,7 @@ def policy_card(
         benchmark=image if "benchmark" in image else None,
         robot_type=None if meta is None else meta.robot_type,
         demonstrated_tasks=[markdown(task) for task in demonstrated_tasks],
-        n_instructions=n_instructions,
-        language_repo_id=LANGUAGE_ENCODERS[config.language_encoder].repo_id,
+        language_repo_id=None if encoder is None else LANGUAGE_ENCODERS[encoder].repo_id,
         repo_id=config.repo_id or "USER/NAME",
         example_task=json.dumps(next(iter([*demonstrated_tasks, *training_tasks]), "the instruction"))[1:-1],
         inputs={name: tuple(feature.shape) for name, feature in config.input_features.items()},

@@ -3,7 +3,7 @@
 It holds embeddings of instructions, so that these need no language encoder, and the demonstrations for
 evaluation, so that these need no dataset:
 
-    embeddings     (instructions, embedding) float32, unit vectors
+    embeddings     (instructions, embedding) float32, unit vectors; none without a language encoder
     frames         (demonstrations, frames, 3, H, W) uint8
     episodes       (demonstrations,) int64, indices in their dataset
     first_images   (demonstrations, 3, H', W') uint8, at the camera's own resolution; optional
@@ -15,6 +15,7 @@ evaluation, so that these need no dataset:
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,20 +46,21 @@ class TaskBankError(ValueError):
 
 
 def write_task_bank(
-    path: Path, instructions: InstructionEmbeddings, demonstrations: DemonstrationBank | None
+    path: Path, instructions: InstructionEmbeddings | None, demonstrations: DemonstrationBank | None
 ) -> None:
     """Writes a task bank.
 
     Args:
         path: The file.
-        instructions: Embeddings of instructions.
+        instructions: Embeddings of instructions; None if the policy has no language encoder.
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
     """
-    tensors = {"embeddings": instructions.embeddings}
-    known = {
-        "language_encoder": instructions.encoder_name,
-        "instructions": json.dumps(list(instructions.rows)),
-    }
+    tensors: dict[str, torch.Tensor] = {}
+    known: dict[str, str] = {}
+    if instructions is not None:
+        tensors["embeddings"] = instructions.embeddings
+        known["language_encoder"] = instructions.encoder_name
+        known["instructions"] = json.dumps(list(instructions.rows))
     if demonstrations is not None:
         tensors |= {"frames": demonstrations.frames, "episodes": demonstrations.episodes}
         if demonstrations.first_images is not None:
@@ -86,13 +88,13 @@ def find_task_bank(pretrained: str | Path, **options: Any) -> Path:
 
 
 def read_task_bank(
-    path: Path, instructions: InstructionEmbeddings, frames_shape: tuple[int, ...], state_dim: int
+    path: Path, instructions: InstructionEmbeddings | None, frames_shape: tuple[int, ...], state_dim: int
 ) -> DemonstrationBank | None:
     """Reads a task bank, and checks that it belongs to a policy.
 
     Args:
         path: The file.
-        instructions: Cache that gets the embeddings.
+        instructions: Cache that gets the embeddings; None if the policy has no language encoder.
         frames_shape: Shape of the policy's demonstrations, (frames, 3, H, W).
         state_dim: Size of the robot's state, for states at grasps.
 
@@ -117,8 +119,20 @@ def read_task_bank(
             raise _error(
                 path, f"it has the tensor `{name}` of {tensor.dtype} and shape {tuple(tensor.shape)}"
             )
-    names: Any = texts.get("instructions")
-    embeddings = tensors.get("embeddings")
+    if instructions is not None:
+        _add_embeddings(path, instructions, tensors.get("embeddings"), texts.get("instructions"), known)
+    if "frames" not in tensors:
+        return None
+    return _demonstrations(path, tensors, texts, frames_shape, state_dim)
+
+
+def _add_embeddings(
+    path: Path,
+    instructions: InstructionEmbeddings,
+    embeddings: torch.Tensor | None,
+    names: Any,
+    known: Mapping[str, str],
+) -> None:
     if known.get("language_encoder") != instructions.encoder_name:
         raise _error(
             path,
@@ -132,9 +146,6 @@ def read_task_bank(
         raise _error(path, "its embeddings are not unit vectors")
     new = [n for n, name in enumerate(names) if name not in instructions.rows]
     instructions.put([names[n] for n in new], embeddings[new])
-    if "frames" not in tensors:
-        return None
-    return _demonstrations(path, tensors, texts, frames_shape, state_dim)
 
 
 def _demonstrations(

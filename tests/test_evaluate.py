@@ -292,8 +292,7 @@ def test_an_input_can_be_left_out(shipped, loaded, given, left_out):
         outcomes_of(loaded, replace(plan, tasks="4"))
 
 
-def test_sentences_of_people_are_used_in_turn(shipped, tmp_path, monkeypatch, given):
-    monkeypatch.setattr(shipped.policy.instructions, "_encode", fake_language_encoder("all-MiniLM-L6-v2"))
+def test_sentences_of_people_are_used_in_turn(shipped, tmp_path, given):
     file = tmp_path / "people.csv"
     file.write_text("task_id,instruction\n24,one\n24,another\n24,last of 24\n35,only\n35,last of 35\n")
     plan = short_plan("24,35", trials=2, paraphrases=str(file), paraphrases_split="train")

@@ -7,13 +7,14 @@ from lerobot.policies import make_pre_post_processors
 from gym_deltaco.tasks import TASKS
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.deltaco_match.words import vocabulary_of
 from lerobot_deltaco.demonstrations import DemonstrationBank
 from lerobot_deltaco.recording import load_conditioned
 
 DEMONSTRATED = (4, 26)
 
 
-# Sentences that the policy can be given: their embeddings are saved with it, so that it needs no encoder.
+# Sentences whose words the policy knows.
 SENTENCES = (
     *(task.instruction for task in TASKS),
     "Put it in the green bin.",
@@ -30,6 +31,7 @@ def save_tiny_policy(folder, **options):
     config = DeltacoMatchConfig(
         device="cpu",
         feature_matching=False,
+        known_words=vocabulary_of(SENTENCES),
         gripper="3",
         input_features={
             "observation.image": PolicyFeature(FeatureType.VISUAL, (3, 48, 48)),
@@ -39,8 +41,6 @@ def save_tiny_policy(folder, **options):
         **options,
     )
     policy = DeltacoMatchPolicy(config).eval()
-    embeddings = torch.nn.functional.normalize(torch.randn(len(SENTENCES), config.embedding_dim), dim=1)
-    policy.instructions.put(list(SENTENCES), embeddings)
     if config.uses_demonstrations:
         frames = torch.randint(0, 256, (len(DEMONSTRATED), 2, 3, 48, 48), dtype=torch.uint8)
         tasks = [TASKS[task_id].instruction for task_id in DEMONSTRATED]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_deltaco.base_config import TaskConditionedConfig
-from lerobot_deltaco.language import MINILM_L3
+from lerobot_deltaco.language import LANGUAGE_ENCODERS, MINILM_L3
 from lerobot_deltaco.losses import GRIPPER_LOSSES
 from lerobot_deltaco.networks import BACKBONES
 from lerobot_deltaco.optimization import CosineSchedulerConfig
@@ -61,6 +61,9 @@ class DeltacoConfig(TaskConditionedConfig):
     seventeenth of the arithmetic.
 
     Args:
+        language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'), all-MiniLM-L6-v2,
+            all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `offline`
+            includes the first two.
         method: Method of the paper: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
         film: Ablation: input through FiLM, instead of the method's: none, demo, language or demo+language.
         concat: Ablation: input that is concatenated to the feature points, instead of the method's; same
@@ -141,6 +144,7 @@ class DeltacoConfig(TaskConditionedConfig):
         """
         super().check()
         self.check_choices(
+            language_encoder=LANGUAGE_ENCODERS,
             method=METHODS,
             film=(None, *INPUTS),
             concat=(None, *INPUTS),
@@ -207,6 +211,11 @@ class DeltacoConfig(TaskConditionedConfig):
                 f"and the instructions' have {self.embedding_dim}. To compare them, give `demo_head` layers, "
                 "such as [256]; or set `encoder_loss` to 'none'."
             )
+
+    @property
+    def embedding_dim(self) -> int:
+        """Size of an instruction's embedding."""
+        return LANGUAGE_ENCODERS[self.language_encoder].embedding_dim
 
     @property
     def conditioning(self) -> Conditioning:

@@ -28,6 +28,7 @@ from lerobot_deltaco.deltaco.demo_encoders import (
     shift_demonstrations,
 )
 from lerobot_deltaco.demonstrations import Demonstration, DemonstrationBank, sample_frames
+from lerobot_deltaco.language import InstructionEmbeddings
 from lerobot_deltaco.losses import (
     GRIPPER_LOSSES,
     contrastive_logits,
@@ -78,6 +79,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
+        self.instructions: InstructionEmbeddings = InstructionEmbeddings(config.language_encoder)
         self.config: DeltacoConfig = config
         if config.method == "one_hot" and not config.one_hot_tasks:
             config.one_hot_tasks = known_tasks(dataset_meta)
