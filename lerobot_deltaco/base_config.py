@@ -14,6 +14,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 
 from gym_deltaco.env import ACTION_NAMES
 from lerobot_deltaco.optimization import CosineSchedulerConfig, FusedAdamWConfig
+from lerobot_deltaco.paraphrases import GRAMMAR
 
 logger = logging.getLogger(__name__)
 
@@ -266,7 +267,8 @@ class TaskConditionedConfig(PreTrainedConfig):
     def _save_pretrained(self, save_directory: Path) -> None:
         saved = copy.copy(self)
         for name in SOURCES:
-            setattr(saved, name, None)
+            if getattr(saved, name) != GRAMMAR:
+                setattr(saved, name, None)
         PreTrainedConfig._save_pretrained(saved, save_directory)
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:

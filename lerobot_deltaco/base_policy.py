@@ -73,7 +73,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         config.validate_features()
         self.state_limits = StateLimits(config.state_dim, dataset_stats)
         self.instructions: InstructionEmbeddings | None = None
-        self.paraphrases = _read_paraphrases(config)
+        self.paraphrases = None if dataset_meta is None else _read_paraphrases(config)
         self.demonstrations: DemonstrationBank | None = self._read_evaluation_bank()
         self.training_bank: DemonstrationBank | None = None
         # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.

@@ -29,6 +29,8 @@ from lerobot_deltaco.language import InstructionEmbeddings
 
 TASK_BANK = "tasks.safetensors"
 _HUB_OPTIONS = ("revision", "cache_dir", "token", "local_files_only", "force_download")
+_FORMAT = "deltaco_tasks"
+_TEXTS = ("instructions", "tasks", "target_objects")
 _UNIT_TOLERANCE = 1e-3
 _DTYPES = {
     "embeddings": torch.float32,
@@ -56,7 +58,7 @@ def write_task_bank(
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
     """
     tensors: dict[str, torch.Tensor] = {}
-    known: dict[str, str] = {}
+    known = {"format": _FORMAT}  # a file without anything else is not valid
     if instructions is not None:
         tensors["embeddings"] = instructions.embeddings
         known["language_encoder"] = instructions.encoder_name
@@ -108,7 +110,7 @@ def read_task_bank(
         with safe_open(path, framework="pt") as file:
             known = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        texts = {name: json.loads(known[name]) for name in known if name != "language_encoder"}
+        texts = {name: json.loads(known[name]) for name in _TEXTS if name in known}
     except (OSError, SafetensorError, ValueError) as error:
         raise _error(path, str(error)) from error
     for name, tensor in tensors.items():

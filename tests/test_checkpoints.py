@@ -35,7 +35,7 @@ from lerobot_deltaco.base_policy import TrainingDivergedError
 from lerobot_deltaco.deltaco.configuration_deltaco import METHODS
 from lerobot_deltaco.deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import TASK_INPUTS
-from lerobot_deltaco.language import LANGUAGE_ENCODERS, InstructionEmbeddings
+from lerobot_deltaco.language import LANGUAGE_ENCODERS
 from lerobot_deltaco.task_bank import TASK_BANK, TaskBankError, read_task_bank
 
 pytestmark = pytest.mark.usefixtures("fake_language")
@@ -177,8 +177,7 @@ def test_task_bank_of_another_robot_is_an_error(tmp_path):
     shape = (2, 3, policy.config.image_size, policy.config.image_size)
 
     def read(state_dim):
-        instructions = InstructionEmbeddings(policy.config.language_encoder)
-        return read_task_bank(tmp_path / "policy" / TASK_BANK, instructions, shape, state_dim)
+        return read_task_bank(tmp_path / "policy" / TASK_BANK, None, shape, state_dim)
 
     assert torch.equal(read(3).pick_states, policy.demonstrations.pick_states)
     with pytest.raises(TaskBankError, match="its grasps have 3 numbers, and the robot's state 5"):

@@ -507,22 +507,25 @@ def test_a_vision_language_action_model_may_lack_cameras_and_pad_the_state():
     check_policy_fits(model, SceneConfig())
 
 
-def test_joint_noise_is_a_function_of_the_episode(loaded):
+def test_joint_noise_is_a_function_of_the_episode(loaded, monkeypatch):
+    preprocess = evaluate_module.preprocess_observation
+
     def states(noise, trials):
         seen = []
 
-        def before(batch):
-            seen.append(batch["observation.state"].clone())
-            return loaded.preprocessor(batch)
+        def noted(stacked):
+            seen.append(torch.from_numpy(stacked["agent_pos"].copy()))
+            return preprocess(stacked)
 
-        outcomes_of(loaded._replace(preprocessor=before), short_plan("4", trials=trials, joint_noise=noise))
-        return torch.stack(seen)  # (steps, batch, state)
+        monkeypatch.setattr(evaluate_module, "preprocess_observation", noted)
+        outcomes_of(loaded, short_plan("4", trials=trials, joint_noise=noise))
+        return seen  # (batch, state) of each step
 
     exact, noisy, alone = states(0.0, 2), states(2.0, 2), states(2.0, 1)
     difference = noisy[0] - exact[0]
     assert difference[:, :6].abs().min() > 0
     assert difference[:, :6].abs().max() < np.radians(10)
     assert not difference[:, 6:].any()
-    assert torch.equal(noisy[0, :1], alone[0])
+    assert torch.equal(noisy[0][:1], alone[0])
     with pytest.raises(ValueError, match="`joint_noise` must be from 0 to 180"):
         short_plan("4", joint_noise=-1.0)

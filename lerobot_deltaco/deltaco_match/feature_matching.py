@@ -126,15 +126,18 @@ class FeatureMatching(nn.Module):
             locations = self.propose(scenes)
             descriptors, words = self.compare(self._features(native, locations))
             scores = torch.zeros_like(locations[..., 0])
-            all_known = torch.zeros(len(scenes), device=scenes.device)
+            described_by = torch.zeros(len(scenes), device=scenes.device)
             if instructions is not None and self.vocabulary and any(instructions):
                 said = encode_words(instructions, self.vocabulary).to(scenes.device)
-                scores = _word_scores(words, said, self.word_weights(said))
-                all_known = ((said != UNKNOWN_WORD).all(dim=1) & (said > UNKNOWN_WORD).any(dim=1)).float()
+                weights = self.word_weights(said)
+                scores = _word_scores(words, said, weights)
+                # How well known words describe the object: not at all if one that describes it is unknown.
+                unknown = (weights * (said == UNKNOWN_WORD)).amax(dim=1)
+                described_by = (1 - unknown) * (weights * (said > UNKNOWN_WORD)).amax(dim=1)
             if described is not None:
                 similar = _SHARPNESS * self.compare.similarity(descriptors, described)
                 # A new noun leaves the demonstration in charge.
-                p_other = (_P_OTHER_OBJECT * all_known)[:, None]
+                p_other = (_P_OTHER_OBJECT * described_by)[:, None]
                 scores = scores + torch.log(
                     (1 - p_other) * similar.softmax(dim=1) + p_other / scores.shape[1]
                 )
@@ -291,15 +294,22 @@ class FeatureMatching(nn.Module):
                 drawn = (first[scenes.cpu(), 0] + draws * first[scenes.cpu(), 1]).long()
                 dropped = torch.rand(len(scenes), said.shape[1], generator=generator) < _P_DROP_WORD
                 sentence = said[drawn.to(device)]
-                sentence = torch.where(dropped.to(device) & (sentence > 0), UNKNOWN_WORD, sentence)
-                loss = loss + self._word_losses(words[:, :-1], sentence, target[scenes])
+                left = torch.where(dropped.to(device) & (sentence > 0), UNKNOWN_WORD, sentence)
+                loss = loss + self._word_losses(words[:, :-1], left, sentence, target[scenes])
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
             schedule.step()
 
-    def _word_losses(self, words: Tensor, said: Tensor, target: Tensor) -> Tensor:
-        """Returns the losses of choosing a proposal by words, and of naming what was grasped."""
+    def _word_losses(self, words: Tensor, said: Tensor, sentence: Tensor, target: Tensor) -> Tensor:
+        """Returns the losses of choosing a proposal by words, of naming what was grasped, and of the weights.
+
+        Args:
+            words: Log probabilities of the vocabulary for each proposal, (batch, n, vocabulary).
+            said: Indices of the words, of which some are left out, (batch, length).
+            sentence: The same with all words.
+            target: The right proposal, (batch,).
+        """
         weights = self.word_weights(said)
         loss = F.cross_entropy(_word_scores(words, said, weights), target)
         named = words[torch.arange(len(words)), target]  # (batch, vocabulary)
@@ -307,7 +317,10 @@ class FeatureMatching(nn.Module):
         log_probabilities = named.gather(1, (said - UNKNOWN_WORD - 1).clamp_min(0))
         naming = -(known * log_probabilities).sum(dim=1) / known.sum(dim=1).clamp_min(1e-6)
         # Words that tell nothing would only add noise.
-        return loss + naming.mean() + _WORD_PENALTY * weights.sum(dim=1).mean()
+        penalty = _WORD_PENALTY * (weights * (said > UNKNOWN_WORD)).sum(dim=1).mean()
+        # What an unknown word is about follows from its neighbors.
+        unknown = (self.word_weights(sentence).detach() - weights).square() * (said == UNKNOWN_WORD)
+        return loss + naming.mean() + penalty + unknown.sum(dim=1).mean()
 
     def _encoded_sentences(
         self, tasks: Sequence[str], sentences: Mapping[str, Sequence[str]], device: torch.device

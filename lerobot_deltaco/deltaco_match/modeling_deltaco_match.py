@@ -138,6 +138,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         super().__init__(config, dataset_stats, dataset_meta)
         self.config: DeltacoMatchConfig = config
         inputs = config.task_inputs
+        if not inputs.uses_language:
+            self.paraphrases = None
         if config.inputs == "one_hot" and not config.one_hot_tasks:
             config.one_hot_tasks = known_tasks(dataset_meta)
         if inputs.uses_language and dataset_meta is not None:
