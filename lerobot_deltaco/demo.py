@@ -58,7 +58,7 @@ class Budget:
 
 
 # By minutes on two idle cores. 25 minutes are enough for the full recipe.
-BUDGETS: MappingProxyType[Minutes, Budget] = MappingProxyType({8: Budget(5, 2000), 25: Budget(16, 8000)})
+BUDGETS: MappingProxyType[Minutes, Budget] = MappingProxyType({8: Budget(5, 2500), 25: Budget(16, 8000)})
 
 # Success rates to compare with, on the novel tasks of scenario A, in %.
 CHANCE = 16.7  # one of three objects, one of two containers
