@@ -358,6 +358,7 @@ def test_fit_finds_shapes_of_one_color_by_demonstrations_and_by_words(matching, 
     # Unknown words leave the demonstration in charge, and known ones still count.
     assert fraction_found(matching, shapes, True, lambda task: "the gizmo") >= 0.9
     assert fraction_found(matching, shapes, words=lambda task: "a b c") < 0.8
+    assert fraction_found(matching, shapes, True, lambda task: "12!") >= 0.9
 
 
 def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes):
@@ -459,3 +460,4 @@ def test_words_are_understood():
         *("put", "red", "yellow", "bowls", None, "the", None)
     ]
     assert encode_words(["the cup", "", "x"], vocabulary).tolist() == [[7, 3], [0, 0], [1, 0]]
+    assert encode_words(["", "12!"], vocabulary).tolist() == [[0], [0]]

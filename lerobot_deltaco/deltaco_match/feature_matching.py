@@ -169,8 +169,10 @@ class FeatureMatching(nn.Module):
         """
         with torch.autocast(images.device.type, enabled=False):
             # A gripper is not always above the middle of an object, but a proposal is.
-            near, distance = _nearest(self.propose(images), locations)
-            locations = torch.where(distance[:, None] < _MAX_DISTANCE, near, locations)
+            proposed = self.propose(images)
+            nearest, is_near = _nearest(proposed, locations)
+            near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
+            locations = torch.where(is_near[:, None], near, locations)
             return self.compare(self._features(native, locations[:, None]))[0][:, 0]
 
     def _features(self, native: Tensor, locations: Tensor) -> Tensor:
@@ -251,8 +253,7 @@ class FeatureMatching(nn.Module):
             for some in drawn.split(_ENCODED_AT_A_TIME):
                 rows = some.to(images.device)
                 proposed = self.propose(images[rows].float() / 255)
-                distance, nearest = (proposed - locations[rows, None]).norm(dim=2).min(dim=1)
-                near = distance < _MAX_DISTANCE
+                nearest, near = _nearest(proposed, locations[rows])
                 if bool(near.any()):
                     of_some = native[rows[near].to(native.device)]
                     features.append(self._features(of_some, proposed[near]).half())
@@ -260,7 +261,11 @@ class FeatureMatching(nn.Module):
                     kept.append(some[near.cpu()])
                 progress.update(len(some))
         if not kept:
-            raise ValueError("no proposal is near a grasp")
+            raise ValueError(
+                "Feature matching finds nothing to grasp in the first images where the gripper closes. Check "
+                "that the first camera stands still and shows the objects, name another with "
+                "--policy.demo_camera, or set --policy.feature_matching=false."
+            )
         return torch.cat(features), torch.cat(targets), torch.cat(kept)
 
     def _fit_comparison(
@@ -397,9 +402,9 @@ def _word_scores(words: Tensor, said: Tensor, weights: Tensor) -> Tensor:
 
 
 def _nearest(proposed: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the proposals nearest to locations (batch, 2), (batch, 2), and their distances, (batch,)."""
+    """Returns which proposal is nearest to locations (batch, 2), and whether it is near, (batch,) each."""
     distance, nearest = (proposed - locations[:, None]).norm(dim=2).min(dim=1)
-    return proposed[torch.arange(len(proposed), device=proposed.device), nearest], distance
+    return nearest, distance < _MAX_DISTANCE
 
 
 def _dropout(values: Tensor, generator: torch.Generator | None) -> Tensor:

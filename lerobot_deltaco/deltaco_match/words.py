@@ -53,14 +53,15 @@ def _understand_word(word: str, vocabulary: tuple[str, ...]) -> str | None:
 def encode_words(sentences: Sequence[str], vocabulary: Sequence[str]) -> Tensor:
     """Returns the indices of the words of sentences, (sentences, words) int64.
 
-    `NO_WORD` fills up shorter sentences, and `UNKNOWN_WORD` stands for words that are not understood.
+    `NO_WORD` fills up shorter sentences, of at least one word, and `UNKNOWN_WORD` stands for words that are not
+    understood.
     """
     index = {word: n for n, word in enumerate(vocabulary, start=_N_SPECIAL)}
     rows = [
-        torch.tensor([UNKNOWN_WORD if word is None else index[word] for word in understand(text, vocabulary)])
+        [UNKNOWN_WORD if word is None else index[word] for word in understand(text, vocabulary)] or [NO_WORD]
         for text in sentences
     ]
-    return nn.utils.rnn.pad_sequence([torch.as_tensor(row, dtype=torch.int64) for row in rows], True, NO_WORD)
+    return nn.utils.rnn.pad_sequence([torch.tensor(row) for row in rows], True, NO_WORD)
 
 
 class WordWeights(nn.Module):
