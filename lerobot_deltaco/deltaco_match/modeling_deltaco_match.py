@@ -8,8 +8,8 @@ r"""`deltaco_match`: describes what a demonstration moved, finds it in the scene
                                                                 v
     image, robot state -------------------------------------- act ----> action
 
-Describing and finding happen once, at the start of an episode (`_find`). Feature matching chooses what to pick
-among proposals, by the demonstration and by the instruction's words; without it, the pick map of the
+Describing and finding happen once, at the start of an episode (`_find`). Feature matching chooses what to
+pick among proposals, by the demonstration and by the instruction's words; without it, the pick map of the
 correspondence network does. The instruction says where to place it. The policy network is given the two
 locations, and how far the robot's state is from where it would be at each of them (`select_action`).
 

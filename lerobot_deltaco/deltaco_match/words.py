@@ -53,8 +53,7 @@ def _understand_word(word: str, vocabulary: tuple[str, ...]) -> str | None:
 def encode_words(sentences: Sequence[str], vocabulary: Sequence[str]) -> Tensor:
     """Returns the indices of the words of sentences, (sentences, words) int64.
 
-    `NO_WORD` fills up shorter sentences, of at least one word, and `UNKNOWN_WORD` stands for words that are not
-    understood.
+    `NO_WORD` fills up shorter sentences. `UNKNOWN_WORD` stands for words that are not understood.
     """
     index = {word: n for n, word in enumerate(vocabulary, start=_N_SPECIAL)}
     rows = [
