@@ -295,7 +295,7 @@ def policy(batch_size: int = 128, seconds: float = 5.0) -> dict[str, float]:
     variants: dict[str, dict[str, Any]] = {
         "deltaco, paper": {"type": "deltaco"},
         "deltaco, strided": {"type": "deltaco", "backbone": "strided"},
-        "deltaco_match": {"type": "deltaco_match", "feature_matching": False},
+        "deltaco_match": {"type": "deltaco_match"},
     }
     results: dict[str, float] = {}
     n_threads = torch.get_num_threads()

@@ -19,6 +19,7 @@ from lerobot_deltaco.paraphrases import GRAMMAR
 logger = logging.getLogger(__name__)
 
 PARAPHRASE_SPLITS = ("all", "train", "held_out")
+_PREDICTIONS_PER_EPISODE = 30
 # Options that name files and datasets of the training machine, whose contents are in the checkpoint.
 SOURCES = ("paraphrases", "demo_repo_id", "demo_root")
 
@@ -36,6 +37,11 @@ class TaskConditionedConfig(PreTrainedConfig):
         p_paraphrase: Probability that a training sample's instruction is such a sentence; otherwise, it is
             the task string.
         image_size: Height and width to which images are scaled, px.
+        chunk_size: Number of steps that the policy predicts at once.
+        n_action_steps: Number of steps of a chunk that are carried out before the next one is predicted.
+            None, for about 30 predictions in an episode as long as those of the training dataset.
+        temporal_ensemble_coeff: Coefficient of ACT's temporal ensembling, which predicts a chunk at every
+            step and averages what the chunks say about it; None for none. It needs `n_action_steps=1`.
         num_mixture_components: Number of Gaussians of the action's distribution. One averages two actions
             that are equally good; of several, the policy takes the likeliest.
         gripper: Gripper's dimension of the action: an index, "auto" (the last one whose name contains
@@ -68,6 +74,9 @@ class TaskConditionedConfig(PreTrainedConfig):
     paraphrases_split: str = "train"
     p_paraphrase: float = 1.0
     image_size: int = 48
+    chunk_size: int = 1
+    n_action_steps: int | None = None
+    temporal_ensemble_coeff: float | None = None
     num_mixture_components: int = 1
     gripper: str = "auto"
     gripper_closed: str = "low"
@@ -93,8 +102,6 @@ class TaskConditionedConfig(PreTrainedConfig):
             "ACTION": NormalizationMode.MIN_MAX,
         }
     )
-    # Filled in by training: the tasks known to a one-hot policy.
-    one_hot_tasks: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,6 +131,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         self.check_ranges(
             p_paraphrase=(0, 1),
             image_size=(16, 1024),
+            chunk_size=(1, 1000),
             num_mixture_components=(1, 1000),
             tasks_per_batch=(0, 1_000_000),
             upsampled_fraction=(0, 1),
@@ -133,6 +141,16 @@ class TaskConditionedConfig(PreTrainedConfig):
             scheduler_warmup_steps=(0, 1_000_000_000),
             grad_clip_norm=(0, 1e6),
         )
+        if self.n_action_steps is not None and not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"`n_action_steps` must be from 1 to `chunk_size`, {self.chunk_size}. Got "
+                f"{self.n_action_steps}."
+            )
+        if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
+            raise ValueError(
+                "`temporal_ensemble_coeff` needs `n_action_steps=1`: it predicts a chunk at every step. "
+                f"Got {self.n_action_steps}."
+            )
         check_pattern("upsampled_tasks", self.upsampled_tasks)
         # Images must stay in 0..1, and actions in -1..1: the networks are made for these.
         valid = {"VISUAL": ("IDENTITY",), "ACTION": ("MIN_MAX", "IDENTITY")}
@@ -184,6 +202,12 @@ class TaskConditionedConfig(PreTrainedConfig):
         if self.gripper == "auto":
             found = [index for index, name in enumerate(names or ()) if "gripper" in str(name).lower()]
             self.gripper = str(found[-1]) if found else "none"
+
+    def set_dataset_size(self, n_frames: int, n_episodes: int) -> None:
+        """Chooses `n_action_steps` by the length of the episodes, if it is not given."""
+        if self.n_action_steps is None:
+            wanted = round(n_frames / max(n_episodes, 1) / _PREDICTIONS_PER_EPISODE)
+            self.n_action_steps = min(max(wanted, 1), self.chunk_size)
 
     def validate_features(self) -> None:
         """Checks the inputs and outputs that LeRobot found in the dataset.
@@ -289,9 +313,9 @@ class TaskConditionedConfig(PreTrainedConfig):
         return
 
     @property
-    def action_delta_indices(self) -> None:
-        """Only the next action is predicted."""
-        return
+    def action_delta_indices(self) -> list[int] | None:
+        """Steps of a chunk; None for only the next action."""
+        return None if self.chunk_size == 1 else list(range(self.chunk_size))
 
     @property
     def reward_delta_indices(self) -> None:

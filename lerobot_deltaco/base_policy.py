@@ -3,6 +3,7 @@
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
 import contextlib
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -13,6 +14,7 @@ import torch.nn.functional as F  # noqa: N812
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
 from torch import Tensor, nn
 
 from lerobot_deltaco.base_config import TaskConditionedConfig
@@ -70,6 +72,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self._meta, self._stats = dataset_meta, dataset_stats
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features)
+            config.set_dataset_size(dataset_meta.total_frames, dataset_meta.total_episodes)
         config.validate_features()
         self.state_limits = StateLimits(config.state_dim, dataset_stats)
         self.instructions: InstructionEmbeddings | None = None
@@ -79,6 +82,9 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.
         self._tasks: tuple[tuple[str, ...], DemonstrationsOfTasks] | None = None
         self._episode: Any = None
+        # The actions of the running chunk that are still to be carried out, and the average of all chunks.
+        self._actions: deque[Tensor] = deque()
+        self._ensemble: ACTTemporalEnsembler | None = None
         # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
 
@@ -90,7 +96,8 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Ends the episode. The next action begins a new one."""
-        self._tasks = self._episode = None
+        self._tasks = None
+        self._start(None)
 
     def set_tasks(self, instructions: Sequence[str], demonstrations: DemonstrationsOfTasks) -> None:
         """Sets the tasks of the episode that begins with the next action, until `reset`.
@@ -107,11 +114,43 @@ class TaskConditionedPolicy(PreTrainedPolicy):
                 f"There must be as many lists of demonstrations as instructions. Got {len(demonstrations)} "
                 f"and {len(instructions)}."
             )
-        self._tasks, self._episode = (tuple(instructions), demonstrations), None
+        self.reset()
+        self._tasks = (tuple(instructions), demonstrations)
 
-    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """Returns the action as a chunk of one, (batch, 1, action)."""
-        return self.select_action(batch, **kwargs).unsqueeze(1)
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """Returns the next action of a chunk, the mean of the likeliest component of its distribution.
+
+        Args:
+            batch: As in `forward`, without `action` and `episode_index`. `task` is not needed if `set_tasks`
+                gave the instructions. New instructions begin a new episode.
+
+        Returns:
+            Actions, (batch, action), normalized as in `forward`.
+
+        Raises:
+            ValueError: There is no instruction, or a task has no demonstration.
+            FloatingPointError: The action is not finite, or absurdly large.
+        """
+        config = self.config
+        if config.temporal_ensemble_coeff is not None:
+            chunk = self.predict_action_chunk(batch)
+            if self._ensemble is None:
+                self._ensemble = ACTTemporalEnsembler(config.temporal_ensemble_coeff, config.chunk_size)
+            return self._ensemble.update(chunk)
+        if self._begins_episode(batch) or not self._actions:
+            chunk = self.predict_action_chunk(batch)[:, : config.n_action_steps or config.chunk_size]
+            self._actions = deque(chunk.unbind(dim=1))
+        return self._actions.popleft()
+
+    def _begins_episode(self, batch: dict[str, Any]) -> bool:
+        """Returns whether an action for a batch begins an episode: after a reset, or for other tasks."""
+        return self._episode is None or self._episode.instructions != self._tasks_of(batch)[0]
+
+    def _start(self, episode: Any) -> None:
+        """Sets the running episode; None for none."""
+        self._episode, self._ensemble = episode, None
+        self._actions.clear()
 
     def _tasks_of(self, batch: dict[str, Any]) -> tuple[tuple[str, ...], DemonstrationsOfTasks | None]:
         """Returns the instructions of a batch, and the demonstrations that `set_tasks` gave, if any."""
@@ -332,35 +371,6 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
         demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
         return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
-
-
-def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) -> Tensor:
-    """Returns one-hot vectors of tasks, (batch, known tasks).
-
-    Raises:
-        ValueError: A task is not known.
-    """
-    unknown = next((task for task in tasks if task not in known), None)
-    if unknown is not None:
-        raise ValueError(
-            f"This one-hot policy does not know the task {unknown!r}. It knows the {len(known)} tasks of its "
-            f"training dataset, such as {known[0]!r}."
-        )
-    index = {task: n for n, task in enumerate(known)}
-    return F.one_hot(torch.tensor([index[task] for task in tasks], device=device), len(known)).float()
-
-
-def known_tasks(meta: LeRobotDatasetMetadata | None) -> list[str]:
-    """Returns the task strings of the training dataset, for a one-hot policy.
-
-    Raises:
-        ValueError: There are no metadata.
-    """
-    if meta is None:
-        raise ValueError(
-            "A one-hot policy knows the tasks of its dataset. Pass the metadata as `dataset_meta`."
-        )
-    return list(meta.tasks.index)
 
 
 def _read_paraphrases(config: TaskConditionedConfig) -> Paraphrases | None:

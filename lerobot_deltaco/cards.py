@@ -28,9 +28,8 @@ _SUMMARIES = {
     "one_hot": "It performs one of the tasks that it was trained on, given by its number.",
     "bc_z": "It performs a task from one demonstration: the baseline BC-Z of DeL-TaCo.",
     "mcil": "It performs a task from an instruction or a demonstration: the baseline MCIL of DeL-TaCo.",
-    "both": "It looks in the scene for what a demonstration moved, and places it where an instruction says.",
-    "demonstration": "It looks in the scene for what a demonstration moved, and places it as shown.",
-    "instruction": "It looks in the scene for what an instruction names, and places it where it says.",
+    "deltaco_match": "It looks in the scene for what a demonstration moved or an instruction names, and "
+    "places it where the instruction says or the demonstration shows.",
 }
 # Options of a policy that its card omits: LeRobot's own, and those shown elsewhere.
 _HIDDEN = {
@@ -87,7 +86,7 @@ def policy_card(
     from lerobot_deltaco.language import LANGUAGE_ENCODERS
 
     encoder = getattr(config, "language_encoder", None)
-    kind = getattr(config, "method", None) or config.inputs
+    kind = str(getattr(config, "method", config.type))
     training_tasks = [] if meta is None else list(meta.tasks.index)
     image = {} if meta is None else meta.features.get("observation.image", {}).get("info") or {}
     lerobot_options = set(draccus.encode(PreTrainedConfig.get_choice_class("act")()))

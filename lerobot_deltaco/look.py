@@ -221,8 +221,6 @@ def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: in
 
 def _how_sure(policy: DeltacoMatchPolicy, instruction: str, found: Found) -> str:
     """Returns how sure a policy is of what to pick, and which words count, as the end of a sentence."""
-    if found.p_pick is None or policy.feature_matching is None:
-        return ""
     words = [
         word if word == meant else f"{word} ({meant})"
         for word, meant in policy.feature_matching.understood(instruction)

@@ -30,32 +30,37 @@ def gaussian_negative_log_likelihood(mean: Tensor, log_std: Tensor, target: Tens
     return (0.5 * scaled.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(dim=-1)
 
 
-def mixture_negative_log_likelihood(means: Tensor, logits: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
-    """Returns -log of a mixture of Gaussians at a target.
+def mixture_negative_log_likelihood(
+    means: Tensor, logits: Tensor, log_std: Tensor, target: Tensor, valid: Tensor | None = None
+) -> Tensor:
+    """Returns -log of a mixture of Gaussians at chunks of actions.
 
     Args:
-        means: Means of the components, (batch, components, dims).
+        means: Means of the components, (batch, components, steps, dims).
         logits: Logits of the components, (batch, components).
-        log_std: Logarithm of the standard deviation, (dims,) or (components, dims), the same for all samples.
-        target: Action to be predicted, (batch, dims).
+        log_std: Logarithm of the standard deviation, (components, steps, dims), the same for all samples.
+        target: Actions to be predicted, (batch, steps, dims).
+        valid: Steps that count, (batch, steps) bool; None for all.
 
     Returns:
         Loss of each sample, (batch,).
     """
-    each = gaussian_negative_log_likelihood(means, log_std, target[:, None])  # (batch, components)
-    return -torch.logsumexp(logits.log_softmax(dim=1) - each, dim=1)
+    each = gaussian_negative_log_likelihood(means, log_std, target[:, None])  # (batch, components, steps)
+    if valid is not None:
+        each = each * valid[:, None]
+    return -torch.logsumexp(logits.log_softmax(dim=1) - each.sum(dim=2), dim=1)
 
 
 def gripper_loss(logit: Tensor, target: Tensor, kind: str) -> Tensor:
     """Returns the loss of the gripper, the sigmoid of a logit, against its target.
 
     Args:
-        logit: Logit of each sample, (batch,).
-        target: Gripper command of each sample, (batch,) in 0..1.
+        logit: Logits, (...).
+        target: Gripper commands, (...) in 0..1.
         kind: "squared_error", the paper's, or "cross_entropy".
 
     Returns:
-        Loss of each sample, (batch,).
+        Loss of each, (...).
     """
     if kind == "squared_error":
         return (torch.sigmoid(logit) - target).square()
@@ -124,17 +129,19 @@ def imitation_loss(
     gripper: Tensor | None,
     log_std: Tensor,
     action: Tensor,
+    is_pad: Tensor | None,
     gripper_index: int | None,
     gripper_weight: float,
     gripper_kind: str,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Returns the imitation loss L_pi (equation 2), in single precision.
+    """Returns the imitation loss L_pi (equation 2), in single precision; of a chunk, the mean over its steps.
 
     Args:
         predicted: Distributions of the samples' actions.
-        gripper: Logit of each gripper, (batch,); None without a gripper.
-        log_std: (dims,) or (components, dims), the same for all samples.
-        action: Actions of the expert, (batch, action), -1..1.
+        gripper: Logits of the grippers, (batch, steps); None without a gripper.
+        log_std: (components, steps, dims), the same for all samples.
+        action: Actions of the expert, (batch, steps, action) in -1..1, or (batch, action) for one step.
+        is_pad: Steps beyond the end of the episode, which do not count, (batch, steps) bool; None for none.
         gripper_index: The gripper's dimension of the action; None without a gripper.
         gripper_weight: Weight of the gripper's loss.
         gripper_kind: Kind of the gripper's loss, as in `gripper_loss`.
@@ -142,38 +149,44 @@ def imitation_loss(
     Returns:
         Loss of each sample, (batch,), and its parts to log, each of shape ().
     """
-    motion, target = split_action(action.float(), gripper_index)
+    action = action.float() if action.ndim == 3 else action.float()[:, None]
+    valid = torch.ones_like(action[..., 0]) if is_pad is None else 1.0 - is_pad.float()  # (batch, steps)
+    n_steps = valid.sum(dim=1)  # at least the current one
+    motion, target = split_action(action, gripper_index)
     likelihood = mixture_negative_log_likelihood(
-        predicted.means.float(), predicted.logits.float(), log_std.float(), motion
+        predicted.means.float(), predicted.logits.float(), log_std.float(), motion, valid
     )
-    error = (predicted.mode.float() - motion).square()
-    logged = {"action_nll": likelihood.mean(), "action_mse": error.mean()}
+    likelihood = likelihood / n_steps
+    error = (predicted.mode.float() - motion).square().mean(dim=2) * valid
+    logged = {"action_nll": likelihood.mean(), "action_mse": error.sum() / n_steps.sum()}
     if gripper is None or target is None:
         return likelihood, logged
-    error = gripper_loss(gripper.float(), target, gripper_kind)
+    error = (gripper_loss(gripper.float(), target, gripper_kind) * valid).sum(dim=1) / n_steps
+    is_right = ((gripper > 0) == (target > 0.5)) * valid
     logged["gripper_loss"] = error.mean()
-    logged["gripper_accuracy"] = ((gripper > 0) == (target > 0.5)).float().mean()
+    logged["gripper_accuracy"] = is_right.sum() / n_steps.sum()
     return likelihood + gripper_weight * error, logged
 
 
 def split_action(action: Tensor, gripper_index: int | None) -> tuple[Tensor, Tensor | None]:
-    """Splits actions (batch, action) in -1..1 into the rest and the gripper in 0..1.
+    """Splits actions (..., action) in -1..1 into the rest and the gripper in 0..1.
 
     Args:
-        action: (batch, action), -1..1.
+        action: (..., action), -1..1.
         gripper_index: The gripper's dimension of the action; None without a gripper.
 
     Returns:
-        (batch, action - 1) and (batch,); without a gripper, the action and None.
+        (..., action - 1) and (...); without a gripper, the action and None.
     """
     if gripper_index is None:
         return action, None
-    rest = torch.cat([action[:, :gripper_index], action[:, gripper_index + 1 :]], dim=1)
-    return rest, (action[:, gripper_index] + 1) / 2
+    rest = torch.cat([action[..., :gripper_index], action[..., gripper_index + 1 :]], dim=-1)
+    return rest, (action[..., gripper_index] + 1) / 2
 
 
 def join_action(rest: Tensor, gripper: Tensor | None, gripper_index: int | None) -> Tensor:
-    """Joins what `split_action` splits: (batch, action - 1) and (batch,) to (batch, action)."""
+    """Joins what `split_action` splits: (..., action - 1) and (...) to (..., action)."""
     if gripper_index is None or gripper is None:
         return rest
-    return torch.cat([rest[:, :gripper_index], 2 * gripper[:, None] - 1, rest[:, gripper_index:]], dim=1)
+    parts = [rest[..., :gripper_index], 2 * gripper[..., None] - 1, rest[..., gripper_index:]]
+    return torch.cat(parts, dim=-1)

@@ -12,7 +12,7 @@
         |                         |
     fully connected           gripper
         |
-    distribution of the action
+    distribution of the actions of a chunk; the paper's has one step
 
 Task embedding: a unit vector that stands for a task, made from a demonstration or an instruction.
 Location: x (to the right) and y (down) in an image, in -1..1 between its edges.
@@ -58,14 +58,14 @@ BACKBONES = {
 
 
 class ActionDistribution(NamedTuple):
-    """A mixture of Gaussians over actions without the gripper; the paper has a single component."""
+    """A mixture of Gaussians over chunks of actions without the gripper; the paper has a single component."""
 
-    means: Tensor  # (batch, components, dims)
+    means: Tensor  # (batch, components, steps, dims)
     logits: Tensor  # (batch, components); their softmax is the probability of each component
 
     @property
     def mode(self) -> Tensor:
-        """The mean of the most likely component, (batch, dims)."""
+        """The mean of the most likely component, (batch, steps, dims)."""
         if self.means.shape[1] == 1:
             return self.means[:, 0]
         likeliest = self.logits.argmax(dim=1)
@@ -73,7 +73,7 @@ class ActionDistribution(NamedTuple):
 
 
 class PolicyNetwork(nn.Module):
-    """Predicts an action from images, the specification of the task, and proprioception.
+    """Predicts a chunk of actions from images, the specification of the task, and proprioception.
 
     Args:
         n_cameras: Number of images of an observation; their feature points are concatenated.
@@ -87,6 +87,7 @@ class PolicyNetwork(nn.Module):
         gripper_hidden_dim: Size of the gripper's hidden layer.
         num_components: Number of Gaussians of the action's distribution.
         n_locations: Number of locations in the first camera's image that specify the task.
+        chunk_size: Number of steps of a chunk; 1 in the paper.
     """
 
     def __init__(
@@ -102,32 +103,32 @@ class PolicyNetwork(nn.Module):
         gripper_hidden_dim: int = 32,
         num_components: int = 1,
         n_locations: int = 0,
+        chunk_size: int = 1,
     ) -> None:
         super().__init__()
         self.backbone = FilmResNet(film_dim, channels, stem_stride, in_channels=3 + n_locations)
         self.spatial_softmax = SpatialSoftmax()
         # Each location adds its coordinates and the features there.
         feature_dim = n_cameras * 2 * channels[-1] + concat_dim + n_locations * (2 + channels[-1])
-        self.action_dim, self.num_components = action_dim, num_components
-        n_outputs = num_components * action_dim + (num_components if num_components > 1 else 0)
+        self.means_shape = (num_components, chunk_size, action_dim)
+        n_outputs = math.prod(self.means_shape) + (num_components if num_components > 1 else 0)
         self.action_head = multilayer_perceptron([feature_dim, *hidden_dims, n_outputs])
         # After the authors' code: independent of the observation.
-        stds = (action_dim,) if num_components == 1 else (num_components, action_dim)
-        self.raw_log_std = nn.Parameter(torch.full(stds, _inverse_log_std(INITIAL_LOG_STD)))
+        self.raw_log_std = nn.Parameter(torch.full(self.means_shape, _inverse_log_std(INITIAL_LOG_STD)))
         # After the authors' code: on the concatenated features (the paper's figure 7: after those layers).
         self.gripper_head = (
-            multilayer_perceptron([feature_dim, gripper_hidden_dim, 1]) if has_gripper else None
+            multilayer_perceptron([feature_dim, gripper_hidden_dim, chunk_size]) if has_gripper else None
         )
 
     @property
     def log_std(self) -> Tensor:
-        """Log standard deviation, (action_dim,) or (components, action_dim), strictly between -6 and 0."""
+        """Log standard deviation, (components, steps, action_dim), strictly between -6 and 0."""
         return MIN_LOG_STD + (MAX_LOG_STD - MIN_LOG_STD) * torch.sigmoid(self.raw_log_std)
 
     def forward(
         self, images: Tensor, film: Tensor | None, concat: Tensor | None, locations: Tensor | None = None
     ) -> tuple[ActionDistribution, Tensor | None]:
-        """Predicts an action.
+        """Predicts a chunk of actions.
 
         Args:
             images: Images of all cameras, (batch, cameras, 3, H, W) in 0..1.
@@ -137,8 +138,8 @@ class PolicyNetwork(nn.Module):
                 `n_locations` is 0.
 
         Returns:
-            The action's distribution, and the gripper's logit, (batch,), or None. (Its sigmoid is the gripper
-            in 0..1.)
+            The distribution of the actions, and the gripper's logits, (batch, steps), or None. (Their sigmoid
+            is the gripper in 0..1.)
         """
         n_cameras = images.shape[1]
         if film is not None:
@@ -154,11 +155,10 @@ class PolicyNetwork(nn.Module):
         if concat is not None:
             parts.append(concat)
         features = torch.cat(parts, dim=-1)  # (batch, feature_dim)
-        gripper = None if self.gripper_head is None else self.gripper_head(features).squeeze(-1)
-        outputs = self.action_head(features)
-        n_means = self.num_components * self.action_dim
-        means = rearrange(outputs[:, :n_means], "b (m d) -> b m d", d=self.action_dim)
-        logits = outputs[:, n_means:] if self.num_components > 1 else torch.zeros_like(means[..., 0])
+        gripper = None if self.gripper_head is None else self.gripper_head(features)
+        outputs, n_means = self.action_head(features), math.prod(self.means_shape)
+        means = outputs[:, :n_means].unflatten(1, self.means_shape)
+        logits = outputs[:, n_means:] if self.means_shape[0] > 1 else torch.zeros_like(means[:, :, 0, 0])
         return ActionDistribution(means, logits), gripper
 
 

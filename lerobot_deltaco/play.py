@@ -251,11 +251,7 @@ def _possible_uses(config: Any) -> tuple[str, ...]:
         takes_sentence = any("language" in source or source == "one_hot" for source in sources)
         can_drop = (config.method == "mcil", config.method == "mcil")
     else:
-        takes_sentence = config.task_inputs.uses_language or config.inputs == "one_hot"
-        can_drop = (
-            config.takes_either and config.p_drop_instruction > 0,
-            config.takes_either and config.p_drop_demonstration > 0,
-        )
+        takes_sentence, can_drop = True, (True, True)
     if not (takes_sentence and config.uses_demonstrations):
         return (INSTRUCTION,) if takes_sentence else (DEMONSTRATION,)
     alone = [use for use, can in zip((DEMONSTRATION, INSTRUCTION), can_drop, strict=True) if can]

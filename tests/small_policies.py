@@ -5,12 +5,15 @@ import hashlib
 import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 from torch.utils.data import default_collate
 
 import lerobot_policy_deltaco  # noqa: F401  (registers the policies)
 from lerobot_deltaco import language
 from lerobot_deltaco.deltaco import modeling_deltaco
+from lerobot_deltaco.deltaco_match import feature_matching
+from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops
 from lerobot_deltaco.vision import VISION_ENCODERS
 
 # A dataset with two cameras and a gripper in the middle of the action.
@@ -68,6 +71,17 @@ class FakeVisionEncoder:
 def use_fake_vision_encoder(monkeypatch):
     """Replaces all frozen image encoders by the fake one."""
     monkeypatch.setattr(modeling_deltaco, "load_vision_encoder", FakeVisionEncoder)
+
+
+def use_short_fit(monkeypatch, steps=2):
+    """Fits feature matching in a few steps, to colors instead of a pretrained encoder's features."""
+
+    def colors(images, locations, sizes):
+        crops = cut_crops(images, locations, sizes, resolution=8).flatten(2)
+        return torch.nn.functional.pad(crops, (0, FEATURE_DIM - crops.shape[2]))
+
+    monkeypatch.setattr(feature_matching, "crop_features", colors)
+    monkeypatch.setattr(feature_matching.FeatureMatching.fit, "__defaults__", (steps,))
 
 
 def write_dataset(root, episodes=EPISODES):
@@ -164,6 +178,12 @@ def small_policy(dataset, policy_type="deltaco", **options):
 def demos_of(dataset):
     """Options that name a dataset as that of the demonstrations for evaluation."""
     return {"demo_repo_id": dataset.repo_id, "demo_root": str(dataset.root)}
+
+
+def with_chunks(dataset, config):
+    """Returns a dataset whose frames have the actions of a chunk, as a policy's training needs them."""
+    windows = resolve_delta_timestamps(config, dataset.meta)
+    return LeRobotDataset(dataset.repo_id, root=dataset.root, delta_timestamps=windows)
 
 
 def batch_of(dataset, indices):

@@ -172,7 +172,7 @@ def test_another_language_encoder_is_an_error(make, tmp_path, encoder):
 
 def test_task_bank_of_another_robot_is_an_error(tmp_path):
     table = write_table(tmp_path / "data", random_moves(2))
-    policy, _, _ = small_policy(table, "deltaco_match", feature_matching=False, **demos_of(table))
+    policy, _, _ = small_policy(table, "deltaco_match", **demos_of(table))
     policy.save_pretrained(tmp_path / "policy")
     shape = (2, 3, policy.config.image_size, policy.config.image_size)
 

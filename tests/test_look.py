@@ -24,7 +24,8 @@ def found_at(pick, place, by_demonstration=(True, True), size=24):
     for n, (column, row) in enumerate((pick, place)):
         maps[0, n, row, column] = 20
     locations = (torch.tensor([[pick, place]]) + 0.5) / size * 2 - 1
-    return Found(locations, torch.zeros(1), maps, maps.flatten(2).softmax(2).view_as(maps), by_demonstration)
+    attention = maps.flatten(2).softmax(2).view_as(maps)
+    return Found(locations, torch.zeros(1), maps, attention, by_demonstration, torch.ones(1))
 
 
 def closeness(image, color, x, y):

@@ -1,13 +1,11 @@
-"""What `deltaco_match` consists of: keyframes, calibration, heights, correspondence, feature matching."""
+"""What `deltaco_match` consists of: keyframes, calibration, heights, places, feature matching."""
 
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F  # noqa: N812
 from small_policies import TABLE_SIZE, draw_table, random_moves, state_at
 
 from lerobot_deltaco.deltaco_match.calibration import MIN_EPISODES, StateToImage
-from lerobot_deltaco.deltaco_match.correspondence import CorrespondenceNetwork, Given, peak_locations
 from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops, fit_perspective
 from lerobot_deltaco.deltaco_match.feature_matching import Candidates, FeatureMatching
 from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
@@ -19,6 +17,7 @@ from lerobot_deltaco.deltaco_match.keyframes import (
     grasp_frames,
     warn_if_inverted,
 )
+from lerobot_deltaco.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
 from lerobot_deltaco.deltaco_match.proposals import N_PROPOSALS, peaks
 from lerobot_deltaco.deltaco_match.robot_states import RobotStates
 from lerobot_deltaco.deltaco_match.words import encode_words, understand, vocabulary_of
@@ -197,43 +196,28 @@ def test_heights_are_zero_if_all_grasps_have_the_same():
 def test_height_of_a_demonstration_counts_as_far_as_it_can_be_trusted():
     torch.manual_seed(0)
     n, dim = 256, 8
-    estimator = GraspHeightEstimator(dim, condition_dim=2, has_demonstration=True)
+    estimator = GraspHeightEstimator(dim)
     optimizer = torch.optim.Adam(estimator.parameters(), lr=1e-2)
-    generator = torch.Generator().manual_seed(0)
 
     def samples():
-        features = torch.randn(n, dim, 6, 6, generator=generator)
-        kind = torch.arange(n) % 2  # 0: the demonstration moved the same object
-        heights = torch.randn(n, generator=generator)
-        others = torch.where(kind == 0, heights, torch.randn(n, generator=generator))
-        return features, torch.zeros(n, 2), heights, torch.randn(n, dim), others, F.one_hot(kind, 2).float()
+        is_same = torch.arange(n) % 2 == 0
+        heights = torch.randn(n)
+        demonstrated = torch.where(is_same, heights, torch.randn(n))
+        return torch.randn(n, dim), torch.where(is_same, 0.9, 0.2), demonstrated, heights
 
     for _ in range(150):
-        loss = estimator.losses(*samples(), generator).mean()
+        loss = estimator.losses(*samples()).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    features, locations, heights, descriptors, others, condition = samples()
-    found = estimator(features, locations, descriptors, others, condition)
-    same = condition[:, 0] == 1
-    assert (found - heights)[same].abs().mean() < 0.1
+    features, similarity, demonstrated, heights = samples()
+    found, is_same = estimator(features, similarity, demonstrated), similarity > 0.5
+    assert (found - heights)[is_same].abs().mean() < 0.1
     # Another object's height counts little, and an unknown one not at all.
-    by_appearance = estimator(features, locations, descriptors, others * torch.nan, condition)
+    by_appearance = estimator(features, similarity, demonstrated * torch.nan)
     assert by_appearance.isfinite().all()
-    change = (found - by_appearance)[~same].abs().mean()
-    assert change < 0.5 * (others - by_appearance)[~same].abs().mean()
-
-
-def test_unknown_heights_leave_the_loss_finite():
-    estimator = GraspHeightEstimator(4, 0, has_demonstration=True)
-    features, descriptors = torch.rand(3, 4, 6, 6), torch.rand(3, 4)
-    unknown = torch.full((3,), torch.nan)
-    losses = estimator.losses(
-        features, torch.zeros(3, 2), torch.zeros(3), descriptors, unknown, None, torch.Generator()
-    )
-    losses.sum().backward()
-    assert losses.isfinite().all()
-    assert all(p.grad is None or p.grad.isfinite().all() for p in estimator.parameters())
+    change = (found - by_appearance)[~is_same].abs().mean()
+    assert change < 0.5 * (demonstrated - by_appearance)[~is_same].abs().mean()
 
 
 # Colors and maps
@@ -261,42 +245,22 @@ def test_peak_of_a_map_is_its_location():
     torch.testing.assert_close(peak_locations(20 * maps), locations, atol=0.03, rtol=0)
 
 
-# Correspondence
+# Places
 
 
-def test_descriptor_is_most_similar_to_what_it_was_made_of():
+def test_the_demonstration_or_the_instruction_says_where():
     torch.manual_seed(0)
-    network = CorrespondenceNetwork(True, True, condition_dim=0).eval()
-    scene = torch.rand(1, 3, TABLE_SIZE, TABLE_SIZE)
-    description = network.describe(torch.stack([scene, scene], dim=1))
-    features = network.trunk(scene)
-    row, column = 3, 8
-    maps, _ = network(scene, scene, description._replace(moved=features[:, :, row, column]), None)
-    assert maps.shape == (1, 2, TABLE_SIZE // 2, TABLE_SIZE // 2)
-    assert maps[0, 0].argmax() == row * (TABLE_SIZE // 2) + column
-
-
-def test_what_is_not_given_does_not_matter():
-    torch.manual_seed(0)
-    network = CorrespondenceNetwork(True, False, condition_dim=5, takes_either=True).eval()
-    scenes, ends = torch.rand(2, 1, 3, 16, 16)[0], torch.rand(2, 1, 2, 3, 16, 16)
-    conditions = torch.randn(2, 1, 5)
-    for demonstration, condition in ((True, False), (False, True), (True, True)):
-        given = Given(torch.tensor([demonstration]), torch.tensor([condition]))
-        maps = torch.stack(
-            [
-                network(scenes, scenes, network.describe(shown), said, given)[0]
-                for shown, said in (
-                    (ends[0], conditions[0]),
-                    (ends[1], conditions[0]),
-                    (ends[0], conditions[1]),
-                )
-            ]
-        )
-        by_demonstration, by_condition = ((maps[0] != other).flatten(2).any(dim=2)[0] for other in maps[1:])
-        # With both, the demonstration says what to pick, and the condition where to place it.
-        assert by_demonstration.tolist() == [demonstration, demonstration and not condition]
-        assert by_condition.tolist() == [condition, condition]
+    network = PlaceNetwork(5).eval()
+    scenes, last = torch.rand(2, 3, 16, 16), torch.rand(2, 3, 16, 16)
+    attention = torch.rand(2, 8, 8).flatten(1).softmax(dim=1).view(2, 8, 8)
+    target, nothing = network.target(last, attention), torch.zeros(2, TARGET_DIM)
+    assert target.shape == nothing.shape
+    instruction = torch.randn(2, 5)
+    maps = [
+        network(scenes, words, to) for words in (instruction, 0 * instruction) for to in (target, nothing)
+    ]
+    assert maps[0].shape == (2, 8, 8)
+    assert len({float(each.sum()) for each in maps}) == 4
 
 
 # Feature matching
@@ -332,23 +296,25 @@ def matching(shapes):
     """A feature matching that is fitted to 24 of the episodes."""
     images, locations, tasks = (part[:24] for part in shapes)
     matching = FeatureMatching(vocabulary_of(SHAPE_TASKS), 0.25)
-    matching.fit(images, images, images, locations, tasks, {task: [task] for task in tasks}, seed=0, steps=60)
+    sentences, heights = {task: [task] for task in tasks}, torch.zeros(24)
+    matching.fit(images, images, images, locations, heights, tasks, sentences, seed=0, steps=60)
     assert matching.fitted
     return matching
 
 
-def fraction_found(matching, shapes, by_demonstration=False, words=None):
+def fraction_found(matching, shapes, by_demonstration=False, words=lambda task: ""):
     """Fraction of the other 12 episodes in which the object is found, by other episodes or by words."""
     images, locations, tasks = (part[24:] for part in shapes)
     scenes = images.float() / 255
     shown = [(n + 2) % 12 for n in range(12)]
-    described = None
+    described = demonstrated = None
     if by_demonstration:
         described = matching.describe(scenes[shown], scenes[shown], locations[shown])
-    candidates = matching.find(scenes, scenes, described, None if words is None else [*map(words, tasks)])
+        demonstrated = torch.zeros(12)
+    candidates = matching.find(scenes, scenes, [*map(words, tasks)], described, demonstrated)
     assert candidates.locations.shape == (12, N_PROPOSALS, 2)
     torch.testing.assert_close(candidates.log_probabilities.exp().sum(dim=1), torch.ones(12))
-    return ((candidates.best - locations).abs().amax(dim=1) < 0.2).float().mean()
+    return ((candidates.best[0] - locations).abs().amax(dim=1) < 0.2).float().mean()
 
 
 def test_fit_finds_shapes_of_one_color_by_demonstrations_and_by_words(matching, shapes):
@@ -368,9 +334,8 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes):
     for seed in (0, 0, 1):
         matching = FeatureMatching(vocabulary_of(tasks), 0.25).train()
         torch.set_rng_state(state)
-        matching.fit(
-            images, images, images, locations, tasks, {task: [task] for task in tasks}, seed=seed, steps=2
-        )
+        sentences = {task: [task] for task in tasks}
+        matching.fit(images, images, images, locations, torch.zeros(8), tasks, sentences, seed, steps=2)
         assert torch.equal(torch.get_rng_state(), state)
         assert not any(weights.requires_grad for weights in matching.parameters())
         assert not any(module.training for module in matching.modules())
@@ -393,7 +358,9 @@ def test_words_that_describe_the_container_do_not_count():
     features[..., :100] += 4.0 * color[..., None]
     matching.requires_grad_(True)
     sentences = {text: [text] for text in tasks}
-    matching._fit_comparison(features, target, [tasks[n] for n in task], sentences, generator, 150)
+    matching._fit_comparison(
+        features, target, torch.zeros(n_scenes), [tasks[n] for n in task], sentences, generator, 150
+    )
     sentence = "Putt the red cubee in the red bin"
     weights = matching.word_weights(encode_words([sentence], matching.vocabulary))[0]
     assert weights[2] > 0.7
@@ -407,7 +374,9 @@ def test_fit_needs_a_task_with_two_grasps(shapes):
     images, locations, tasks = (part[:6] for part in shapes)
     locations = torch.where(torch.arange(6)[:, None] < 2, locations, torch.nan)
     with pytest.raises(ValueError, match="at least two episodes .* 2 such episodes are of 2 different tasks"):
-        FeatureMatching([], 0.25).fit(images, images, images, locations, tasks, {}, seed=0, steps=2)
+        FeatureMatching([], 0.25).fit(
+            images, images, images, locations, torch.zeros(6), tasks, {}, seed=0, steps=2
+        )
 
 
 def test_crops_are_centered_and_see_the_native_resolution():
@@ -447,10 +416,12 @@ def test_peaks_are_apart_and_ordered():
 
 
 def test_the_map_of_candidates_peaks_at_the_best():
-    candidates = Candidates(torch.tensor([[[-0.5, 0.2], [0.6, -0.4]]]), torch.tensor([[0.2, 0.8]]).log())
+    candidates = Candidates(
+        torch.tensor([[[-0.5, 0.2], [0.6, -0.4]]]), torch.tensor([[0.2, 0.8]]).log(), torch.zeros(1, 2)
+    )
     maps = candidates.map((24, 30))
     assert maps.shape == (1, 24, 30)
-    torch.testing.assert_close(peak_locations(maps[:, None])[0, 0], candidates.best[0], atol=0.05, rtol=0)
+    torch.testing.assert_close(peak_locations(maps[:, None])[0, 0], candidates.best[0][0], atol=0.05, rtol=0)
 
 
 def test_words_are_understood():

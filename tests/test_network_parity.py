@@ -72,9 +72,9 @@ def test_policy_network_matches_formulas(training, film_dim, concat_dim, has_gri
     with torch.no_grad():
         predicted, gripper = network(image_tensor, film_tensor, concat_tensor)
     assert np.abs(expected).max() > 0.1  # else this would test nothing
-    np.testing.assert_allclose(predicted.mode.numpy(), expected, **TOLERANCE)
+    np.testing.assert_allclose(predicted.mode[:, 0].numpy(), expected, **TOLERANCE)
     if has_gripper:
-        np.testing.assert_allclose(gripper.numpy(), expected_gripper, **TOLERANCE)
+        np.testing.assert_allclose(gripper[:, 0].numpy(), expected_gripper, **TOLERANCE)
     else:
         assert gripper is None
         assert expected_gripper is None
@@ -103,7 +103,7 @@ def test_likelihood_of_an_action_matches_formula():
     found = gaussian_negative_log_likelihood(mean_tensor, log_std_tensor, target_tensor)
     np.testing.assert_allclose(found.numpy(), expected, **TOLERANCE)
     one_component = mixture_negative_log_likelihood(
-        mean_tensor[:, None], torch.zeros(BATCH, 1), log_std_tensor, target_tensor
+        mean_tensor[:, None, None], torch.zeros(BATCH, 1), log_std_tensor, target_tensor[:, None]
     )
     np.testing.assert_allclose(one_component.numpy(), expected, **TOLERANCE)
 
@@ -115,7 +115,9 @@ def test_likelihood_of_a_mixture_matches_formula():
     logits, logit_tensor = drawn(BATCH, 4, seed=4)
     probabilities = np.exp(reference.log_softmax(logits))
     densities = np.exp(reference.normal_log_density(means, log_std, target[:, None]))
-    found = mixture_negative_log_likelihood(mean_tensor, logit_tensor, log_std_tensor, target_tensor)
+    found = mixture_negative_log_likelihood(
+        mean_tensor[:, :, None], logit_tensor, log_std_tensor[:, None], target_tensor[:, None]
+    )
     np.testing.assert_allclose(found.numpy(), -np.log((probabilities * densities).sum(axis=1)), **TOLERANCE)
 
 

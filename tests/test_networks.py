@@ -11,7 +11,13 @@ from lerobot_deltaco.deltaco.demo_encoders import (
     frame_grid,
     shift_demonstrations,
 )
-from lerobot_deltaco.losses import join_action, location_loss, mixture_negative_log_likelihood, split_action
+from lerobot_deltaco.losses import (
+    imitation_loss,
+    join_action,
+    location_loss,
+    mixture_negative_log_likelihood,
+    split_action,
+)
 from lerobot_deltaco.networks import (
     BACKBONES,
     INITIAL_LOG_STD,
@@ -41,9 +47,9 @@ def _seed():
 
 
 def test_likelihood_of_a_mixture_is_that_of_torch():
-    means, logits, target = torch.randn(5, 4, 3), torch.randn(5, 4), torch.randn(5, 3)
-    log_std = torch.randn(4, 3)
-    components = torch.distributions.Independent(torch.distributions.Normal(means, log_std.exp()), 1)
+    means, logits, target = torch.randn(5, 4, 2, 3), torch.randn(5, 4), torch.randn(5, 2, 3)
+    log_std = torch.randn(4, 2, 3)
+    components = torch.distributions.Independent(torch.distributions.Normal(means, log_std.exp()), 2)
     mixture = torch.distributions.MixtureSameFamily(
         torch.distributions.Categorical(logits=logits), components
     )
@@ -51,10 +57,38 @@ def test_likelihood_of_a_mixture_is_that_of_torch():
     torch.testing.assert_close(loss, -mixture.log_prob(target))
 
 
+@pytest.mark.parametrize("gripper_index", [None, 1])
+def test_steps_beyond_the_end_of_an_episode_do_not_count(gripper_index):
+    dim = 3 - (gripper_index is not None)
+    means, logits, log_std = torch.randn(2, 4, 5, dim), torch.randn(2, 4), torch.randn(4, 5, dim)
+    gripper = None if gripper_index is None else torch.randn(2, 5)
+    action, is_pad = torch.rand(2, 5, 3) * 2 - 1, torch.arange(5) > torch.tensor([[1], [4]])
+
+    def loss(action, n_steps=5):
+        predicted = ActionDistribution(means[:, :, :n_steps], logits)
+        of_steps = None if gripper is None else gripper[:, :n_steps]
+        return imitation_loss(
+            predicted,
+            of_steps,
+            log_std[:, :n_steps],
+            action[:, :n_steps],
+            is_pad[:, :n_steps],
+            gripper_index,
+            3.0,
+            "cross_entropy",
+        )
+
+    losses, logged = loss(action)
+    other, other_logged = loss(torch.where(is_pad[..., None], 0.5, action))
+    torch.testing.assert_close(losses, other)
+    torch.testing.assert_close(logged, other_logged)
+    torch.testing.assert_close(losses[0], loss(action, 2)[0][0])
+
+
 def test_mode_is_the_mean_of_the_likeliest_component():
-    means = torch.tensor([[[1.0], [2.0]], [[3.0], [4.0]]])
+    means = torch.tensor([[[[1.0]], [[2.0]]], [[[3.0]], [[4.0]]]])
     logits = torch.tensor([[0.0, 1.0], [1.0, 0.0]])
-    assert ActionDistribution(means, logits).mode.tolist() == [[2.0], [3.0]]
+    assert ActionDistribution(means, logits).mode.tolist() == [[[2.0]], [[3.0]]]
 
 
 @pytest.mark.parametrize("gripper_index", [None, 0, 1, 3])
@@ -111,10 +145,10 @@ def test_paper_networks_have_the_sizes_of_the_paper():
 
 def test_log_std_stays_within_its_limits():
     network = PolicyNetwork(1, 0, 0, 3, False)
-    torch.testing.assert_close(network.log_std, torch.full((3,), INITIAL_LOG_STD))
+    torch.testing.assert_close(network.log_std, torch.full((1, 1, 3), INITIAL_LOG_STD))
     with torch.no_grad():
         network.raw_log_std.copy_(torch.tensor([-50.0, 0.0, 50.0]))
-    torch.testing.assert_close(network.log_std, torch.tensor([-6.0, -3.0, 0.0]))
+    torch.testing.assert_close(network.log_std[0, 0], torch.tensor([-6.0, -3.0, 0.0]))
 
 
 def test_outputs_are_not_rounded_under_mixed_precision():
@@ -127,7 +161,7 @@ def test_outputs_are_not_rounded_under_mixed_precision():
     last = network.action_head[-1]
     exact = F.linear(hidden[0].float(), last.weight, last.bias)
     assert predicted.means.dtype == gripper.dtype == torch.float32
-    torch.testing.assert_close(predicted.means[:, 0], exact)
+    torch.testing.assert_close(predicted.mode[:, 0], exact)
     assert (exact != exact.bfloat16()).any()
 
 
@@ -172,7 +206,7 @@ def test_initial_weights_of_the_authors():
             if isinstance(layer, nn.Linear):
                 assert 0.9e-3 < layer.weight.abs().max() <= 1e-3
                 assert layer.bias.abs().max() <= 1e-3
-    torch.testing.assert_close(network.log_std.exp(), torch.full((3,), 0.05))
+    torch.testing.assert_close(network.log_std.exp(), torch.full((1, 1, 3), 0.05))
     convolution = network.backbone.blocks[7].conv2
     expected = torch.tensor((2 / (convolution.out_channels * 9)) ** 0.5)
     torch.testing.assert_close(convolution.weight.std(), expected, rtol=0.02, atol=0)

@@ -93,7 +93,7 @@ def test_bfloat16_needs_instructions_of_the_processor(monkeypatch, caplog):
     ("options", "message"),
     [
         (["--policy.type=deltaco", "--policy.temperature=1e-40"], "`temperature` must be from 0.001"),
-        (["--policy.type=deltaco_match", "--policy.inputs=all"], "`inputs` must be one of both"),
+        (["--policy.type=deltaco_match", "--policy.crop_size=2"], "`crop_size` must be from 0.01"),
     ],
 )
 def test_command_line_of_lerobot_logs_what_is_wrong(options, message, monkeypatch, caplog):

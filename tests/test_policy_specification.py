@@ -22,6 +22,7 @@ from small_policies import (
     observation,
     random_moves,
     small_policy,
+    with_chunks,
     write_table,
 )
 
@@ -42,12 +43,11 @@ VARIANTS = [
     ("deltaco", {"gripper_loss": "cross_entropy", "language_head": [8]}),
     ("deltaco", {"language_encoder": "all-distilroberta-v1"}),
     ("deltaco", {"dtype": "bfloat16", "grad_clip_norm": 1.0}),
+    ("deltaco", {"chunk_size": 4, "n_action_steps": 3}),
     ("deltaco_match", {}),
-    ("deltaco_match", {"inputs": "demonstration"}),
-    ("deltaco_match", {"inputs": "both", "feature_matching": False, "dtype": "bfloat16"}),
-    ("deltaco_match", {"p_drop_demonstration": 0.0, "p_drop_instruction": 0.0, "n_demonstrations": 2}),
-    ("deltaco_match", {"inputs": "instruction", "frames_after_release": None}),
-    ("deltaco_match", {"inputs": "one_hot", "num_mixture_components": 1}),
+    ("deltaco_match", {"chunk_size": 3, "n_action_steps": 1, "temporal_ensemble_coeff": 0.01}),
+    ("deltaco_match", {"dtype": "bfloat16", "n_demonstrations": 2}),
+    ("deltaco_match", {"frames_after_release": None, "num_mixture_components": 1}),
 ]
 # Frames that are trained on, of all tasks.
 FRAMES = {"deltaco": [0, 7, 16, 22, 29], "deltaco_match": list(range(0, 20 * TABLE_LENGTH, TABLE_LENGTH + 1))}
@@ -75,7 +75,7 @@ def make(request, dataset, table, fake_language, short_fit):
             after=after,
             data=data,
             tasks=TASKS if policy_type == "deltaco" else TABLE_TASKS,
-            batch=before(batch_of(data, FRAMES[policy_type])),
+            batch=before(batch_of(with_chunks(data, policy.config), FRAMES[policy_type])),
         )
 
     return make
@@ -135,11 +135,13 @@ def test_acting_in_batches_of_any_size_leaves_the_batch_unchanged(make):
         made.policy.reset()
         batch = made.before(observation(made.data, tasks))
         kept = copy.deepcopy(batch)
-        action = made.policy.select_action(batch)
-        assert action.shape == (len(tasks), 3)
-        assert torch.isfinite(made.after(action)).all()
-        assert torch.equal(made.policy.select_action(batch), action)
-        assert torch.equal(made.policy.predict_action_chunk(batch), action[:, None])
+        chunk = made.policy.predict_action_chunk(batch)
+        assert chunk.shape == (len(tasks), made.config.chunk_size, 3)
+        assert torch.isfinite(made.after(chunk)).all()
+        first, second = (made.policy.select_action(batch) for _ in range(2))
+        assert torch.equal(first, chunk[:, 0])
+        if made.config.temporal_ensemble_coeff is None:
+            assert torch.equal(second, chunk[:, 1 % made.config.n_action_steps])
         assert_same(kept, batch)
 
 
@@ -219,7 +221,7 @@ def test_loss_matches_the_papers_formulas(dataset, method):
     model = weights_of(policy, "model.")
     imitation = functools.partial(
         reference.imitation_loss,
-        raw_log_std=model["raw_log_std"],
+        raw_log_std=model["raw_log_std"][0, 0],
         action=action[:, [0, 2]],
         gripper_target=(action[:, 1] + 1) / 2,
         gripper_weight=30,

@@ -94,9 +94,7 @@ def test_commands_that_are_killed_come_to_the_same(tmp_path):
         run_with_kills([*collect, folder / "killed_data"], folder / "killed_data", rng)
         assert contents(folder / "killed_data") == contents(folder / "data")
 
-        policy = rng.choice(
-            ["deltaco --policy.backbone=strided", "deltaco_match --policy.feature_matching=false"]
-        )
+        policy = rng.choice(["deltaco --policy.backbone=strided", "deltaco_match"])
         train = ["train", *f"--policy.type={policy}".split(), "--policy.device=cpu", "--batch_size=150"]
         train += [f"--policy.tasks_per_batch={rng.choice([0, 3])}", f"--steps={N_STEPS}", "--save_freq=2"]
         train += ["--dataset.repo_id=soak/data", f"--dataset.root={folder / 'data'}", f"--seed={n_rounds}"]

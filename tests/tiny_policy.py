@@ -30,7 +30,6 @@ def save_tiny_policy(folder, **options):
     torch.manual_seed(0)
     config = DeltacoMatchConfig(
         device="cpu",
-        feature_matching=False,
         known_words=vocabulary_of(SENTENCES),
         gripper="3",
         input_features={
@@ -41,10 +40,9 @@ def save_tiny_policy(folder, **options):
         **options,
     )
     policy = DeltacoMatchPolicy(config).eval()
-    if config.uses_demonstrations:
-        frames = torch.randint(0, 256, (len(DEMONSTRATED), 2, 3, 48, 48), dtype=torch.uint8)
-        tasks = [TASKS[task_id].instruction for task_id in DEMONSTRATED]
-        policy.demonstrations = DemonstrationBank(frames, tasks, range(len(tasks)), [4, 26])
+    frames = torch.randint(0, 256, (len(DEMONSTRATED), 2, 3, 48, 48), dtype=torch.uint8)
+    tasks = [TASKS[task_id].instruction for task_id in DEMONSTRATED]
+    policy.demonstrations = DemonstrationBank(frames, tasks, range(len(tasks)), [4, 26])
     policy.save_pretrained(folder)
     stats = {"observation.state": {"mean": torch.zeros(10), "std": torch.ones(10)}}
     for processor in make_pre_post_processors(config, dataset_stats=stats):

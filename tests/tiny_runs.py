@@ -8,6 +8,7 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_train
+from small_policies import use_short_fit
 from torch.utils.data import default_collate
 
 import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
@@ -22,7 +23,6 @@ EPISODES_PER_TASK = 6  # `deltaco_match` needs 24 episodes
 DELTACO = {"policy.type": "deltaco", "policy.backbone": "strided", "policy.tasks_per_batch": 2}
 MATCH = {
     "policy.type": "deltaco_match",
-    "policy.feature_matching": False,
     "policy.tasks_per_batch": 2,
     # accelerate keeps its precision for the whole process.
     "policy.dtype": "float32",
@@ -143,6 +143,7 @@ def run_training(root, folder, options, in_memory=True, **more):
     words = [f"--{name}={_as_word(value)}" for name, value in arguments.items()]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(language, "load_language_encoder", fake_language_encoder)
+        use_short_fit(patch)
         patch.setattr(sys, "argv", ["train", *words])
         train() if in_memory else lerobot_train.main()
     return folder / "checkpoints"

@@ -2,7 +2,7 @@
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -127,6 +127,8 @@ class DeltacoConfig(TaskConditionedConfig):
     scheduler_name: str = "constant"
     # Filled in by the pretrained image encoder: the size of its features.
     demo_feature_dim: int | None = None
+    # The tasks known to a one-hot policy.
+    one_hot_tasks: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if self.initial_weights is None:

@@ -15,11 +15,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy, known_tasks, one_hot
+from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.deltaco.demo_encoders import (
     AttentionEncoder,
@@ -171,36 +172,32 @@ class DeltacoPolicy(TaskConditionedPolicy):
         predicted, gripper = self.model(images, film, self._concatenated(batch, concat))
         kind = self.config.gripper_loss
         index, weight = self.config.gripper_index, GRIPPER_LOSSES[kind]
-        return imitation_loss(predicted, gripper, self.model.log_std, batch[ACTION], index, weight, kind)
+        return imitation_loss(
+            predicted,
+            gripper,
+            self.model.log_std,
+            batch[ACTION],
+            batch.get(f"{ACTION}_is_pad"),
+            index,
+            weight,
+            kind,
+        )
 
     # Acting
 
     @torch.no_grad()
-    def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """Returns the mean action; with several mixture components, the mean of the most likely one.
-
-        Args:
-            batch: As in `forward`, without `action` and `episode_index`. `task` is not needed if `set_tasks`
-                gave the instructions.
-
-        Returns:
-            Actions, (batch, action), normalized as in `forward`.
-
-        Raises:
-            ValueError: There is no instruction, or a task has no demonstration.
-            FloatingPointError: The action is not finite, or absurdly large.
-        """
-        instructions, demonstrations = self._tasks_of(batch)
+    def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """Returns the actions of a chunk, (batch, steps, action). See `select_action`."""
         images = self._images(batch)
-        if self._episode is None or self._episode.instructions != instructions:
-            self._episode = self._begin_episode(instructions, demonstrations, images.device)
+        if self._begins_episode(batch):
+            self._start(self._begin_episode(*self._tasks_of(batch), images.device))
         episode: Episode = self._episode
         concat = self._concatenated(batch, episode.concat)
         predicted, gripper = episode.network(images, episode.film, concat)
         if gripper is not None:
             gripper = torch.sigmoid(gripper.float())
-        action = join_action(predicted.mode.float(), gripper, self.config.gripper_index)
-        return self._checked_action(action, batch)
+        chunk = join_action(predicted.mode.float(), gripper, self.config.gripper_index)
+        return self._checked_action(chunk, batch)
 
     def _begin_episode(
         self,
@@ -389,6 +386,7 @@ def _make_network(config: DeltacoConfig) -> PolicyNetwork:
         channels=backbone.channels,
         stem_stride=backbone.stem_stride,
         num_components=config.num_mixture_components,
+        chunk_size=config.chunk_size,
     )
 
 
@@ -413,3 +411,32 @@ def _make_language_head(config: DeltacoConfig) -> UnitHead | None:
     if hidden_dims is None or not config.uses_language:
         return None
     return UnitHead(config.embedding_dim, hidden_dims, config.embedding_dim)
+
+
+def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) -> Tensor:
+    """Returns one-hot vectors of tasks, (batch, known tasks).
+
+    Raises:
+        ValueError: A task is not known.
+    """
+    unknown = next((task for task in tasks if task not in known), None)
+    if unknown is not None:
+        raise ValueError(
+            f"This one-hot policy does not know the task {unknown!r}. It knows the {len(known)} tasks of its "
+            f"training dataset, such as {known[0]!r}."
+        )
+    index = {task: n for n, task in enumerate(known)}
+    return F.one_hot(torch.tensor([index[task] for task in tasks], device=device), len(known)).float()
+
+
+def known_tasks(meta: LeRobotDatasetMetadata | None) -> list[str]:
+    """Returns the task strings of the training dataset, for a one-hot policy.
+
+    Raises:
+        ValueError: There are no metadata.
+    """
+    if meta is None:
+        raise ValueError(
+            "A one-hot policy knows the tasks of its dataset. Pass the metadata as `dataset_meta`."
+        )
+    return list(meta.tasks.index)

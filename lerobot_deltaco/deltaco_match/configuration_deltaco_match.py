@@ -3,30 +3,10 @@
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
 from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import NamedTuple
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_deltaco.base_config import TaskConditionedConfig, check_pattern
-
-
-class TaskInputs(NamedTuple):
-    """Inputs that specify what to pick and where to place it."""
-
-    picks_by_demonstration: bool
-    places_by_demonstration: bool
-    uses_language: bool
-
-
-TASK_INPUTS = MappingProxyType(
-    {
-        "both": TaskInputs(True, False, True),
-        "demonstration": TaskInputs(True, True, False),
-        "instruction": TaskInputs(False, False, True),
-        "one_hot": TaskInputs(False, False, False),
-    }
-)
+from lerobot_deltaco.base_config import TaskConditionedConfig
 
 
 @PreTrainedConfig.register_subclass("deltaco_match")
@@ -34,17 +14,10 @@ TASK_INPUTS = MappingProxyType(
 class DeltacoMatchConfig(TaskConditionedConfig):
     """A policy that finds what a demonstration moved, and places it where an instruction says.
 
-    It needs a fixed camera, a robot state, and a gripper among the action's dimensions.
+    It needs a fixed camera, a robot state, and a gripper among the action's dimensions. It acts on a
+    demonstration, an instruction, or both.
 
     Args:
-        inputs: What specifies a task: both (a demonstration and an instruction), demonstration, instruction,
-            or one_hot (the number of a training task).
-        p_drop_demonstration: With both inputs: probability that a training sample has no demonstration, so
-            that the policy can do without.
-        p_drop_instruction: The same for the instruction; no sample is without both.
-        feature_matching: Whether to compare the things that could be grasped with the demonstrated and the
-            named object by features of EfficientNet-Lite0, which was trained on ImageNet. Training begins
-            with a few minutes of fitting.
         crop_size: Side of the square around a thing that is compared, in the middle of the first camera's
             image and as a fraction of its side: about the size of a large object.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation.
@@ -53,22 +26,15 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             too early misses flat objects; on a robot, one that goes too far may touch the table.
         p_hue_augmentation: Probability that a training sample's observation and demonstration undergo the
             same random change of hue, saturation and brightness.
-        colorless_tasks: Regular expression for the instructions in which color does not count; in these
-            tasks, the demonstration's colors change differently from the scene's.
         frames_after_release: Number of frames after the gripper's last opening in an episode that
             `deltaco train` trains on; None for all.
     """
 
-    inputs: str = "both"
-    p_drop_demonstration: float = 0.25
-    p_drop_instruction: float = 0.25
-    feature_matching: bool = True
     crop_size: float = 0.17
     n_demonstrations: int = 1
     num_mixture_components: int = 5
     grasp_height_bias: float = 0.75
     p_hue_augmentation: float = 0.7
-    colorless_tasks: str | None = "shaped object"
     frames_after_release: int | None = 2
     paraphrases: str | None = "grammar"
     p_paraphrase: float = 0.5
@@ -86,20 +52,12 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             ValueError: An option is invalid; the message says what is valid.
         """
         super().check()
-        self.check_choices(inputs=TASK_INPUTS)
         self.check_ranges(
-            p_drop_demonstration=(0, 1),
-            p_drop_instruction=(0, 1),
             crop_size=(0.01, 1),
             n_demonstrations=(1, 1000),
             grasp_height_bias=(-10, 10),
             p_hue_augmentation=(0, 1),
         )
-        if self.p_drop_demonstration + self.p_drop_instruction >= 1:
-            raise ValueError(
-                "`p_drop_demonstration` and `p_drop_instruction` must sum to less than 1, so that some "
-                f"samples have both. Got {self.p_drop_demonstration} and {self.p_drop_instruction}."
-            )
         if self.frames_after_release is not None and self.frames_after_release < 0:
             raise ValueError(f"`frames_after_release` must be at least 0. Got {self.frames_after_release}.")
         if self.n_demonstrations > 1 and self.demo_episode is not None:
@@ -107,7 +65,6 @@ class DeltacoMatchConfig(TaskConditionedConfig):
                 "`demo_episode` names a single demonstration, but `n_demonstrations` is "
                 f"{self.n_demonstrations}. Set `demo_episode` to null, or `n_demonstrations` to 1."
             )
-        check_pattern("colorless_tasks", self.colorless_tasks)
 
     def validate_features(self) -> None:
         """Checks the inputs and outputs that LeRobot found in the dataset.
@@ -124,16 +81,6 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             )
 
     @property
-    def task_inputs(self) -> TaskInputs:
-        """Inputs that specify what to pick and where to place it."""
-        return TASK_INPUTS[self.inputs]
-
-    @property
     def uses_demonstrations(self) -> bool:
         """Whether the policy takes demonstrations."""
-        return self.task_inputs.picks_by_demonstration
-
-    @property
-    def takes_either(self) -> bool:
-        """Whether the policy has learned to do without a demonstration, or without an instruction."""
-        return self.inputs == "both" and self.p_drop_demonstration + self.p_drop_instruction > 0
+        return True

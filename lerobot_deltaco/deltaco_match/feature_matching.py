@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 from lerobot_deltaco.deltaco_match import proposals
 from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, crop_features, fit_perspective
+from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.deltaco_match.proposals import ProposalNetwork
 from lerobot_deltaco.deltaco_match.words import UNKNOWN_WORD, WordWeights, encode_words, understand, words_of
 from lerobot_deltaco.networks import gaussian_maps
@@ -58,16 +59,19 @@ class Candidates(NamedTuple):
     Attributes:
         locations: The proposals, (batch, n, 2) in -1..1.
         log_probabilities: How likely each is what the task asks for, (batch, n).
+        heights: Height offset of a grasp of each, (batch, n).
     """
 
     locations: Tensor
     log_probabilities: Tensor
+    heights: Tensor
 
     @property
-    def best(self) -> Tensor:
-        """The likeliest location, (batch, 2)."""
-        rows = torch.arange(len(self.locations), device=self.locations.device)
-        return self.locations[rows, self.log_probabilities.argmax(dim=1)]
+    def best(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Location (batch, 2), probability (batch,) and height offset (batch,) of the likeliest."""
+        log_p, best = self.log_probabilities.max(dim=1)
+        rows = torch.arange(len(best), device=best.device)
+        return self.locations[rows, best], log_p.exp(), self.heights[rows, best]
 
     def map(self, shape: Sequence[int]) -> Tensor:
         """Returns the candidates as maps of a shape (h, w), as logits (batch, h, w)."""
@@ -83,7 +87,7 @@ class FeatureMatching(nn.Module):
     It stays in evaluation mode, and receives no gradient while a policy is trained.
 
     Args:
-        vocabulary: Known words; empty for a policy without instructions.
+        vocabulary: Known words.
         crop_size: Side of a crop in the middle of an image, as a fraction of the image's.
 
     Attributes:
@@ -100,6 +104,7 @@ class FeatureMatching(nn.Module):
         self.propose = ProposalNetwork()
         self.compare = Comparison(len(vocabulary))
         self.word_weights = WordWeights(len(vocabulary))
+        self.grasp_height = GraspHeightEstimator(_HIDDEN_DIM)
         self.register_buffer("perspective", torch.zeros(2))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
         self.requires_grad_(False)
@@ -111,43 +116,50 @@ class FeatureMatching(nn.Module):
 
     @torch.no_grad()
     def find(
-        self, scenes: Tensor, native: Tensor, described: Tensor | None, instructions: Sequence[str] | None
+        self,
+        scenes: Tensor,
+        native: Tensor,
+        instructions: Sequence[str],
+        described: Tensor | None,
+        demonstrated: Tensor | None,
     ) -> Candidates:
         """Finds what tasks ask for.
 
         Args:
             scenes: First images of episodes, (batch, 3, H, W) in 0..1, as small as the policy's.
             native: The same at the camera's own resolution, (batch, 3, H', W').
+            instructions: Instruction of each sample, "" for none.
             described: Descriptors of the demonstrated objects, (batch, descriptor); None without
                 demonstrations.
-            instructions: Instruction of each sample, "" for none; None for a policy without instructions.
+            demonstrated: Height offsets of the demonstrated grasps, (batch,), NaN where they are not known;
+                None without demonstrations.
         """
         with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
             locations = self.propose(scenes)
-            descriptors, words = self.compare(self._features(native, locations))
-            scores = torch.zeros_like(locations[..., 0])
-            described_by = torch.zeros(len(scenes), device=scenes.device)
-            if instructions is not None and self.vocabulary and any(instructions):
-                said = encode_words(instructions, self.vocabulary).to(scenes.device)
-                weights = self.word_weights(said)
-                scores = _word_scores(words, said, weights)
+            crops = self.compare(self._features(native, locations))
+            said = encode_words(instructions, self.vocabulary).to(scenes.device)
+            weights = self.word_weights(said)
+            scores = _word_scores(crops.words, said, weights)
+            if described is None or demonstrated is None:
+                similarity = torch.zeros_like(scores)
+                demonstrated = torch.full_like(scores[:, 0], torch.nan)
+            else:
                 # How well known words describe the object: not at all if one that describes it is unknown.
                 unknown = (weights * (said == UNKNOWN_WORD)).amax(dim=1)
-                described_by = (1 - unknown) * (weights * (said > UNKNOWN_WORD)).amax(dim=1)
-            if described is not None:
-                similar = _SHARPNESS * self.compare.similarity(descriptors, described)
+                known = (weights * (said > UNKNOWN_WORD)).amax(dim=1)
                 # A new noun leaves the demonstration in charge.
-                p_other = (_P_OTHER_OBJECT * described_by)[:, None]
-                scores = scores + torch.log(
-                    (1 - p_other) * similar.softmax(dim=1) + p_other / scores.shape[1]
-                )
-            return Candidates(locations, scores.log_softmax(dim=1))
+                p_other = (_P_OTHER_OBJECT * (1 - unknown) * known)[:, None]
+                similarity = self.compare.similarity(crops.descriptors, described)
+                matches = (_SHARPNESS * self.compare.log_scale.exp() * similarity).softmax(dim=1)
+                scores = scores + torch.log((1 - p_other) * matches + p_other / scores.shape[1])
+            heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
+            return Candidates(locations, scores.log_softmax(dim=1), heights)
 
     @torch.no_grad()
     def understood(self, instruction: str) -> list[tuple[str, str]]:
         """Returns the words of an instruction that describe the object, and what each is understood as."""
         said, vocabulary = words_of(instruction), self.vocabulary
-        if not said or not vocabulary:
+        if not said:
             return []
         device = self.fitted.device
         weights = self.word_weights(encode_words([instruction], vocabulary).to(device))[0].tolist()
@@ -173,7 +185,7 @@ class FeatureMatching(nn.Module):
             nearest, is_near = _nearest(proposed, locations)
             near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
             locations = torch.where(is_near[:, None], near, locations)
-            return self.compare(self._features(native, locations[:, None]))[0][:, 0]
+            return self.compare(self._features(native, locations[:, None])).descriptors[:, 0]
 
     def _features(self, native: Tensor, locations: Tensor) -> Tensor:
         """Returns features of the crops at locations (batch, n, 2), (batch, n, FEATURE_DIM)."""
@@ -186,6 +198,7 @@ class FeatureMatching(nn.Module):
         last: Tensor,
         native: Tensor,
         locations: Tensor,
+        heights: Tensor,
         tasks: Sequence[str],
         sentences: Mapping[str, Sequence[str]],
         seed: int,
@@ -202,6 +215,7 @@ class FeatureMatching(nn.Module):
             last: Last images of the same episodes.
             native: The first images at the camera's own resolution, (episodes, 3, H', W') uint8.
             locations: Locations of their grasps, (episodes, 2) in -1..1; NaN where there is none.
+            heights: Height offsets of their grasps, (episodes,).
             tasks: Task of each episode.
             sentences: Instructions of each task, one of which is drawn for an episode in each step.
             seed: Seed of the initial weights and of the draws.
@@ -225,9 +239,9 @@ class FeatureMatching(nn.Module):
                 n_steps = min(proposals.FIT_STEPS, 2 * steps)
                 self.propose.fit(images[drawn.to(device)], locations[drawn.to(device)], generator, n_steps)
             features, target, kept = self._crops_of_proposals(images, native, locations, drawn)
-            self._fit_comparison(
-                features, target, [tasks[row] for row in kept.tolist()], sentences, generator, steps
-            )
+            of_kept = [tasks[row] for row in kept.tolist()]
+            heights = heights[kept.to(heights.device)]
+            self._fit_comparison(features, target, heights, of_kept, sentences, generator, steps)
         self.requires_grad_(False)
         for weights in self.parameters():
             weights.grad = None
@@ -263,8 +277,8 @@ class FeatureMatching(nn.Module):
         if not kept:
             raise ValueError(
                 "Feature matching finds nothing to grasp in the first images where the gripper closes. Check "
-                "that the first camera stands still and shows the objects, name another with "
-                "--policy.demo_camera, or set --policy.feature_matching=false."
+                "that the first camera stands still and shows the objects, or name another with "
+                "--policy.demo_camera."
             )
         return torch.cat(features), torch.cat(targets), torch.cat(kept)
 
@@ -272,6 +286,7 @@ class FeatureMatching(nn.Module):
         self,
         features: Tensor,
         target: Tensor,
+        heights: Tensor,
         tasks: Sequence[str],
         sentences: Mapping[str, Sequence[str]],
         generator: torch.Generator,
@@ -282,6 +297,7 @@ class FeatureMatching(nn.Module):
         said, first = self._encoded_sentences(tasks, sentences, device)
         groups: list[dict[str, Any]] = [
             {"params": self.compare.parameters(), "lr": _LEARNING_RATE, "weight_decay": _WEIGHT_DECAY},
+            {"params": self.grasp_height.parameters(), "lr": _LEARNING_RATE, "weight_decay": _WEIGHT_DECAY},
             {"params": self.word_weights.parameters(), "lr": _WORD_LEARNING_RATE, "weight_decay": 0.0},
         ]
         optimizer = torch.optim.AdamW(groups)
@@ -291,16 +307,25 @@ class FeatureMatching(nn.Module):
         for _ in tqdm(range(steps), desc="Fitting the comparison", unit="step", leave=False):
             scenes, others = (rows.to(device) for rows in pairs.draw(_SCENES_PER_STEP, generator))
             crops = torch.cat([features[scenes], features[others, target[others]][:, None]], dim=1)
-            descriptors, words = self.compare(crops, generator)
-            similar = self.compare.similarity(descriptors[:, :-1], descriptors[:, -1])
-            loss = F.cross_entropy(similar, target[scenes])
-            if self.vocabulary:
-                draws = torch.rand(len(scenes), generator=generator)
-                drawn = (first[scenes.cpu(), 0] + draws * first[scenes.cpu(), 1]).long()
-                dropped = torch.rand(len(scenes), said.shape[1], generator=generator) < _P_DROP_WORD
-                sentence = said[drawn.to(device)]
-                left = torch.where(dropped.to(device) & (sentence > 0), UNKNOWN_WORD, sentence)
-                loss = loss + self._word_losses(words[:, :-1], left, sentence, target[scenes])
+            described = self.compare(crops, generator)
+            similar = self.compare.similarity(described.descriptors[:, :-1], described.descriptors[:, -1])
+            loss = F.cross_entropy(self.compare.log_scale.exp() * similar, target[scenes])
+            draws = torch.rand(len(scenes), generator=generator)
+            drawn = (first[scenes.cpu(), 0] + draws * first[scenes.cpu(), 1]).long()
+            dropped = torch.rand(len(scenes), said.shape[1], generator=generator) < _P_DROP_WORD
+            sentence = said[drawn.to(device)]
+            left = torch.where(dropped.to(device) & (sentence > 0), UNKNOWN_WORD, sentence)
+            loss = loss + self._word_losses(described.words[:, :-1], left, sentence, target[scenes])
+            rows = torch.arange(len(scenes), device=device)
+            with torch.no_grad():  # as similar as they are without dropout
+                grasped = self.compare(crops[rows[:, None], _beside(target[scenes])]).descriptors
+                similarity = self.compare.similarity(grasped[:, :1], grasped[:, 1])[:, 0]
+            loss = (
+                loss
+                + self.grasp_height.losses(
+                    described.hidden[rows, target[scenes]], similarity, heights[others], heights[scenes]
+                ).mean()
+            )
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -339,6 +364,20 @@ class FeatureMatching(nn.Module):
         return encode_words(every, self.vocabulary).to(device), torch.tensor([spans[task] for task in tasks])
 
 
+class Crops(NamedTuple):
+    """Descriptions of crops.
+
+    Attributes:
+        descriptors: Unit vectors, (batch, n, descriptor).
+        words: Log probabilities of the words of the vocabulary, (batch, n, words).
+        hidden: Features of a crop's appearance, (batch, n, hidden).
+    """
+
+    descriptors: Tensor
+    words: Tensor
+    hidden: Tensor
+
+
 class Comparison(nn.Module):
     """Maps features of crops to descriptors, and to log probabilities of words.
 
@@ -365,27 +404,22 @@ class Comparison(nn.Module):
         self.mean.copy_(some.mean(dim=0))
         self.std.copy_(some.std(dim=0).clamp_min(_MIN_STD))
 
-    def forward(self, features: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, features: Tensor, generator: torch.Generator | None = None) -> Crops:
         """Describes crops.
 
         Args:
             features: (batch, n, FEATURE_DIM).
             generator: Source of dropout's draws, on the CPU; None for no dropout.
-
-        Returns:
-            Unit descriptors, (batch, n, descriptor), and log probabilities of words, (batch, n, words).
         """
         inputs = ((features.float() - self.mean) / self.std).clamp(-_MAX_FEATURE, _MAX_FEATURE)
         inputs = _dropout(inputs, generator)
         hidden = _dropout(F.relu(self.hidden(inputs)), generator)
         descriptors = F.normalize(self.linear(inputs) + self.from_hidden(hidden), dim=-1)
-        return descriptors, self.words(hidden).log_softmax(dim=-1)
+        return Crops(descriptors, self.words(hidden).log_softmax(dim=-1), hidden)
 
     def similarity(self, descriptors: Tensor, demonstrated: Tensor) -> Tensor:
-        """Returns scaled cosines, (batch, n), of descriptors (batch, n, d) with one of each (batch, d)."""
-        return self.log_scale.exp() * torch.einsum(
-            "bnd,bd->bn", descriptors, F.normalize(demonstrated, dim=1)
-        )
+        """Returns cosines, (batch, n), of descriptors (batch, n, d) with one of each (batch, d)."""
+        return torch.einsum("bnd,bd->bn", descriptors, F.normalize(demonstrated, dim=1))
 
 
 def _word_scores(words: Tensor, said: Tensor, weights: Tensor) -> Tensor:
@@ -405,6 +439,11 @@ def _nearest(proposed: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
     """Returns which proposal is nearest to locations (batch, 2), and whether it is near, (batch,) each."""
     distance, nearest = (proposed - locations[:, None]).norm(dim=2).min(dim=1)
     return nearest, distance < _MAX_DISTANCE
+
+
+def _beside(target: Tensor) -> Tensor:
+    """Returns the indices (batch, 2) of right proposals (batch,), and of the last crop."""
+    return torch.stack([target, torch.full_like(target, -1)], dim=1)
 
 
 def _dropout(values: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -432,8 +471,7 @@ class _Pairs:
         if not self._rows:
             raise ValueError(
                 "Feature matching needs tasks with at least two episodes in which the gripper closes on "
-                f"an object. The {len(tasks)} such episodes are of {len(rows)} different tasks. Add "
-                "episodes, or set --policy.feature_matching=false."
+                f"an object. The {len(tasks)} such episodes are of {len(rows)} different tasks. Add episodes."
             )
 
     def draw(self, n_pairs: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -9,42 +9,39 @@ r"""`deltaco_match`: describes what a demonstration moved, finds it in the scene
     image, robot state -------------------------------------- act ----> action
 
 Describing and finding happen once, at the start of an episode (`_find`). Feature matching chooses what to
-pick among proposals, by the demonstration and by the instruction's words; without it, the pick map of the
-correspondence network does. The instruction says where to place it. The policy network is given the two
-locations, and how far the robot's state is from where it would be at each of them (`select_action`).
+pick among proposals, by the demonstration and by the instruction's words; the place network finds where to
+place it, by the instruction, or by the demonstration if there is none. The policy network is given the two
+locations, and how far the robot's state is from where it would be at each of them
+(`predict_action_chunk`).
 
-In training, the network is given the locations of each sample's own episode, with noise; they follow from the
-robot's states when the gripper closed and opened. The correspondence network learns to find them from
-demonstrations in other episodes. So neither has to wait for the other.
+In training, feature matching is fitted first. The policy network is given the locations of each sample's own
+episode, with noise; they follow from the robot's states when the gripper closed and opened. So it does not
+have to wait for the place network, which learns beside it.
 """
 
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
-import re
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_transition
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy, known_tasks, one_hot
+from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.deltaco_match.correspondence import (
-    DESCRIPTOR_DIM,
-    CorrespondenceNetwork,
-    Description,
-    Given,
-    peak_locations,
-)
 from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
-from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes, follows_gripper, warn_if_inverted
+from lerobot_deltaco.deltaco_match.place import (
+    TARGET_DIM,
+    DemonstrationAttention,
+    PlaceNetwork,
+    peak_locations,
+)
 from lerobot_deltaco.deltaco_match.robot_states import N_LOCATIONS, RobotStates, TrainingLocations
 from lerobot_deltaco.deltaco_match.words import (
     INSTRUCTION_DIM,
@@ -67,6 +64,7 @@ _LOCATED_FRACTION = 0.25  # of a batch's samples, on which the locations are lea
 _LOCATION_NOISE = 0.04  # standard deviation in training: a pixel of 48
 _HEIGHT_NOISE = 0.1  # in standard deviations of heights
 _SHIFT_PADDING = 4  # px, of scenes and demonstrations when locations are learned to be found
+_P_PLACE_BY_DEMONSTRATION = 0.25  # in these samples; in the others, the instruction says where
 _MIN_ATTENTION = 1e-9
 
 
@@ -81,7 +79,7 @@ class Found(NamedTuple):
             without demonstrations.
         by_demonstration: Whether the pick and the place location were found by the demonstration. Otherwise,
             the attention is meaningless.
-        p_pick: Probability of the pick location among the proposals, (batch,); None without feature matching.
+        p_pick: Probability of the pick location among the proposals, (batch,).
     """
 
     locations: Tensor
@@ -89,7 +87,7 @@ class Found(NamedTuple):
     maps: Tensor
     attention: Tensor | None
     by_demonstration: tuple[bool, bool]
-    p_pick: Tensor | None = None
+    p_pick: Tensor
 
 
 class Episode(NamedTuple):
@@ -120,11 +118,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     Attributes:
         model: Network that predicts actions.
-        correspondence: Predicts pick and place maps.
         robot_states: The robot's states at locations.
-        grasp_height: Estimates height offsets of grasps.
-        instruction_encoder: Embeds instructions; None without them.
-        feature_matching: Finds what to pick by pretrained features; None without it.
+        feature_matching: Finds what to pick, and how high.
+        attention: Finds what a demonstration moved, and where it was put.
+        place: Finds where to place it.
+        instruction_encoder: Embeds instructions for `place`.
     """
 
     config_class = DeltacoMatchConfig
@@ -138,15 +136,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
         self.config: DeltacoMatchConfig = config
-        inputs = config.task_inputs
-        if not inputs.uses_language:
-            self.paraphrases = None
-        if config.inputs == "one_hot" and not config.one_hot_tasks:
-            config.one_hot_tasks = known_tasks(dataset_meta)
-        if inputs.uses_language and dataset_meta is not None:
+        if dataset_meta is not None:
             sentences = self._sentences(dataset_meta.tasks.index)
             config.known_words = config.known_words or vocabulary_of(chain.from_iterable(sentences.values()))
-        condition_dim = INSTRUCTION_DIM if inputs.uses_language else len(config.one_hot_tasks)
         backbone = BACKBONES["strided"]
         assert config.action_feature is not None
         self.model = PolicyNetwork(
@@ -159,19 +151,14 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             channels=backbone.channels,
             stem_stride=backbone.stem_stride,
             num_components=config.num_mixture_components,
+            chunk_size=config.chunk_size,
             n_locations=N_LOCATIONS,
         )
-        self.instruction_encoder = (
-            InstructionEncoder(len(config.known_words)) if inputs.uses_language else None
-        )
-        self.correspondence = CorrespondenceNetwork(*inputs[:2], condition_dim, config.takes_either)
         self.robot_states = RobotStates(config.state_dim)
-        self.grasp_height = GraspHeightEstimator(DESCRIPTOR_DIM, condition_dim, config.uses_demonstrations)
-        self.feature_matching: FeatureMatching | None = None
-        if config.feature_matching and config.uses_demonstrations:
-            # Forked so that all other weights are the same with and without it.
-            with torch.random.fork_rng(devices=[]):
-                self.feature_matching = FeatureMatching(config.known_words, config.crop_size)
+        self.feature_matching = FeatureMatching(config.known_words, config.crop_size)
+        self.attention = DemonstrationAttention()
+        self.place = PlaceNetwork(INSTRUCTION_DIM)
+        self.instruction_encoder = InstructionEncoder(len(config.known_words))
         self.training_locations: TrainingLocations | None = None
 
     # The loss
@@ -214,16 +201,16 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         images, rows = self._images(batch), self.training_bank.episode_rows(batch["episode_index"])
         instructions = self._draw_instructions(tasks, generator)
         changes = random_color_changes(len(rows), config.p_hue_augmentation, generator)
-        # Some samples, evenly spaced in the batch, train the finding of locations.
+        # Some samples, evenly spaced in the batch, train the finding of places.
         n_some = max(1, round(_LOCATED_FRACTION * len(rows)))
         some = torch.arange(n_some) * len(rows) // n_some
-        finding = self._finding_losses(
+        finding = self._place_losses(
             batch["episode_index"][some.to(rows.device)],
             [tasks[sample] for sample in some.tolist()],
             [instructions[sample] for sample in some.tolist()],
             changes[some],
             generator,
-        )  # (some, 4)
+        )  # (some, 2)
         noise = torch.randn(known.locations[rows].shape, generator=generator).to(rows.device)
         locations = known.locations[rows] + _LOCATION_NOISE * noise
         noise = torch.randn(len(rows), generator=generator).to(rows.device)
@@ -233,10 +220,10 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         # An episode without a grasp has no locations, and teaches nothing.
         loss = torch.where((rows >= 0) & known.found[rows], loss, 0.0)
         loss = loss.index_add(0, some.to(rows.device), len(rows) / n_some * finding.sum(dim=1))
-        names = ("pick_loss", "place_loss", "height_loss", "attention_loss")
+        names = ("place_loss", "attention_loss")
         return loss, logged | dict(zip(names, finding.mean(dim=0), strict=True))
 
-    def _finding_losses(
+    def _place_losses(
         self,
         episodes: Tensor,
         tasks: Sequence[str],
@@ -244,65 +231,64 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         changes: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """Computes the losses of finding the locations in the first images of episodes.
+        """Computes the losses of finding the places in the first images of episodes.
 
         Args:
             episodes: Episodes of the samples, (batch,), as indices of the dataset.
             tasks: Task string of each sample.
             instructions: Instruction of each sample.
-            changes: Change of each sample's colors, (batch, 3, 3), on the CPU.
+            changes: Change of the colors of each sample's demonstration, (batch, 3, 3), on the CPU.
             generator: Source of the draws, on the CPU.
 
         Returns:
-            Losses of the pick and place locations, the height and the attention, (batch, 4); 0 for an episode
-            without a grasp.
+            Losses of the place and of the attention, (batch, 2); 0 for an episode without a grasp.
         """
-        bank, known, config = self.training_bank, self.training_locations, self.config
+        bank, known = self.training_bank, self.training_locations
         assert bank is not None
         assert known is not None
         rows, device = bank.episode_rows(episodes), episodes.device
-        given = self._draw_given(len(rows), generator, device)
-        condition = self._condition(instructions, device, generator)
-        plain = bank.frames[rows, 0].float() / 255  # (batch, 3, H, W)
-        plain, locations = _shifted(plain, known.locations[rows], generator)
-        scenes, description, demonstrated = plain, None, None
-        found = (rows >= 0) & known.found[rows]
-        attention_losses = torch.zeros(len(rows), device=device)
-        if config.uses_demonstrations:
-            # With only an instruction, colors keep their meaning.
-            scenes = change_colors(plain, changes)
-            if given is not None:
-                scenes = torch.where(given.demonstration[:, None, None, None], scenes, plain)
-            others = bank.draw_other_episodes(episodes, tasks, generator)
-            found = found & known.found[others]
-            ends = bank.frames[others][:, [0, -1]].float() / 255  # (batch, 2, 3, H, W)
-            ends, their_locations = _shifted(ends, known.locations[others], generator)
-            if config.colorless_tasks is not None:
-                apart = random_color_changes(len(rows), 1.0, generator)
-                colorless = [re.search(config.colorless_tasks, task) is not None for task in tasks]
-                changes = torch.where(torch.tensor(colorless)[:, None, None], apart, changes)
-            description = self.correspondence.describe(change_colors(ends, changes))
-            demonstrated = known.heights[others]
-            # Without this loss, learning to find what was moved takes thousands of steps.
-            log_attention = description.attention.clamp_min(_MIN_ATTENTION).log()
-            attention_losses = location_loss(log_attention, their_locations).sum(dim=1)
-        if given is not None:
-            assert condition is not None
-            assert demonstrated is not None
-            demonstrated = torch.where(given.demonstration, demonstrated, torch.nan)
-            condition = torch.where(given.condition[:, None], condition, 0.0)
-        maps, features = self.correspondence(scenes, plain, description, condition, given, generator)
-        height_losses = self.grasp_height.losses(
-            features,
-            locations[:, 0],
-            known.heights[rows],
-            None if description is None else description.moved,
-            demonstrated,
-            condition,
-            generator,
-        )
-        losses = [location_loss(maps, locations), height_losses[:, None], attention_losses[:, None]]
-        return torch.where(found[:, None], torch.cat(losses, dim=1), 0.0)
+        others = bank.draw_other_episodes(episodes, tasks, generator)
+        found = (rows >= 0) & known.found[rows] & known.found[others]
+        scenes, locations = _shifted(
+            bank.frames[rows, 0].float() / 255, known.locations[rows, 1:], generator
+        )  # (batch, 3, H, W)
+        ends, demonstrated = _shifted(
+            bank.frames[others][:, [0, -1]].float() / 255, known.locations[others], generator
+        )  # (batch, 2, 3, H, W)
+        attention = self.attention(change_colors(ends, changes))
+        says = (torch.rand(len(rows), generator=generator) >= _P_PLACE_BY_DEMONSTRATION).to(device)
+        maps = self._place_maps(scenes, says, instructions, ends[:, 1], attention[:, 1], generator)
+        # Without a loss of its own, the attention would take thousands of steps.
+        log_attention = attention.clamp_min(_MIN_ATTENTION).log()
+        attention_losses = location_loss(log_attention, demonstrated).sum(dim=1, keepdim=True)
+        losses = torch.cat([location_loss(maps[:, None], locations), attention_losses], dim=1)
+        return torch.where(found[:, None], losses, 0.0)
+
+    def _place_maps(
+        self,
+        scenes: Tensor,
+        says: Tensor,
+        instructions: Sequence[str],
+        last: Tensor | None,
+        attention: Tensor | None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Returns maps of where to place the object, as logits (batch, h, w).
+
+        Args:
+            scenes: First images of episodes, (batch, 3, H, W) in 0..1.
+            says: Whether the instruction says where, and not the demonstration, (batch,) bool.
+            instructions: Instruction of each sample.
+            last: Last images of the demonstrations, (batch, 3, H, W); None without demonstrations.
+            attention: Maps of where the demonstrations put the object, (batch, h, w).
+            generator: In training, source of the draws of words that are left out, on the CPU.
+        """
+        words = encode_words(instructions, self.config.known_words).to(scenes.device)
+        instruction = torch.where(says[:, None], self.instruction_encoder(words, generator), 0.0)
+        target = torch.zeros(len(scenes), TARGET_DIM, device=scenes.device)
+        if last is not None and attention is not None:
+            target = torch.where(says[:, None], target, self.place.target(last, attention))
+        return self.place(scenes, instruction, target)
 
     def _validation_loss(self, batch: dict[str, Any], tasks: list[str]) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the imitation loss; locations in held-out episodes are found in the image."""
@@ -313,8 +299,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         is_known = (rows >= 0) & known.found[rows]
         locations, heights = known.locations[rows], known.heights[rows]
         if not is_known.all():
-            demonstrations = self.banked_demonstrations(tasks) if self.config.uses_demonstrations else None
-            found = self._find(batch, tasks, demonstrations)
+            found = self._find(batch, tasks, self.banked_demonstrations(tasks))
             locations = torch.where(is_known[:, None, None], locations, found.locations)
             heights = torch.where(is_known, heights, found.heights)
         return self._imitation_loss(batch, self._images(batch), locations, heights)
@@ -325,41 +310,36 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """Returns the imitation loss of each sample, (batch,), and its parts to log."""
         concat = self._concatenated(batch, locations, heights)
         predicted, gripper = self.model(images, None, concat, locations)
-        index, weight = self.config.gripper_index, GRIPPER_LOSSES[_GRIPPER_LOSS]
-        log_std = self.model.log_std
-        return imitation_loss(predicted, gripper, log_std, batch[ACTION], index, weight, _GRIPPER_LOSS)
+        return imitation_loss(
+            predicted,
+            gripper,
+            self.model.log_std,
+            batch[ACTION],
+            batch.get(f"{ACTION}_is_pad"),
+            self.config.gripper_index,
+            GRIPPER_LOSSES[_GRIPPER_LOSS],
+            _GRIPPER_LOSS,
+        )
 
     # Acting
 
     @torch.no_grad()
-    def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """Returns the mean action; with several mixture components, the mean of the most likely one.
-
-        Args:
-            batch: As in `forward`, without `action` and `episode_index`. `task` is not needed if `set_tasks`
-                gave the instructions.
-
-        Returns:
-            Actions, (batch, action), normalized as in `forward`.
-
-        Raises:
-            ValueError: There is no instruction, or a task has no demonstration.
-            FloatingPointError: The action is not finite, or absurdly large.
-        """
-        instructions, demonstrations = self._tasks_of(batch)
-        if self._episode is None or self._episode.instructions != instructions:
-            if demonstrations is None and self.config.uses_demonstrations:
+    def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """Returns the actions of a chunk, (batch, steps, action). See `select_action`."""
+        if self._begins_episode(batch):
+            instructions, demonstrations = self._tasks_of(batch)
+            if demonstrations is None:
                 demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
             found = self._find(batch, instructions, demonstrations)
             network = self.model if self.training else fuse_batch_norms(self.model)
-            self._episode = Episode(instructions, found, network)
+            self._start(Episode(instructions, found, network))
         episode: Episode = self._episode
         locations, heights = episode.found.locations, episode.found.heights
         concat = self._concatenated(batch, locations, heights)
         predicted, gripper = episode.network(self._images(batch), None, concat, locations)
         gripper = torch.sigmoid(gripper.float())
-        action = join_action(predicted.mode.float(), gripper, self.config.gripper_index)
-        return self._checked_action(action, batch)
+        chunk = join_action(predicted.mode.float(), gripper, self.config.gripper_index)
+        return self._checked_action(chunk, batch)
 
     @property
     def found(self) -> Found | None:
@@ -371,7 +351,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self,
         batch: dict[str, Any],
         instructions: Sequence[str],
-        demonstrations: DemonstrationsOfTasks | None,
+        demonstrations: DemonstrationsOfTasks,
     ) -> Found:
         """Finds the locations of tasks in the first images of episodes.
 
@@ -379,94 +359,52 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             batch: As in `select_action`, at the start of the episodes.
             instructions: Instruction of each sample; an empty string leaves it out.
             demonstrations: Demonstrations of each sample, the same number for each; an empty list leaves them
-                out. None for a policy that takes none.
+                out.
 
         Raises:
-            ValueError: An input is left out that the policy has not learned to do without.
+            ValueError: A sample has neither an instruction nor a demonstration.
         """
-        camera, inputs = self.config.cameras[0], self.config.task_inputs
+        camera = self.config.cameras[0]
         scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
-        device = scenes.device
-        stacked = self._stacked(demonstrations, device)
-        says = torch.tensor([bool(text) for text in instructions], device=device)
-        self._check_given(says, stacked)
-        condition, given, description, heights = self._condition(instructions, device), None, None, None
-        if stacked is not None:
+        says = torch.tensor([bool(text) for text in instructions], device=scenes.device)
+        stacked = self._stacked(demonstrations, scenes.device)
+        attention = last = described = heights = None
+        if stacked is None:
+            if not bool(says.all()):
+                raise ValueError("Neither a demonstration nor an instruction is given. Pass one of them.")
+        else:
             n_each = stacked.ends.shape[1]
-            each = self.correspondence.describe(stacked.ends.flatten(0, 1))
-            moved = F.normalize(each.moved, dim=1).unflatten(0, (-1, n_each)).mean(dim=1)
-            target = each.target
-            if target is not None:
-                target = target.unflatten(0, (-1, n_each)).mean(dim=1)
-            description = Description(moved, target, each.attention[::n_each])
-            states = stacked.pick_states.flatten(0, 1)
+            ends, states = stacked.ends.flatten(0, 1), stacked.pick_states.flatten(0, 1)
+            every = self.attention(ends)
+            # Where the robot's state at a grasp is not known, the attention tells where it was.
+            attended = peak_locations(every.clamp_min(_MIN_ATTENTION).log())[:, 0]
+            by_state = self.robot_states.pick_locations(states)
+            picks = torch.where(by_state.isnan(), attended, by_state)
+            described = self.feature_matching.describe(ends[:, 0], stacked.first_images.flatten(0, 1), picks)
+            described = described.unflatten(0, (-1, n_each)).mean(dim=1)
             heights = self.robot_states.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
-        if self.config.takes_either:
-            assert condition is not None
-            condition = torch.where(says[:, None], condition, 0.0)
-            given = Given(torch.full_like(says, stacked is not None), says)
-            if description is None:
-                description = self.correspondence.no_description(len(scenes), device)
-                heights = torch.full((len(scenes),), torch.nan, device=device)
-        maps, features = self.correspondence(scenes, scenes, description, condition, given)
-        locations, p_pick = peak_locations(maps), None
-        if self.feature_matching is not None:
-            described = None
-            if stacked is not None:
-                # Where a grasp is not known, the attention stands in for its location.
-                attended = peak_locations(each.attention.clamp_min(_MIN_ATTENTION).log())[:, 0]
-                by_state = self.robot_states.pick_locations(states)
-                picks = torch.where(by_state.isnan(), attended, by_state)
-                described = self.feature_matching.describe(
-                    stacked.ends[:, :, 0].flatten(0, 1), stacked.first_images.flatten(0, 1), picks
-                )
-                described = described.unflatten(0, (-1, n_each)).mean(dim=1)
-            texts = instructions if inputs.uses_language else None
-            candidates = self.feature_matching.find(scenes, batch[camera], described, texts)
-            p_pick = candidates.log_probabilities.amax(dim=1).exp()
-            locations = torch.stack([candidates.best, locations[:, 1]], dim=1)
-            maps = torch.stack([candidates.map(maps.shape[2:]), maps[:, 1]], dim=1)
-        descriptors = None if description is None else description.moved
-        found_heights = self.grasp_height(features, locations[:, 0], descriptors, heights, condition)
-        attention = None if stacked is None or description is None else description.attention
-        places = inputs.places_by_demonstration or not bool(says.all())
-        by_demonstration = (stacked is not None, stacked is not None and places)
-        found_heights = found_heights + self.config.grasp_height_bias
-        return Found(locations, found_heights, maps, attention, by_demonstration, p_pick)
-
-    def _check_given(self, says: Tensor, stacked: StackedDemonstrations | None) -> None:
-        """Checks that the policy has learned to do without the inputs that are left out.
-
-        Raises:
-            ValueError: It has not.
-        """
-        config = self.config
-        missing = {
-            "demonstration": config.uses_demonstrations and stacked is None,
-            "instruction": config.task_inputs.uses_language and not bool(says.all()),
-        }
-        if all(missing.values()):
-            raise ValueError("Neither a demonstration nor an instruction is given. Pass one of them.")
-        for name, is_missing in missing.items():
-            learned = config.takes_either and getattr(config, f"p_drop_{name}") > 0
-            if is_missing and not learned:
-                raise ValueError(
-                    f"The {name} is left out, but this policy has not learned to do without it: "
-                    f"`p_drop_{name}` was 0, or `inputs` was {config.inputs!r}."
-                )
+            attention, last = every[::n_each], ends[::n_each, 1]
+        candidates = self.feature_matching.find(scenes, batch[camera], instructions, described, heights)
+        pick, p_pick, height = candidates.best
+        place_maps = self._place_maps(
+            scenes, says, instructions, last, None if attention is None else attention[:, 1]
+        )
+        locations = torch.stack([pick, peak_locations(place_maps[:, None])[:, 0]], dim=1)
+        maps = torch.stack([candidates.map(place_maps.shape[1:]), place_maps], dim=1)
+        by_demonstration = (stacked is not None, stacked is not None and not bool(says.all()))
+        bias = self.config.grasp_height_bias
+        return Found(locations, height + bias, maps, attention, by_demonstration, p_pick)
 
     # Inputs
 
     def _stacked(
-        self, demonstrations: DemonstrationsOfTasks | None, device: torch.device
+        self, demonstrations: DemonstrationsOfTasks, device: torch.device
     ) -> StackedDemonstrations | None:
         """Stacks the demonstrations of a batch; None if they are left out.
 
         Raises:
             ValueError: The samples have different numbers of demonstrations.
         """
-        if not self.config.uses_demonstrations or demonstrations is None:
-            return None
         counts = {len(own) for own in demonstrations}
         if len(counts) != 1:
             raise ValueError(
@@ -492,35 +430,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             torch.stack(states).to(device),
         )
 
-    def _condition(
-        self, instructions: Sequence[str], device: torch.device, generator: torch.Generator | None = None
-    ) -> Tensor | None:
-        """Returns embeddings of instructions, or one-hot tasks, (batch, condition); None without either.
-
-        Args:
-            instructions: Instruction of each sample.
-            device: Device of the result.
-            generator: In training, source of the draws of words that are left out, on the CPU.
-        """
-        if self.config.inputs == "one_hot":
-            return one_hot(instructions, self.config.one_hot_tasks, device)
-        if self.instruction_encoder is None:
-            return None
-        words = encode_words(instructions, self.config.known_words).to(device)
-        return self.instruction_encoder(words, generator)
-
     def _concatenated(self, batch: dict[str, Any], locations: Tensor, heights: Tensor) -> Tensor:
         """Returns the robot's state, and its offsets from the states at the locations, (batch, 3 state)."""
         state = self.state_limits(batch[OBS_STATE])
         offsets = self.robot_states(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
-
-    def _draw_given(self, n_samples: int, generator: torch.Generator, device: torch.device) -> Given | None:
-        """Draws which inputs training samples have; None for all that the policy takes."""
-        if not self.config.takes_either:
-            return None
-        draws = torch.rand(n_samples, generator=generator).to(device)
-        return Given(draws >= self.config.p_drop_demonstration, draws < 1 - self.config.p_drop_instruction)
 
     # Training data
 
@@ -532,8 +446,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             robot_data: States and actions of the robot in them.
 
         Raises:
-            ValueError: There are too few episodes in which the gripper closes and opens, or, for feature
-                matching, no task with two of them.
+            ValueError: There are too few episodes in which the gripper closes and opens, or no task with two
+                of them.
             PretrainedWeightsError: The weights that feature matching needs are missing.
         """
         super().set_training_data(bank, robot_data)
@@ -550,14 +464,19 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         known = self.robot_states.fit(keyframes, frames[:, 0], frames[:, -1], end - shift, shift, is_arm)
         self.training_locations = known
         self.training_bank.pick_states = keyframes.pick_states
-        matching = self.feature_matching
-        if matching is not None and not bool(matching.fitted):
+        if not bool(self.feature_matching.fitted):
             picks = torch.where(known.found[:, None], known.locations[:, 0], torch.nan)
             native = self.training_bank.first_images
-            native = frames[:, 0] if native is None else native
             tasks = self.training_bank.tasks
-            matching.fit(
-                frames[:, 0], frames[:, -1], native, picks, tasks, self._sentences(tasks), config.seed
+            self.feature_matching.fit(
+                frames[:, 0],
+                frames[:, -1],
+                frames[:, 0] if native is None else native,
+                picks,
+                known.heights,
+                tasks,
+                self._sentences(tasks),
+                config.seed,
             )
 
     def _sentences(self, tasks: Iterable[str]) -> dict[str, list[str]]:

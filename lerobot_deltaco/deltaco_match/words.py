@@ -13,8 +13,7 @@ from torch import Tensor, nn
 
 NO_WORD, UNKNOWN_WORD = 0, 1  # indices of words; those of the vocabulary follow
 _N_SPECIAL = 2
-WORD_DIM, _N_SUMS = 64, 2
-INSTRUCTION_DIM = _N_SUMS * WORD_DIM
+INSTRUCTION_DIM = 64
 _WORD_STD, _P_DROP_WORD = 0.3, 0.2
 # Words are rare in batches: their tables learn as much faster than the rest of the network.
 _LEARNING_SPEED = 10.0
@@ -64,9 +63,10 @@ def encode_words(sentences: Sequence[str], vocabulary: Sequence[str]) -> Tensor:
 
 
 class WordWeights(nn.Module):
-    """Weighs words by whether they describe the object: "red" does in "red cup", and not in "red bin".
+    """Weighs words by whether they are about the object: "red" is in "red cup", and not in "red bin".
 
-    A weight depends on the word and on two words at either side.
+    With other weights, by whether they are about the place. A weight depends on the word and on two words at
+    either side.
 
     Args:
         n_words: Size of the vocabulary.
@@ -92,9 +92,7 @@ class WordWeights(nn.Module):
 
 
 class InstructionEncoder(nn.Module):
-    """Embeds instructions as two weighted sums of their words' vectors.
-
-    In training, one of the weightings comes to describe the object, the other the place.
+    """Embeds instructions as weighted sums of their words' vectors.
 
     Args:
         n_words: Size of the vocabulary.
@@ -102,8 +100,8 @@ class InstructionEncoder(nn.Module):
 
     def __init__(self, n_words: int) -> None:
         super().__init__()
-        self.weights = nn.ModuleList(WordWeights(n_words) for _ in range(_N_SUMS))
-        self.vectors = nn.Embedding(n_words + _N_SPECIAL, WORD_DIM)
+        self.weights = WordWeights(n_words)
+        self.vectors = nn.Embedding(n_words + _N_SPECIAL, INSTRUCTION_DIM)
         nn.init.normal_(self.vectors.weight, std=_WORD_STD / _LEARNING_SPEED)
 
     def forward(self, words: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -117,5 +115,4 @@ class InstructionEncoder(nn.Module):
             dropped = torch.rand(words.shape, generator=generator).to(words.device) < _P_DROP_WORD
             words = torch.where(dropped & (words != NO_WORD), UNKNOWN_WORD, words)
         vectors = _LEARNING_SPEED * self.vectors(words) * (words > UNKNOWN_WORD)[..., None]
-        sums = [torch.einsum("bw,bwd->bd", weights(words), vectors) for weights in self.weights]
-        return torch.cat(sums, dim=1)
+        return torch.einsum("bw,bwd->bd", self.weights(words), vectors)
