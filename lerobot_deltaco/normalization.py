@@ -12,17 +12,18 @@ from torch import Tensor, nn
 
 logger = logging.getLogger(__name__)
 
-# Least standard deviation of a dimension of the state, as a fraction of the largest one.
+# Least standard deviation of a dimension of the state, as a fraction of the median of all.
 MIN_STD_FRACTION = 0.03
 MAX_STATE = 5.0  # in standard deviations
+_NOISE, _P_NOISE = 0.1, 0.5  # of the noise in training, and probability that a number gets some
 
 
 class StateLimits(nn.Module):
     """Limits normalized states.
 
     A joint that hardly moves in the training data has a tiny standard deviation, by which its noise is
-    divided: it would decide the action. So no dimension is divided by less than 3 % of the largest standard
-    deviation. States beyond 5 standard deviations are clipped.
+    divided: it would decide the action. So no dimension is divided by less than 3 % of the median of the
+    standard deviations. States beyond 5 standard deviations are clipped.
 
     Args:
         state_dim: Size of the robot's state.
@@ -39,7 +40,7 @@ class StateLimits(nn.Module):
         scale = torch.ones(state_dim)
         if state_dim and stats is not None and "std" in stats.get(OBS_STATE, {}):
             std = torch.as_tensor(stats[OBS_STATE]["std"]).float().reshape(state_dim)
-            least = MIN_STD_FRACTION * std.max()
+            least = MIN_STD_FRACTION * std.median()
             scale = torch.where(std < least, std / least, 1.0)
             still = (scale < 1).nonzero().flatten().tolist()
             if still:
@@ -54,3 +55,17 @@ class StateLimits(nn.Module):
     def forward(self, states: Tensor) -> Tensor:
         """Maps normalized states, (..., state), to limited ones."""
         return (states * self.scale).clamp(-MAX_STATE, MAX_STATE)
+
+    def add_noise(self, states: Tensor, generator: torch.Generator) -> Tensor:
+        """Adds noise to limited states (batch, state) in training, so that no number alone decides.
+
+        Half of the numbers get little noise; dimensions that hardly move get more than they move.
+
+        Args:
+            states: Limited states, (batch, state).
+            generator: Source of the draws, on the CPU.
+        """
+        std = torch.maximum(1 - self.scale, self.scale.new_tensor(_NOISE))
+        is_noisy = torch.rand(states.shape, generator=generator) < _P_NOISE
+        noise = torch.randn(states.shape, generator=generator) * is_noisy
+        return states + std * noise.to(states)

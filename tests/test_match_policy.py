@@ -251,11 +251,16 @@ def test_actions_that_cannot_be_carried_out_are_errors(make, table):
 
 
 def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):
-    stats = {OBS_STATE: {"std": np.array([0.5, 0.2, 1e-5])}}
-    limits = StateLimits(3, stats)
+    stats = {OBS_STATE: {"std": np.array([0.5, 0.2, 1e-5, 0.3])}}
+    limits = StateLimits(4, stats)
     assert "Dimensions 2 of the robot's state hardly move" in caplog.text
-    # Divided by 3 % of 0.5, and clipped.
-    torch.testing.assert_close(limits(torch.tensor([1.0, -9.0, 300.0])), torch.tensor([1.0, -5.0, 0.2]))
+    # Divided by 3 % of the median, 0.2, and clipped.
+    torch.testing.assert_close(
+        limits(torch.tensor([1.0, -9.0, 300.0, 0.0])), torch.tensor([1.0, -5.0, 0.5, 0.0])
+    )
+    noise = limits.add_noise(torch.zeros(5000, 4), torch.Generator().manual_seed(0))
+    assert (noise == 0).float().mean() == pytest.approx(0.5, abs=0.02)
+    assert (noise / 0.5**0.5).std(dim=0).tolist() == pytest.approx([0.1, 0.1, 1.0, 0.1], rel=0.1)
     assert StateLimits(3, None)(torch.ones(3)).tolist() == [1, 1, 1]
 
 

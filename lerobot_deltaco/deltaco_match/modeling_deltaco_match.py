@@ -216,7 +216,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         noise = torch.randn(len(rows), generator=generator).to(rows.device)
         heights = known.heights[rows] + _HEIGHT_NOISE * noise
         images = change_colors(images, changes)
-        loss, logged = self._imitation_loss(batch, images, locations, heights)
+        loss, logged = self._imitation_loss(batch, images, locations, heights, generator)
         # An episode without a grasp has no locations, and teaches nothing.
         loss = torch.where((rows >= 0) & known.found[rows], loss, 0.0)
         loss = loss.index_add(0, some.to(rows.device), len(rows) / n_some * finding.sum(dim=1))
@@ -305,10 +305,15 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         return self._imitation_loss(batch, self._images(batch), locations, heights)
 
     def _imitation_loss(
-        self, batch: dict[str, Any], images: Tensor, locations: Tensor, heights: Tensor
+        self,
+        batch: dict[str, Any],
+        images: Tensor,
+        locations: Tensor,
+        heights: Tensor,
+        generator: torch.Generator | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the imitation loss of each sample, (batch,), and its parts to log."""
-        concat = self._concatenated(batch, locations, heights)
+        concat = self._concatenated(batch, locations, heights, generator)
         predicted, gripper = self.model(images, None, concat, locations)
         return imitation_loss(
             predicted,
@@ -430,9 +435,17 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             torch.stack(states).to(device),
         )
 
-    def _concatenated(self, batch: dict[str, Any], locations: Tensor, heights: Tensor) -> Tensor:
+    def _concatenated(
+        self,
+        batch: dict[str, Any],
+        locations: Tensor,
+        heights: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
         """Returns the robot's state, and its offsets from the states at the locations, (batch, 3 state)."""
         state = self.state_limits(batch[OBS_STATE])
+        if generator is not None:
+            state = self.state_limits.add_noise(state, generator)
         offsets = self.robot_states(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
 
