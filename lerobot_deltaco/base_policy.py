@@ -18,12 +18,12 @@ from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
 from torch import Tensor, nn
 
 from lerobot_deltaco.base_config import TaskConditionedConfig
+from lerobot_deltaco.dataset_reading import check_episode_numbers, open_dataset, training_argument
 from lerobot_deltaco.demonstrations import (
     Demonstration,
     DemonstrationBank,
     RobotData,
     kept_frames,
-    open_dataset,
     read_demonstrations,
     read_robot_data,
 )
@@ -246,13 +246,18 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             bank = frames.demonstrations(
                 self.config.cameras[0], self.config.image_size, self.config.n_demo_frames
             )
-            self.set_training_data(bank, frames.robot_data())
+            self.set_training_data(bank, frames.robot_data(self.config.cameras[0]))
             return
-        dataset = open_dataset("--dataset.root", self._meta.repo_id, self._meta.root)
-        chosen = self.config.demo_episodes or list(range(dataset.meta.total_episodes))
+        meta = self._meta
+        chosen = self.config.demo_episodes or training_argument("dataset.episodes")
+        chosen = list(dict.fromkeys(chosen or range(meta.total_episodes)))
+        check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
+        dataset = open_dataset("--dataset.root", meta.repo_id, meta.root, chosen)
         bank = self._read_bank(dataset, chosen)
-        has_states = self.config.state_dim > 0
-        self.set_training_data(bank, read_robot_data(dataset, chosen) if has_states else None)
+        robot_data = None
+        if self.config.state_dim:
+            robot_data = read_robot_data(dataset, chosen, self.config.cameras[0])
+        self.set_training_data(bank, robot_data)
 
     def _read_bank(self, dataset: Any, episodes: Sequence[int] | None) -> DemonstrationBank:
         config = self.config

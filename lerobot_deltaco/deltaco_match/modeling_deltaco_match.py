@@ -32,10 +32,12 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
+from lerobot_deltaco.dataset_reading import open_dataset
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
+from lerobot_deltaco.deltaco_match.gripper_direction import warn_if_inverted
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
-from lerobot_deltaco.deltaco_match.keyframes import find_keyframes, follows_gripper, warn_if_inverted
+from lerobot_deltaco.deltaco_match.keyframes import find_keyframes, follows_gripper
 from lerobot_deltaco.deltaco_match.place import (
     TARGET_DIM,
     DemonstrationAttention,
@@ -49,7 +51,7 @@ from lerobot_deltaco.deltaco_match.words import (
     encode_words,
     vocabulary_of,
 )
-from lerobot_deltaco.demonstrations import DemonstrationBank, RobotData, open_dataset, read_robot_data
+from lerobot_deltaco.demonstrations import DemonstrationBank, RobotData, read_robot_data
 from lerobot_deltaco.losses import GRIPPER_LOSSES, imitation_loss, join_action, location_loss
 from lerobot_deltaco.networks import (
     BACKBONES,
@@ -469,8 +471,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         config, device, frames = self.config, self.step.device, self.training_bank.frames
         states = robot_data.states.to(device)
         gripper = config.gripper_opening(robot_data.actions).to(device)
-        keyframes = find_keyframes(states, gripper, robot_data.spans)
-        warn_if_inverted(gripper, robot_data.spans)
+        keyframes = find_keyframes(states, gripper, robot_data.spans, bank.episodes.tolist())
+        warn_if_inverted(gripper, robot_data, config.gripper_closed)
         zero_and_one = torch.stack([torch.zeros(states.shape[1]), torch.ones(states.shape[1])])
         shift, end = self._normalized(zero_and_one).to(device)
         is_arm = ~follows_gripper(states, gripper, robot_data.spans)
