@@ -3,6 +3,7 @@
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
 import contextlib
+import logging
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,6 +31,8 @@ from lerobot_deltaco.demonstrations import (
 from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.normalization import StateLimits
 from lerobot_deltaco.task_bank import TASK_BANK, find_task_bank, read_task_bank, write_task_bank
+
+logger = logging.getLogger(__name__)
 
 # Normalized actions are in -1..1; a policy may overshoot, but not by that much.
 _ABSURD_ACTION = 100.0
@@ -71,7 +74,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self.config: Any = config
         self._meta, self._stats = dataset_meta, dataset_stats
         if dataset_meta is not None:
-            config.set_dataset_feature_metadata(dataset_meta.features)
+            config.set_dataset_feature_metadata(dataset_meta.features, dataset_stats or dataset_meta.stats)
             config.set_dataset_size(dataset_meta.total_frames, dataset_meta.total_episodes)
         config.validate_features()
         self.state_limits = StateLimits(config.state_dim, dataset_stats)
@@ -376,6 +379,27 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
         demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
         return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
+
+
+def warn_of_equal_instructions(tasks: Sequence[str], encoded: Tensor) -> None:
+    """Warns if a policy cannot tell two instructions apart.
+
+    Args:
+        tasks: Task strings.
+        encoded: What the policy makes of them, (tasks, ...).
+    """
+    _, group, sizes = encoded.unique(dim=0, return_inverse=True, return_counts=True)
+    alike = (sizes[group] > 1).nonzero().flatten().tolist()
+    if alike:
+        first, other = [n for n in alike if group[n] == group[alike[0]]][:2]
+        logger.warning(
+            "The policy cannot tell %d of %d tasks from others by their instructions, such as %r and %r. "
+            "Word them differently, with English words.",
+            len(alike),
+            len(tasks),
+            tasks[first],
+            tasks[other],
+        )
 
 
 def _read_paraphrases(config: TaskConditionedConfig) -> Paraphrases | None:

@@ -298,7 +298,7 @@ def _check_episodes(dataset: LeRobotDataset) -> None:
         if len(own_tasks) > 1:
             disagree(
                 episode,
-                f"it has several tasks, {own_tasks}, but a demonstration shows one. Split it into an episode for "
+                f"it has several tasks, {own_tasks}, but a demonstration shows one. Split it into one for "
                 "each task",
             )
         if list(table["tasks"][episode]) != own_tasks:

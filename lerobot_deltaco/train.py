@@ -17,10 +17,11 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
 from lerobot.utils.constants import ACTION
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
 from gym_deltaco import CONTROL_FPS
-from lerobot_deltaco.base_config import TaskConditionedConfig
+from lerobot_deltaco.base_config import TaskConditionedConfig, check_image_shapes
 from lerobot_deltaco.dataset_reading import check_dataset_folder, missing_files_named
 from lerobot_deltaco.deltaco_match.keyframes import Grasp, find_grasps
 from lerobot_deltaco.frames import FramesInMemory
@@ -69,6 +70,9 @@ class _InMemoryTraining:
         config.num_workers = 0
         with missing_files_named(config.dataset.repo_id, config.dataset.root, config.dataset.episodes):
             dataset, held_back = self._make_datasets(config)
+        if isinstance(policy, TaskConditionedConfig):
+            features = dataset_to_policy_features(dataset.meta.features)
+            check_image_shapes({name: features[name].shape for name in dataset.meta.camera_keys})
         if dataset.meta.depth_keys or dataset.meta.has_language_columns:
             raise ValueError(
                 "The dataset has depth images or columns of messages, which only `lerobot-train` prepares."
