@@ -268,7 +268,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
 
     def _compare_instructions(self, device: torch.device) -> None:
         """Warns once if instructions of the training dataset have equal embeddings."""
-        if self._meta is not None and not self._are_instructions_compared:
+        if self._meta is not None and self.paraphrases is None and not self._are_instructions_compared:
             self._are_instructions_compared = True
             tasks = list(self._meta.tasks.index)
             warn_of_equal_instructions(tasks, self.instructions(tasks, device))
