@@ -268,3 +268,25 @@ def test_fine_tuning_honors_the_rename_map(root, tmp_path, monkeypatch, in_memor
     assert (tuned / "000001").is_dir()
     expected = read_demonstrations(open_dataset("", "test/small", other), "observation.images.front", 48, 2)
     assert torch.equal(banks[0].frames, expected.frames)
+
+
+def test_demonstrations_in_other_units_are_warned_of(root, intact, monkeypatch, caplog):
+    use_fake_encoder(monkeypatch)
+    demos = {"demo_repo_id": "test/shown", "demo_root": str(root), "demo_encoder": "attention"}
+    training = LeRobotDataset("test/foreign", root=intact)
+    small_policy(training, "deltaco", **demos)
+    assert not [record for record in caplog.records if record.name.startswith("lerobot_deltaco")]
+    stats = json.loads((root / "meta/stats.json").read_text())
+    for name, values in stats["action"].items():
+        if name != "count":
+            values[2] *= 57.3
+    (root / "meta/stats.json").write_text(json.dumps(stats))
+    change(root / DATA, "action", lambda rows: [row.__setitem__(2, row[2] * 57.3) for row in rows])
+    small_policy(training, "deltaco", **demos)
+    assert "`action` does not fit: its dimension 2 is between" in caplog.text
+    caplog.clear()
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"]["action"]["names"] = ["a", "b_gripper", "c"]
+    (root / "meta/info.json").write_text(json.dumps(info))
+    small_policy(training, "deltaco", **demos)
+    assert "but ['a', 'b_gripper', 'c'] in the demonstrations in test/shown" in caplog.text
