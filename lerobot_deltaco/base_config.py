@@ -5,6 +5,7 @@
 import copy
 import logging
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,8 @@ class TaskConditionedConfig(PreTrainedConfig):
             step and averages what the chunks say about it; None for none. It needs `n_action_steps=1`.
         num_mixture_components: Number of Gaussians of the action's distribution. One averages two actions
             that are equally good; of several, the policy takes the likeliest.
-        gripper: Gripper's dimension of the action: an index, "auto" (the last one whose name contains
-            "gripper", if any) or "none".
+        gripper: Gripper's dimension of the action: an index, "auto" (of those whose name contains "gripper",
+            the one that moves most) or "none".
         gripper_closed: Whether low or high values of the gripper's dimension mean closed.
         demo_camera: Name of the camera of demonstrations, such as "observation.images.front". By default, the
             first.
@@ -185,23 +186,47 @@ class TaskConditionedConfig(PreTrainedConfig):
 
     # From the dataset
 
-    def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
+    def set_dataset_feature_metadata(
+        self, features: dict[str, dict[str, Any]], stats: dict[str, dict[str, Any]] | None = None
+    ) -> None:
         """Finds out which dimension is the gripper, and how actions are scaled.
 
-        LeRobot calls this with the training dataset's features, before it makes the policy.
+        LeRobot calls this with the training dataset's features, before it makes the policy. The policy calls
+        it again with the statistics, which tell which of several grippers moves.
 
         Args:
             features: Features of the training dataset.
+            stats: Its statistics.
+
+        Raises:
+            ValueError: The names of the action's dimensions cannot be read.
         """
-        names = features.get("action", {}).get("names")
-        if isinstance(names, dict):
-            names = next(iter(names.values()))
-        if names and list(names) == ACTION_NAMES:
+        action = features.get("action", {})
+        if action.get("names") == ACTION_NAMES:
             # The benchmark's actions are in -1..1 already.
             self.normalization_mapping["ACTION"] = NormalizationMode.IDENTITY
-        if self.gripper == "auto":
-            found = [index for index, name in enumerate(names or ()) if "gripper" in str(name).lower()]
-            self.gripper = str(found[-1]) if found else "none"
+        if self.gripper != "auto":
+            return
+        names = dimension_names(action)
+        found = [index for index, name in enumerate(names) if "gripper" in name.lower()]
+        if len(found) < 2:
+            self.gripper = str(found[0]) if found else "none"
+        elif stats is not None:
+            spread = torch.as_tensor(stats["action"]["std"]).reshape(-1).tolist()
+            self.gripper = str(max(found, key=lambda index: (spread[index], index)))
+            logger.warning(
+                "The action has %d grippers. The policy is about the one that moves most, %s. For another "
+                "one, set --policy.gripper: %s.",
+                len(found),
+                self.name_gripper(features),
+                ", ".join(f"{index} ({names[index]})" for index in found),
+            )
+
+    def name_gripper(self, features: dict[str, dict[str, Any]]) -> str:
+        """Returns the gripper's dimension and its name in a dataset with these features, for messages."""
+        names = features.get("action", {}).get("names")
+        name = dimension_names(features["action"])[int(self.gripper)] if names else "without a name"
+        return f"dimension {self.gripper} of the action ({name})"
 
     def set_dataset_size(self, n_frames: int, n_episodes: int) -> None:
         """Chooses `n_action_steps` by the length of the episodes, if it is not given."""
@@ -225,9 +250,7 @@ class TaskConditionedConfig(PreTrainedConfig):
                 "The policy needs the feature 'action'. The dataset's outputs are "
                 f"{', '.join(sorted(self.output_features or {})) or 'none'}."
             )
-        shapes = {name: tuple(feature.shape) for name, feature in self.image_features.items()}
-        if any(len(shape) != 3 or shape[0] != 3 for shape in shapes.values()):
-            raise ValueError(f"Images must have the shape (3, height, width). Got {shapes}.")
+        check_image_shapes({name: feature.shape for name, feature in self.image_features.items()})
         for name, feature in (
             ("action", self.action_feature),
             ("observation.state", self.robot_state_feature),
@@ -321,6 +344,58 @@ class TaskConditionedConfig(PreTrainedConfig):
     def reward_delta_indices(self) -> None:
         """Rewards are not used."""
         return
+
+
+def dimension_names(feature: dict[str, Any]) -> list[str]:
+    """Returns the names of a feature's dimensions, in any of the forms that converters and robots write.
+
+    These are a list, lists in a list or under names of groups, and a dictionary from name to index.
+
+    Args:
+        feature: The feature, as in meta/info.json.
+
+    Raises:
+        ValueError: The names cannot be read, or are not as many as the dimensions.
+    """
+    names, shape = feature.get("names"), feature.get("shape", ())
+    if names is None:
+        return []
+    found = _flat_names(names)
+    if not all(isinstance(name, str) for name in found) or (len(shape) == 1 and len(found) != shape[0]):
+        raise ValueError(
+            f"The `names` of 'action' in meta/info.json must name each of its {shape[0] if shape else '?'} "
+            f"dimensions. Got {names}. Correct them, or set --policy.gripper to the gripper's dimension, or "
+            "to none."
+        )
+    return found
+
+
+def _flat_names(names: Any) -> list[Any]:
+    if isinstance(names, dict):
+        if all(isinstance(index, int) for index in names.values()):
+            return sorted(names, key=names.__getitem__)
+        names = list(names.values())
+    if not isinstance(names, (list, tuple)):
+        return [names]
+    return [name for part in names for name in _flat_names(part)]
+
+
+def check_image_shapes(shapes: dict[str, Sequence[int]]) -> None:
+    """Checks that cameras give images of three colors.
+
+    Args:
+        shapes: Shapes of the cameras' images, by name.
+
+    Raises:
+        ValueError: One does not, such as a depth camera.
+    """
+    wrong = {name: tuple(shape) for name, shape in shapes.items() if len(shape) != 3 or shape[0] != 3}
+    if wrong:
+        raise ValueError(
+            f"Images must have the shape (3, height, width). Got {wrong}. Leave out depth and gray cameras: "
+            "lerobot-edit-dataset --repo_id=DATASET --operation.type=remove_feature "
+            f'--operation.feature_names="{list(wrong)}" makes a dataset without them.'
+        )
 
 
 def check_pattern(name: str, pattern: str | None) -> None:

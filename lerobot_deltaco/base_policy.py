@@ -3,6 +3,7 @@
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
 import contextlib
+import logging
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,21 +16,24 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_deltaco.base_config import TaskConditionedConfig
+from lerobot_deltaco.dataset_reading import check_episode_numbers, open_dataset, training_argument
 from lerobot_deltaco.demonstrations import (
     Demonstration,
     DemonstrationBank,
     RobotData,
     kept_frames,
-    open_dataset,
     read_demonstrations,
     read_robot_data,
 )
 from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.normalization import StateLimits
 from lerobot_deltaco.task_bank import TASK_BANK, find_task_bank, read_task_bank, write_task_bank
+
+logger = logging.getLogger(__name__)
 
 # Normalized actions are in -1..1; a policy may overshoot, but not by that much.
 _ABSURD_ACTION = 100.0
@@ -71,7 +75,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self.config: Any = config
         self._meta, self._stats = dataset_meta, dataset_stats
         if dataset_meta is not None:
-            config.set_dataset_feature_metadata(dataset_meta.features)
+            config.set_dataset_feature_metadata(dataset_meta.features, dataset_stats or dataset_meta.stats)
             config.set_dataset_size(dataset_meta.total_frames, dataset_meta.total_episodes)
         config.validate_features()
         self.state_limits = StateLimits(config.state_dim, dataset_stats)
@@ -246,13 +250,18 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             bank = frames.demonstrations(
                 self.config.cameras[0], self.config.image_size, self.config.n_demo_frames
             )
-            self.set_training_data(bank, frames.robot_data())
+            self.set_training_data(bank, frames.robot_data(self.config.cameras[0]))
             return
-        dataset = open_dataset("--dataset.root", self._meta.repo_id, self._meta.root)
-        chosen = self.config.demo_episodes or list(range(dataset.meta.total_episodes))
+        meta = self._meta
+        chosen = self.config.demo_episodes or training_argument("dataset.episodes")
+        chosen = list(dict.fromkeys(chosen or range(meta.total_episodes)))
+        check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
+        dataset = open_dataset("--dataset.root", meta.repo_id, meta.root, chosen)
         bank = self._read_bank(dataset, chosen)
-        has_states = self.config.state_dim > 0
-        self.set_training_data(bank, read_robot_data(dataset, chosen) if has_states else None)
+        robot_data = None
+        if self.config.state_dim:
+            robot_data = read_robot_data(dataset, chosen, self.config.cameras[0])
+        self.set_training_data(bank, robot_data)
 
     def _read_bank(self, dataset: Any, episodes: Sequence[int] | None) -> DemonstrationBank:
         config = self.config
@@ -265,6 +274,8 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         if self.config.demo_repo_id is None or not self.config.uses_demonstrations:
             return None
         dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
+        if self._meta is not None:
+            _compare_robots(self._meta, dataset.meta)
         return self._read_bank(dataset, None)
 
     def _step_generator(self) -> torch.Generator:
@@ -371,6 +382,53 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
         demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
         return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
+
+
+def warn_of_equal_instructions(tasks: Sequence[str], encoded: Tensor) -> None:
+    """Warns if a policy cannot tell two instructions apart.
+
+    Args:
+        tasks: Task strings.
+        encoded: What the policy makes of them, (tasks, ...).
+    """
+    _, group, sizes = encoded.unique(dim=0, return_inverse=True, return_counts=True)
+    alike = (sizes[group] > 1).nonzero().flatten().tolist()
+    if alike:
+        first, other = [n for n in alike if group[n] == group[alike[0]]][:2]
+        logger.warning(
+            "The policy cannot tell %d of %d tasks from others by their instructions, such as %r and %r. "
+            "Word them differently, with English words.",
+            len(alike),
+            len(tasks),
+            tasks[first],
+            tasks[other],
+        )
+
+
+def _compare_robots(training: LeRobotDatasetMetadata, shown: LeRobotDatasetMetadata) -> None:
+    """Warns if demonstrations are of another robot than the training's, or in other units."""
+    for name in {ACTION, OBS_STATE} & training.features.keys() & shown.features.keys():
+        names = [meta.features[name].get("names") for meta in (training, shown)]
+        least, most, means = (
+            np.asarray(meta.stats[name][key]).reshape(-1)
+            for meta, key in ((training, "min"), (training, "max"), (shown, "mean"))
+        )
+        ours, theirs = f"{training.repo_id}, which is trained on,", f"the demonstrations in {shown.repo_id}"
+        if names[0] != names[1]:
+            logger.warning("`%s` is %s in %s but %s in %s.", name, names[0], ours, names[1], theirs)
+        elif len(least) == len(means) and (abs(means - (least + most) / 2) > most - least + 1e-6).any():
+            worst = int(np.argmax(abs(means - (least + most) / 2) - (most - least)))
+            logger.warning(
+                "`%s` does not fit: its dimension %d is between %g and %g in %s but %g on average in %s. Are "
+                "the units the same?",
+                name,
+                worst,
+                least[worst],
+                most[worst],
+                ours,
+                means[worst],
+                theirs,
+            )
 
 
 def _read_paraphrases(config: TaskConditionedConfig) -> Paraphrases | None:

@@ -7,19 +7,25 @@ evaluation passes them to the policy's `set_tasks`.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
-from huggingface_hub import constants
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from tqdm import tqdm
+
+from lerobot_deltaco.dataset_reading import (
+    check_episode_numbers,
+    column,
+    episode_spans,
+    read_frame,
+    source_of,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -248,43 +254,14 @@ class RobotData(NamedTuple):
         states: Robot states of frames, (frames, state).
         actions: Actions in these frames, (frames, action).
         spans: First and last frame of each episode.
+        images: Returns the images of some frames by the camera of demonstrations, (n, 3, H, W) uint8; None
+            if there are only states and actions.
     """
 
     states: Tensor
     actions: Tensor
     spans: list[tuple[int, int]]
-
-
-def check_dataset_folder(option: str, root: str | Path | None) -> None:
-    """Checks that a folder holds a dataset, if the Hub is offline.
-
-    Args:
-        option: Command-line option that names the folder, for the error.
-        root: The folder; None for LeRobot's cache.
-
-    Raises:
-        FileNotFoundError: It holds none.
-    """
-    if root is not None and constants.HF_HUB_OFFLINE and not (Path(root) / "meta/info.json").exists():
-        raise FileNotFoundError(
-            f"{option} is {root}, but there is no dataset: meta/info.json is missing. Check the spelling. "
-            "(HF_HUB_OFFLINE is set, so nothing can be downloaded into it.)"
-        )
-
-
-def open_dataset(option: str, repo_id: str, root: str | Path | None) -> LeRobotDataset:
-    """Opens a dataset of demonstrations.
-
-    Args:
-        option: Command-line option that names its folder, for the error.
-        repo_id: Repository id of the dataset.
-        root: Folder of the dataset; None for LeRobot's cache.
-
-    Raises:
-        FileNotFoundError: The folder holds no dataset, and the Hub is offline.
-    """
-    check_dataset_folder(option, root)
-    return LeRobotDataset(repo_id, root=root, return_uint8=True)
+    images: Callable[[list[int]], Tensor] | None = None
 
 
 def read_demonstrations(
@@ -307,44 +284,48 @@ def read_demonstrations(
         ValueError: The dataset has no such camera or episode.
     """
     meta, repo_id = dataset.meta, dataset.repo_id
+    camera = source_of(camera, meta.camera_keys)
     if camera not in meta.camera_keys:
         raise ValueError(
-            f"The demonstrations in {repo_id} have no camera {camera!r}, only {', '.join(meta.camera_keys)}."
+            f"The demonstrations in {repo_id} have no camera {camera!r}, only {', '.join(meta.camera_keys)}. "
+            "If it has another name there, pass --rename_map."
         )
     episodes = list(range(meta.total_episodes)) if episodes is None else list(episodes)
-    if not episodes or not all(0 <= episode < meta.total_episodes for episode in episodes):
-        raise ValueError(
-            f"{repo_id} has the episodes 0 to {meta.total_episodes - 1}. Got {_shortened(episodes)}. "
-            "Name others in `demo_episodes`."
-        )
+    check_episode_numbers(repo_id, meta.total_episodes, episodes)
+    spans = episode_spans(dataset)
     frames, tasks, target_objects, first_images = [], [], [], []
     for episode in tqdm(episodes, desc="Reading demonstrations", unit="episode", leave=False):
-        row = meta.episodes[episode]
-        indices = kept_frames(row["dataset_from_index"], row["dataset_to_index"] - 1, n_frames).tolist()
-        items = [dataset[index] for index in indices]
+        items = [read_frame(dataset, row, camera) for row in kept_frames(*spans[episode], n_frames).tolist()]
         if TARGET_OBJECT in items[0]:
             target_objects.append(int(items[0][TARGET_OBJECT]))
         images = as_uint8(torch.stack([item[camera] for item in items]))
         frames.append(resize_images(images, image_size))
         first_images.append(images[0])
-        tasks.append(row["tasks"][0])
+        tasks.append(items[0]["task"])
     native = torch.stack(first_images) if first_images[0].shape != frames[0][0].shape else None
     return DemonstrationBank(torch.stack(frames), tasks, episodes, target_objects or None, native)
 
 
-def read_robot_data(dataset: LeRobotDataset, episodes: Sequence[int]) -> RobotData:
+def read_robot_data(dataset: LeRobotDataset, episodes: Sequence[int], camera: str | None = None) -> RobotData:
     """Reads the states and actions of episodes of a LeRobotDataset.
 
     Args:
         dataset: The dataset.
         episodes: Indices of the episodes.
+        camera: Key of the images that can be read later; None for none.
     """
-    columns = dataset.hf_dataset.select_columns([OBS_STATE, ACTION]).with_format("numpy")[:]
     states, actions = (
-        torch.from_numpy(np.stack(columns[name]).astype(np.float32)) for name in (OBS_STATE, ACTION)
+        torch.from_numpy(column(dataset, source_of(name, dataset.hf_dataset.column_names)).astype(np.float32))
+        for name in (OBS_STATE, ACTION)
     )
-    starts, ends = (dataset.meta.episodes[f"dataset_{side}_index"][:] for side in ("from", "to"))
-    return RobotData(states, actions, [(starts[episode], ends[episode] - 1) for episode in episodes])
+    spans, images = episode_spans(dataset), None
+    if camera is not None:
+        name = source_of(camera, dataset.meta.camera_keys)
+
+        def images(rows: list[int]) -> Tensor:
+            return as_uint8(torch.stack([read_frame(dataset, row, name)[name] for row in rows]))
+
+    return RobotData(states, actions, [spans[episode] for episode in episodes], images)
 
 
 def kept_frames(first: int, last: int, n_frames: int) -> Tensor:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import psutil
-import pyarrow as pa
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.feature_utils import get_delta_indices
@@ -23,6 +22,15 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 from torchvision.io import ImageReadMode, decode_image
 from tqdm import tqdm
 
+from lerobot_deltaco.dataset_reading import (
+    check_dataset,
+    column,
+    decoding,
+    episode_spans,
+    frame_name,
+    read_frame,
+    source_of,
+)
 from lerobot_deltaco.demonstrations import (
     TARGET_OBJECT,
     DemonstrationBank,
@@ -60,22 +68,22 @@ class FramesInMemory(torch.utils.data.Dataset):
             )
         self._dataset = dataset
         _check_memory(dataset, image_size)
+        check_dataset(dataset)
         cameras = dataset.meta.camera_keys
         self.columns: dict[str, Tensor] = {}
         self.texts: dict[str, list[str]] = {}
         for name in dataset.hf_dataset.column_names:
             if name in cameras:
                 continue
-            values = _column(dataset, name)
+            values = column(dataset, name)
             if values.dtype.kind in "OUS":
                 self.texts[name] = [str(value) for value in values]
             else:
                 self.columns[name] = torch.from_numpy(values)
         self.task_names = list(dataset.meta.tasks.sort_values("task_index").index)
         self.tasks: NDArray[np.int64] = self.columns["task_index"].reshape(-1).numpy()
-        # First and last row of each episode, whose rows are consecutive.
-        episodes = self.columns["episode_index"].reshape(-1).numpy()
-        numbers, first = np.unique(episodes, return_index=True)
+        self.spans = episode_spans(dataset)
+        first, last = np.array(list(self.spans.values())).T
         # First images of the episodes at their own resolution, where the others are scaled.
         self._first_images: dict[str, Tensor] = {}
         for camera in cameras:
@@ -83,10 +91,8 @@ class FramesInMemory(torch.utils.data.Dataset):
             self.columns[camera] = _camera_images(dataset, camera, image_size, set(first.tolist()), native)
             if native:
                 self._first_images[camera] = torch.stack(native)
-        last = len(episodes) - 1 - np.unique(episodes[::-1], return_index=True)[1]
-        self.spans = {int(n): (int(a), int(b)) for n, a, b in zip(numbers, first, last, strict=True)}
         self._first, self._last = (
-            torch.from_numpy(rows[np.searchsorted(numbers, episodes)]) for rows in (first, last)
+            torch.from_numpy(np.repeat(rows, last - first + 1)) for rows in (first, last)
         )
         # For each feature with a window of frames: the frames' distances from the sample's frame.
         deltas = get_delta_indices(dataset.delta_timestamps or {}, dataset.fps)
@@ -140,6 +146,7 @@ class FramesInMemory(torch.utils.data.Dataset):
             image_size: Height and width to which they are scaled, px.
             n_frames: Number of frames of a demonstration.
         """
+        camera = source_of(camera, list(self.columns))
         rows = torch.stack([kept_frames(*span, n_frames) for span in self.spans.values()])
         images = resize_images(self.columns[camera][rows], image_size)  # (episodes, kept, 3, S, S)
         tasks = [self.task_names[self.tasks[first]] for first, _ in self.spans.values()]
@@ -151,11 +158,13 @@ class FramesInMemory(torch.utils.data.Dataset):
             native = self.columns[camera][rows[:, 0]]
         return DemonstrationBank(images, tasks, list(self.spans), objects, native)
 
-    def robot_data(self) -> RobotData | None:
-        """Returns the robot's states and actions in all frames; None without states."""
-        if OBS_STATE not in self.columns:
+    def robot_data(self, camera: str) -> RobotData | None:
+        """Returns the robot's states and actions, and a camera's images; None without states."""
+        names = [source_of(name, list(self.columns)) for name in (OBS_STATE, ACTION, camera)]
+        if names[0] not in self.columns:
             return None
-        return RobotData(self.columns[OBS_STATE], self.columns[ACTION], list(self.spans.values()))
+        states, actions, images = (self.columns[name] for name in names)
+        return RobotData(states, actions, list(self.spans.values()), lambda rows: images[rows])
 
 
 class _Frame:
@@ -194,38 +203,6 @@ def _check_memory(dataset: LeRobotDataset, image_size: int | None) -> None:
             f"{allowed / 1e9:.1f} GB may be used here. Train on fewer episodes (--dataset.episodes), or with "
             "`lerobot-train`, which reads them from the disk."
         )
-
-
-def _column(dataset: LeRobotDataset, name: str) -> NDArray[Any]:
-    """Returns all values of a feature, (frames, ...)."""
-    table = dataset.hf_dataset.select_columns([name])
-    values = table.with_format("arrow")[:][name].combine_chunks()
-    array = _flat_numbers(values)
-    if array is None:
-        array = np.array(table.with_format("numpy")[:][name])
-    elif len(array) != len(values):
-        array = array.reshape(len(values), *dataset.meta.features[name]["shape"])
-    elif pa.types.is_nested(values.type):
-        array = array[:, None]
-    # As LeRobot, which makes tensors of Python's numbers.
-    if np.issubdtype(array.dtype, np.floating):
-        return array.astype(np.float32)
-    return array.astype(np.int64) if np.issubdtype(array.dtype, np.integer) else array.copy()
-
-
-def _flat_numbers(values: pa.Array) -> NDArray[Any] | None:
-    """Returns numbers and vectors of numbers as one flat array; None for anything else.
-
-    `datasets` makes arrays row by row, and takes ten seconds for a hundred thousand.
-    """
-    while pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type):
-        if values.null_count:
-            return None
-        values = values.flatten()
-    is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
-    if values.null_count or not (is_number or pa.types.is_boolean(values.type)):
-        return None
-    return values.to_numpy(zero_copy_only=False)
 
 
 def _camera_images(
@@ -269,11 +246,22 @@ Reader = Callable[[range], Callable[[range], Tensor]]
 
 def _stored_images(dataset: LeRobotDataset, camera: str) -> Reader:
     """Returns a reader of an `image` feature, whose stored files are decoded."""
-    table = dataset.hf_dataset.with_format("arrow")
+    table, shape = dataset.hf_dataset.with_format("arrow"), dataset.meta.features[camera]["shape"]
+    declared, n_channels = sorted(shape), min(shape)
 
     def read(rows: range) -> Callable[[range], Tensor]:
         files = table[rows.start : rows.stop][camera].to_pylist()
-        return lambda part: torch.stack([_decoded(files[row - rows.start]["bytes"]) for row in part])
+        return lambda part: torch.stack([image_of(row, files[row - rows.start]["bytes"]) for row in part])
+
+    def image_of(row: int, file: bytes) -> Tensor:
+        image = decoding(dataset, row, camera, lambda: _decoded(file))
+        if sorted((*image.shape[1:], n_channels)) != declared:
+            raise ValueError(
+                f"The image {camera} in {frame_name(dataset, row)} has {image.shape[2]} x {image.shape[1]} "
+                f"pixels, but by meta/info.json the shape is {shape}. Record the episode again, or leave it "
+                "out with --dataset.episodes."
+            )
+        return image
 
     return read
 
@@ -298,8 +286,7 @@ def _video_images(dataset: LeRobotDataset, camera: str) -> Reader:
         with _single_frames(dataset):
             images = []
             for row in rows:
-                image = dataset[row][camera]
-                images.append(as_uint8(image))
+                images.append(as_uint8(read_frame(dataset, row, camera)[camera]))
         return lambda part: torch.stack([images[row - rows.start] for row in part])
 
     return read

@@ -23,9 +23,10 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.base_config import TaskConditionedConfig
 from lerobot_deltaco.checkpoints import LoadedPolicy
+from lerobot_deltaco.dataset_reading import open_dataset
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, Found
-from lerobot_deltaco.demonstrations import open_dataset, read_demonstrations, read_robot_data
+from lerobot_deltaco.demonstrations import read_demonstrations, read_robot_data
 from lerobot_deltaco.evaluate import Simulators
 from lerobot_deltaco.pictures import (
     MIN_SIDE,

@@ -17,11 +17,13 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
 from lerobot.utils.constants import ACTION
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
-from lerobot_deltaco.base_config import TaskConditionedConfig
-from lerobot_deltaco.deltaco_match.keyframes import grasp_frames
-from lerobot_deltaco.demonstrations import check_dataset_folder
+from gym_deltaco import CONTROL_FPS
+from lerobot_deltaco.base_config import TaskConditionedConfig, check_image_shapes
+from lerobot_deltaco.dataset_reading import check_dataset_folder, missing_files_named
+from lerobot_deltaco.deltaco_match.keyframes import Grasp, find_grasps
 from lerobot_deltaco.frames import FramesInMemory
 from lerobot_deltaco.optimization import keep_freed_memory
 from lerobot_deltaco.task_batches import TaskBatchSampler
@@ -66,7 +68,11 @@ class _InMemoryTraining:
         if isinstance(policy, TaskConditionedConfig):
             check_dataset_folder("--policy.demo_root", policy.demo_root)
         config.num_workers = 0
-        dataset, held_back = self._make_datasets(config)
+        with missing_files_named(config.dataset.repo_id, config.dataset.root, config.dataset.episodes):
+            dataset, held_back = self._make_datasets(config)
+        if isinstance(policy, TaskConditionedConfig):
+            features = dataset_to_policy_features(dataset.meta.features)
+            check_image_shapes({name: features[name].shape for name in dataset.meta.camera_keys})
         if dataset.meta.depth_keys or dataset.meta.has_language_columns:
             raise ValueError(
                 "The dataset has depth images or columns of messages, which only `lerobot-train` prepares."
@@ -128,9 +134,10 @@ def _until_release(frames: FramesInMemory, policy: TaskConditionedConfig) -> NDA
         return use
     spans = list(frames.spans.values())
     gripper = policy.gripper_opening(frames.columns[ACTION])
-    for keyframes, (_, last) in zip(grasp_frames(gripper, spans), spans, strict=True):
-        if keyframes is not None:
-            use[keyframes[1] + 1 + n_after : last + 1] = False
+    n_after = round(n_after * frames.fps / CONTROL_FPS)
+    for grasp, (_, last) in zip(find_grasps(gripper, spans), spans, strict=True):
+        if isinstance(grasp, Grasp):
+            use[grasp.opened + 1 + n_after : last + 1] = False
     return use
 
 

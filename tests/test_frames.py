@@ -86,10 +86,11 @@ def test_demonstrations_and_robot_data_equal_those_that_are_read(root, n_frames)
     assert found.tasks == expected.tasks
     assert torch.equal(found.episodes, expected.episodes)
     assert torch.equal(found.frames, expected.frames)
-    robot, expected_robot = frames.robot_data(), read_robot_data(read(root), [0, 2, 5])
+    robot, expected_robot = frames.robot_data(TOP), read_robot_data(read(root), [0, 2, 5], TOP)
     for (first, last), (a, b) in zip(robot.spans, expected_robot.spans, strict=True):
         assert torch.equal(robot.states[first : last + 1], expected_robot.states[a : b + 1])
         assert torch.equal(robot.actions[first : last + 1], expected_robot.actions[a : b + 1])
+        assert torch.equal(robot.images([first, last]), expected_robot.images([a, b]))
 
 
 def test_images_are_scaled_on_request(root):

@@ -137,7 +137,7 @@ def features_config(action=(3,), state=(2,), **options):
 )
 def test_gripper_is_found_by_name_or_given(names, gripper, index):
     config = features_config(gripper=gripper)
-    config.set_dataset_feature_metadata({"action": {"names": names}})
+    config.set_dataset_feature_metadata({"action": {"names": names}}, {"action": {"std": [1, 1, 1]}})
     config.validate_features()
     assert config.gripper_index == index
     assert config.normalization_mapping["ACTION"] is NormalizationMode.MIN_MAX

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,13 @@ from lerobot_deltaco.deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 
 EPISODE_LENGTH = 30
+
+
+class FakeFrames(SimpleNamespace):
+    def __len__(self):
+        return len(self.columns["action"])
+
+
 CLASSES = {"deltaco": DeltacoPolicy, "deltaco_match": DeltacoMatchPolicy, "act": ACTPolicy}
 
 
@@ -216,6 +224,19 @@ def test_frames_long_after_the_release_are_left_out(train, monkeypatch, n_after)
     for opening, use in zip(gripper.numpy(), used[0].reshape(-1, EPISODE_LENGTH), strict=True):
         release = np.flatnonzero((opening[1:] > 0) & (opening[:-1] <= 0))[-1] + 1
         np.testing.assert_array_equal(use, np.arange(EPISODE_LENGTH) <= release + n_after)
+
+
+def test_frames_after_the_release_are_as_many_seconds_at_any_rate():
+    # Closed from 20 to 40, and open again from 50 on.
+    course = np.interp(np.arange(100), [0, 10, 20, 40, 50, 60], [1, 1, 0, 0, 1, 1])
+    actions = torch.from_numpy(np.stack([course, course], axis=1))
+    policy = SimpleNamespace(frames_after_release=12, gripper_index=0, gripper_opening=lambda a: a[:, 0])
+    last = []
+    for fps in (24, 48):
+        frames = FakeFrames(columns={"action": actions}, spans={0: (0, 99)}, fps=fps)
+        last.append(int(np.flatnonzero(train_module._until_release(frames, policy))[-1]))
+    assert 48 <= last[0] - 12 <= 50
+    assert last[1] - last[0] == 12
 
 
 # Checkpoints and logs

@@ -20,7 +20,11 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
+from lerobot_deltaco.base_policy import (
+    DemonstrationsOfTasks,
+    TaskConditionedPolicy,
+    warn_of_equal_instructions,
+)
 from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.deltaco.demo_encoders import (
     AttentionEncoder,
@@ -81,6 +85,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
         self.instructions: InstructionEmbeddings = InstructionEmbeddings(config.language_encoder)
+        self._are_instructions_compared = False
         self.config: DeltacoConfig = config
         if config.method == "one_hot" and not config.one_hot_tasks:
             config.one_hot_tasks = known_tasks(dataset_meta)
@@ -136,6 +141,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         if config.uses_demonstrations:
             demo = self._embed_training_demonstrations(batch["episode_index"], tasks, generator)
         if config.uses_language:
+            self._compare_instructions(images.device)
             # With paraphrases, one sentence is drawn for each task, and one for each sample.
             known = self._embed_instructions(
                 self._draw_instructions(list(distinct), generator), images.device
@@ -259,6 +265,13 @@ class DeltacoPolicy(TaskConditionedPolicy):
         """Returns embeddings of instructions, (instructions, embedding)."""
         embeddings = self.instructions(instructions, device)
         return embeddings if self.language_head is None else self.language_head(embeddings)
+
+    def _compare_instructions(self, device: torch.device) -> None:
+        """Warns once if instructions of the training dataset have equal embeddings."""
+        if self._meta is not None and self.paraphrases is None and not self._are_instructions_compared:
+            self._are_instructions_compared = True
+            tasks = list(self._meta.tasks.index)
+            warn_of_equal_instructions(tasks, self.instructions(tasks, device))
 
     def _embed_demonstrations(self, demonstrations: DemonstrationsOfTasks, device: torch.device) -> Tensor:
         """Returns embeddings of the first demonstration of each sample, (batch, embedding)."""

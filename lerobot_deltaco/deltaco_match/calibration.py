@@ -47,17 +47,8 @@ class StateToImage(nn.Module):
         Args:
             first: First images of episodes, (episodes, 3, H, W) uint8.
             last: Last images of the same episodes.
-            states: States at their grasps, (episodes, state).
-
-        Raises:
-            ValueError: There are fewer than `MIN_EPISODES`.
+            states: States at their grasps, (episodes, state), at least `MIN_EPISODES`.
         """
-        if len(states) < MIN_EPISODES:
-            raise ValueError(
-                f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} episodes "
-                f"in which the gripper closes and opens. Got {len(states)}. Collect more, or train "
-                "--policy.type=deltaco with --policy.demo_encoder=attention, which needs none."
-            )
         states = states.float()
         mean, std = states.mean(dim=0), states.std(dim=0)
         self.mean.copy_(mean)

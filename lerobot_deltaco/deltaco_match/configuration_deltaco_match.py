@@ -26,8 +26,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             too early misses flat objects; on a robot, one that goes too far may touch the table.
         p_hue_augmentation: Probability that a training sample's observation and demonstration undergo the
             same random change of hue, saturation and brightness.
-        frames_after_release: Number of frames after the gripper's last opening in an episode that
-            `deltaco train` trains on; None for all.
+        frames_after_release: Number of frames after the gripper has opened for the last time in an episode
+            that `deltaco train` trains on, at 24 frames per second and proportionally at others; None for
+            all.
     """
 
     crop_size: float = 0.17

@@ -8,22 +8,46 @@ gripper that rests closed at either end is not a grasp.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
+_GLITCH, _MAX_GLITCH = 30, 3  # frames at either side of a median: a 30th of the episode's, but no more
 _OUTLIERS = 0.02  # fraction of an episode's frames at either end of the range that do not count
 _MIN_RANGE = 0.2  # of an episode, as a fraction of the usual range: less is a tremble
-_MIN_DEPTH = 0.25  # of a valley below the openings at its sides, as a fraction of the episode's range
+_MIN_DEPTH = 0.15  # of a valley below the openings at its sides, as a fraction of the episode's range
+_MIN_RELATIVE_DEPTH = 0.3  # the same, as a fraction of the deepest valley's depth
+_NOISE = 4.0  # ranges of less than so many standard deviations are noise
 _CLOSED = 0.2  # fraction of the way up from the valley to an opening below which the gripper counts as closed
-_APPROACH_FRAMES = 2  # before the gripper closes
+_APPROACH = 30  # the state before a grasp is a 30th of the episode before the gripper begins to close
+_N_REASONS = 3  # that a warning names
 _GRIPPER_CORRELATION = 0.8  # of a state with the gripper's command, above which it is the gripper's
+# Commands that mean close, stay, open, as LeRobot's gamepads and keyboards give them; and inverted.
+_THREE_STATES = ({0.0, 1.0, 2.0}, {-1.0, 0.0, 1.0}, {-2.0, -1.0, 0.0})
+
+
+class Grasp(NamedTuple):
+    """Frames of a grasp.
+
+    Attributes:
+        closing: The last one before it in which the gripper is more than half open.
+        grasp: The first one in which it has closed.
+        release: The first one in which it is no longer closed.
+        opened: The first one in which it has opened again.
+    """
+
+    closing: int
+    grasp: int
+    release: int
+    opened: int
 
 
 class Keyframes(NamedTuple):
@@ -46,30 +70,52 @@ class Keyframes(NamedTuple):
         return torch.where(self.found[:, None], self.states[:, 0], torch.nan)
 
 
-def find_keyframes(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Keyframes:
+def find_keyframes(
+    states: Tensor,
+    gripper: Tensor,
+    spans: Sequence[tuple[int, int]],
+    episodes: Sequence[int] | None = None,
+) -> Keyframes:
     """Finds the grasp and the release of episodes. If an object slips, the last grasp counts.
 
     Args:
         states: Robot states of all frames, (frames, state).
         gripper: Commands to the gripper in all frames, greater for more open, (frames,).
         spans: First and last frame of each episode.
+        episodes: Index of each episode, for the warning; by default, they are counted.
     """
-    found, frames = [], []
-    for (first, _), keyframes in zip(spans, grasp_frames(gripper, spans), strict=True):
-        found.append(keyframes is not None)
-        grasp, release = (first, first) if keyframes is None else keyframes
+    found, frames = find_grasps(gripper, spans), []
+    for (first, last), grasp in zip(spans, found, strict=True):
+        if isinstance(grasp, str):
+            frames.append((first, first, first))
+            continue
+        approach = grasp.closing - max(1, (last - first + 1) // _APPROACH)
         # The command to close takes effect one step later.
-        frames.append((min(grasp + 1, release), release, max(grasp - _APPROACH_FRAMES, first)))
-    if not all(found):
-        logger.warning(
-            "The gripper does not close and open again in %d of %d episodes; they are not trained on.",
-            found.count(False),
-            len(found),
-        )
-    is_found = torch.tensor(found, device=states.device)
+        frames.append((min(grasp.grasp + 1, grasp.release), grasp.release, max(approach, first)))
+    _warn_of_missing(found, range(len(spans)) if episodes is None else episodes)
+    is_found = torch.tensor([isinstance(grasp, Grasp) for grasp in found], device=states.device)
     at = states[torch.tensor(frames, device=states.device)].float()  # (episodes, 3, state)
     at = torch.where(is_found[:, None, None], at, 0.0)
     return Keyframes(at[:, :2], at[:, 2], is_found)
+
+
+def _warn_of_missing(found: Sequence[Grasp | str], episodes: Sequence[int]) -> None:
+    example = {
+        reason: episode
+        for reason, episode in zip(found[::-1], episodes[::-1], strict=True)
+        if isinstance(reason, str)
+    }
+    if example:
+        counts = Counter(reason for reason in found if isinstance(reason, str))
+        logger.warning(
+            "%d of %d episodes have no grasp, and are not trained on: %s.",
+            counts.total(),
+            len(found),
+            "; ".join(
+                f"in {count}, such as episode {example[reason]}, {reason}"
+                for reason, count in counts.most_common(_N_REASONS)
+            ),
+        )
 
 
 def grasp_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[tuple[int, int] | None]:
@@ -82,69 +128,121 @@ def grasp_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[tupl
     Returns:
         Frame of the grasp and of the release of each episode; None where there is no grasp.
     """
+    return [
+        None if isinstance(found, str) else (found.grasp, found.release)
+        for found in find_grasps(gripper, spans)
+    ]
+
+
+def find_grasps(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[Grasp | str]:
+    """Finds the last grasp of each episode that is released.
+
+    Args:
+        gripper: Commands to the gripper in all frames, greater for more open, (frames,). Of commands that
+            mean close, stay and open (0, 1, 2 or -1, 0, 1), the last one before "stay" holds.
+        spans: First and last frame of each episode.
+
+    Returns:
+        The grasp of each episode, or the reason why there is none.
+    """
+    courses = _courses(gripper, spans)
+    smooth = [_without_outliers(course) for course in courses]
+    ranges = [float(np.ptp(course)) for course in smooth]
+    usual = float(np.nanmedian(ranges)) if np.isfinite(ranges).any() else 0.0
+    found: list[Grasp | str] = []
+    for (first, _), raw, course, size in zip(spans, courses, smooth, ranges, strict=True):
+        grasp = _last_valley(raw, course, size, usual)
+        found.append(grasp if isinstance(grasp, str) else Grasp(*(first + frame for frame in grasp)))
+    return found
+
+
+def _courses(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[NDArray[np.float64]]:
+    """Returns the course of each episode; commands to stay are replaced by the last state."""
     commands = gripper.cpu().double().numpy()
     courses = [commands[first : last + 1] for first, last in spans]
-    ranges = [np.diff(np.quantile(course, [_OUTLIERS, 1 - _OUTLIERS])).item() for course in courses]
-    usual = float(np.median(ranges))
-    found = [
-        _last_valley(course) if size > _MIN_RANGE * usual else None
-        for course, size in zip(courses, ranges, strict=True)
-    ]
-    return [
-        None if valley is None else (first + valley[0], first + valley[1])
-        for (first, _), valley in zip(spans, found, strict=True)
-    ]
+    values = np.unique(np.concatenate(courses)) if courses else commands
+    if set(values.tolist()) in _THREE_STATES:
+        courses = [_held(course, *values) for course in courses]
+    return courses
 
 
-def _last_valley(course: NDArray[np.float64]) -> tuple[int, int] | None:
-    """Returns the first frame of the last valley between two openings, and the first frame after it."""
-    low, high = np.quantile(course, [_OUTLIERS, 1 - _OUTLIERS])
-    course, depth = np.clip(course, low, high), _MIN_DEPTH * (high - low)
+def _held(course: NDArray[np.float64], closed: float, stay: float, opened: float) -> NDArray[np.float64]:
+    """Returns a course in which the last state holds while it should stay."""
+    given = np.flatnonzero(course != stay)
+    if not len(given):
+        return course
+    # Before the first command, the gripper is in the other state.
+    before = closed if course[given[0]] == opened else opened
+    last = np.searchsorted(given, np.arange(len(course)), side="right") - 1
+    return np.where(last < 0, before, course[given[np.maximum(last, 0)]])
+
+
+def _without_outliers(course: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns a course without glitches of a few frames, and without the extremes of its range."""
+    if len(np.unique(course)) > 2:  # binary commands have no glitches
+        reach = min(max(1, len(course) // _GLITCH), _MAX_GLITCH)
+        course = np.median(sliding_window_view(np.pad(course, reach, "edge"), 2 * reach + 1), axis=1)
+    return np.clip(course, *np.quantile(course, [_OUTLIERS, 1 - _OUTLIERS]))
+
+
+def _last_valley(
+    raw: NDArray[np.float64], course: NDArray[np.float64], size: float, usual: float
+) -> tuple[int, int, int, int] | str:
+    """Returns the frames of a `Grasp` at the last valley between two openings, or why there is none.
+
+    Args:
+        raw: The course as recorded.
+        course: The course without outliers.
+        size: Its range.
+        usual: Range of the usual episode.
+    """
+    if not np.isfinite(raw).all():
+        return f"the gripper's command is not finite in frame {int(np.argmin(np.isfinite(raw)))}"
+    if size == 0:
+        return "the gripper does not move"
+    is_binary = len(np.unique(raw)) <= 2
+    noise = 0.0 if is_binary else 1.48 * float(np.median(np.abs(np.diff(raw)))) / np.sqrt(2)
+    if size <= max(_MIN_RANGE * usual, _NOISE * noise):
+        return "the gripper only trembles"
+    sides = np.minimum(np.maximum.accumulate(course), np.maximum.accumulate(course[::-1])[::-1])
+    depth = max(_MIN_DEPTH * size, _MIN_RELATIVE_DEPTH * float((sides - course).max()), _NOISE * noise)
     # Backwards: from the last opening down into the valley, and up to the opening before it.
     after, bottom, level = course[-1], 0, None
     for frame in range(len(course) - 1, -1, -1):
         if level is None and course[frame] > after:
             after = course[frame]
-        elif (level is None and after - course[frame] >= depth > 0) or (
+        elif (level is None and after - course[frame] >= depth) or (
             level is not None and course[frame] < level
         ):
             level, bottom = course[frame], frame
         elif level is not None and course[frame] - level >= depth:
             break
     else:
-        return None
+        return _why_no_valley(course, depth)
     before = _opening(course[frame::-1], level + depth / 2)
     # The opening that ends the valley need not be the last one.
     rise = bottom + int(np.argmax(course[bottom:] - level >= depth))
     after = _opening(course[rise:], level + depth / 2)
     grasp = frame + int(np.argmax(course[frame:] <= level + _CLOSED * (before - level)))
+    closing = np.flatnonzero(course[:grasp] > (level + before) / 2)[-1]
     is_closed = course[: rise + 1] <= level + _CLOSED * (after - level)
-    return grasp, int(np.flatnonzero(is_closed)[-1]) + 1
+    release = int(np.flatnonzero(is_closed)[-1]) + 1
+    opened = release + int(np.argmax(course[release:] >= after - _CLOSED * (after - level)))
+    return int(closing), grasp, release, opened
+
+
+def _why_no_valley(course: NDArray[np.float64], depth: float) -> str:
+    """Returns why a course that moves has no valley between two openings."""
+    opens, closes = (course.max() - end >= depth for end in (course[0], course[-1]))
+    if opens and closes:
+        return "the gripper opens and closes, but does not open again"
+    return "the gripper opens, but does not close before" if opens else "the gripper does not open again"
 
 
 def _opening(course: NDArray[np.float64], least: float) -> float:
     """Returns the greatest value before a course falls to a level for the first time."""
     ends = np.flatnonzero(course <= least)
     return float(course[: ends[0] if len(ends) else None].max())
-
-
-def warn_if_inverted(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> None:
-    """Warns if more episodes have a grasp when low and high are swapped.
-
-    Args:
-        gripper: Commands to the gripper in all frames, greater for more open, (frames,).
-        spans: First and last frame of each episode.
-    """
-    n_found = sum(found is not None for found in grasp_frames(gripper, spans))
-    n_inverted = sum(found is not None for found in grasp_frames(-gripper, spans))
-    if n_inverted > n_found:
-        logger.warning(
-            "%d of %d episodes have a grasp, and %d would have one if the gripper's values meant the "
-            "opposite. Then set --policy.gripper_closed to the other of low and high.",
-            n_found,
-            len(spans),
-            n_inverted,
-        )
 
 
 def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Tensor:
@@ -154,11 +252,12 @@ def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, 
 
     Args:
         states: Robot states of all frames, (frames, state).
-        gripper: Commands to the gripper in all frames, (frames,).
+        gripper: Commands to the gripper in all frames, as for `find_grasps`, (frames,).
         spans: First and last frame of each episode.
     """
     frames = torch.cat([torch.arange(first, last) for first, last in spans]).to(states.device)
-    after, command = states[frames + 1].double(), gripper[frames].double()[:, None]
+    held = np.concatenate([course[:-1] for course in _courses(gripper, spans)])
+    after, command = states[frames + 1].double(), torch.from_numpy(held).to(states.device)[:, None]
     after, command = after - after.mean(dim=0), command - command.mean()
     covariance = (after * command).mean(dim=0)
     scale = after.square().mean(dim=0).sqrt() * command.square().mean().sqrt()

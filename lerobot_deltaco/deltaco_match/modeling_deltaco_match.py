@@ -31,11 +31,18 @@ from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_tra
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
+from lerobot_deltaco.base_policy import (
+    DemonstrationsOfTasks,
+    TaskConditionedPolicy,
+    warn_of_equal_instructions,
+)
+from lerobot_deltaco.dataset_reading import open_dataset
+from lerobot_deltaco.deltaco_match.calibration import MIN_EPISODES
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
+from lerobot_deltaco.deltaco_match.gripper_direction import warn_if_inverted
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
-from lerobot_deltaco.deltaco_match.keyframes import find_keyframes, follows_gripper, warn_if_inverted
+from lerobot_deltaco.deltaco_match.keyframes import find_keyframes, follows_gripper
 from lerobot_deltaco.deltaco_match.place import (
     TARGET_DIM,
     DemonstrationAttention,
@@ -49,7 +56,7 @@ from lerobot_deltaco.deltaco_match.words import (
     encode_words,
     vocabulary_of,
 )
-from lerobot_deltaco.demonstrations import DemonstrationBank, RobotData, open_dataset, read_robot_data
+from lerobot_deltaco.demonstrations import DemonstrationBank, RobotData, read_robot_data
 from lerobot_deltaco.losses import GRIPPER_LOSSES, imitation_loss, join_action, location_loss
 from lerobot_deltaco.networks import (
     BACKBONES,
@@ -139,6 +146,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if dataset_meta is not None:
             sentences = self._sentences(dataset_meta.tasks.index)
             config.known_words = config.known_words or vocabulary_of(chain.from_iterable(sentences.values()))
+            tasks = list(sentences)
+            warn_of_equal_instructions(tasks, encode_words(tasks, config.known_words))
         backbone = BACKBONES["strided"]
         assert config.action_feature is not None
         self.model = PolicyNetwork(
@@ -469,11 +478,21 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         config, device, frames = self.config, self.step.device, self.training_bank.frames
         states = robot_data.states.to(device)
         gripper = config.gripper_opening(robot_data.actions).to(device)
-        keyframes = find_keyframes(states, gripper, robot_data.spans)
-        warn_if_inverted(gripper, robot_data.spans)
+        keyframes = find_keyframes(states, gripper, robot_data.spans, bank.episodes.tolist())
+        warn_if_inverted(gripper, robot_data, config.gripper_closed)
         zero_and_one = torch.stack([torch.zeros(states.shape[1]), torch.ones(states.shape[1])])
         shift, end = self._normalized(zero_and_one).to(device)
         is_arm = ~follows_gripper(states, gripper, robot_data.spans)
+        n_found = int(keyframes.found.sum())
+        if n_found < MIN_EPISODES:
+            assert self._meta is not None
+            raise ValueError(
+                f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} episodes "
+                f"in which the gripper closes and opens. Got {n_found}. Collect more, or train "
+                "--policy.type=deltaco with --policy.demo_encoder=attention, which needs none. The gripper "
+                f"is {config.name_gripper(self._meta.features)}, whose {config.gripper_closed} values close "
+                "it; see --policy.gripper and --policy.gripper_closed."
+            )
         known = self.robot_states.fit(keyframes, frames[:, 0], frames[:, -1], end - shift, shift, is_arm)
         self.training_locations = known
         self.training_bank.pick_states = keyframes.pick_states

@@ -1,0 +1,325 @@
+"""Opens LeRobotDatasets, and checks that what they store twice agrees.
+
+An error names the episode, its file, and what disagrees. Datasets that other tools converted or edited may
+have a table of episodes, statistics or tasks that do not belong to the frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pyarrow as pa
+import yaml
+from huggingface_hub import constants
+from lerobot.configs import parser
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
+from numpy.typing import NDArray
+
+_TOLERANCE = 1e-3  # of numbers beyond the range of the statistics, as a fraction of it
+
+
+def check_dataset_folder(option: str, root: str | Path | None) -> None:
+    """Checks that a folder holds a dataset, if the Hub is offline.
+
+    Args:
+        option: Command-line option that names the folder, for the error.
+        root: The folder; None for LeRobot's cache.
+
+    Raises:
+        FileNotFoundError: It holds none.
+    """
+    if root is not None and constants.HF_HUB_OFFLINE and not (Path(root) / "meta/info.json").exists():
+        raise FileNotFoundError(
+            f"{option} is {root}, but there is no dataset: meta/info.json is missing. Check the spelling. "
+            "(HF_HUB_OFFLINE is set, so nothing can be downloaded into it.)"
+        )
+
+
+def open_dataset(
+    option: str, repo_id: str, root: str | Path | None, episodes: Sequence[int] | None = None
+) -> LeRobotDataset:
+    """Opens a dataset, and checks it.
+
+    Args:
+        option: Command-line option that names its folder, for the error.
+        repo_id: Repository id of the dataset.
+        root: Folder of the dataset; None for LeRobot's cache.
+        episodes: Episodes to open; None for all.
+
+    Raises:
+        FileNotFoundError: The folder holds no dataset, or a file of it is missing.
+        ValueError: The dataset is damaged, or has no such episode.
+    """
+    check_dataset_folder(option, root)
+    with missing_files_named(repo_id, root, episodes):
+        dataset = LeRobotDataset(
+            repo_id, root=root, episodes=None if episodes is None else list(episodes), return_uint8=True
+        )
+    check_dataset(dataset)
+    return dataset
+
+
+@contextmanager
+def missing_files_named(
+    repo_id: str, root: str | Path | None, episodes: Sequence[int] | None = None
+) -> Iterator[None]:
+    """While a local dataset is opened, names the file that is missing, rather than the Hub."""
+    try:
+        yield
+    except Exception as error:
+        folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+        if not (folder / "meta/info.json").exists():
+            raise
+        for name in ("meta/tasks.parquet", "meta/episodes"):
+            if not (folder / name).exists():
+                _raise_missing(folder / name, "The dataset", error)
+        meta = LeRobotDatasetMetadata(repo_id, folder)
+        chosen = range(meta.total_episodes) if episodes is None else episodes
+        check_episode_numbers(repo_id, meta.total_episodes, chosen)
+        for episode in chosen:
+            for path in _files(meta, episode):
+                if not path.exists():
+                    _raise_missing(path, f"Episode {episode}", error)
+        raise
+
+
+def _raise_missing(path: Path, owner: str, error: Exception) -> NoReturn:
+    raise FileNotFoundError(
+        f"{path} is missing. {owner} needs it, and it could not be downloaded. Copy it there, or leave out "
+        "the episode with --dataset.episodes."
+    ) from error
+
+
+def _files(meta: LeRobotDatasetMetadata, episode: int) -> list[Path]:
+    """Returns the files that hold an episode."""
+    videos = [meta.get_video_file_path(episode, name) for name in meta.video_keys]
+    return [meta.root / path for path in (meta.get_data_file_path(episode), *videos)]
+
+
+def check_episode_numbers(repo_id: str, total: int, episodes: Sequence[int]) -> None:
+    """Checks that a dataset has episodes.
+
+    Raises:
+        ValueError: It does not.
+    """
+    if not len(episodes) or not all(0 <= episode < total for episode in episodes):
+        shown = ", ".join(map(str, episodes[:10])) + (", ..." if len(episodes) > 10 else "")  # noqa: PLR2004
+        raise ValueError(
+            f"{repo_id} has the episodes 0 to {total - 1}. Got {shown or 'none'}. Name others in "
+            "`demo_episodes` or --dataset.episodes."
+        )
+
+
+def training_argument(name: str) -> Any:
+    """Returns an argument of the running `lerobot-train`, such as "dataset.episodes"; None if it has none.
+
+    LeRobot tells a policy neither of the episodes that it is trained on, nor how features are renamed.
+    """
+    given, path = parser.parse_arg(name), parser.parse_arg("config_path")
+    if given is not None:
+        return yaml.safe_load(given)
+    value = yaml.safe_load(Path(path).read_text()) if path and Path(path).is_file() else {}
+    for part in name.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    return value
+
+
+def source_of(feature: str, available: Sequence[str]) -> str:
+    """Returns the name that a policy's feature has in a dataset, before --rename_map."""
+    renamed = {new: old for old, new in (training_argument("rename_map") or {}).items()}
+    return feature if feature in available else renamed.get(feature, feature)
+
+
+# Frames
+
+
+def episode_spans(dataset: LeRobotDataset) -> dict[int, tuple[int, int]]:
+    """Returns the first and the last row of each episode in a dataset, by the episode's index."""
+    episodes = column(dataset, "episode_index").reshape(-1)
+    first = np.flatnonzero(np.diff(episodes, prepend=-1))
+    last = np.append(first[1:], len(episodes)) - 1
+    return dict(zip(episodes[first].tolist(), zip(first.tolist(), last.tolist(), strict=True), strict=True))
+
+
+def column(dataset: LeRobotDataset, name: str) -> NDArray[Any]:
+    """Returns all values of a feature, (frames, ...)."""
+    table = dataset.hf_dataset.select_columns([name])
+    values = table.with_format("arrow")[:][name].combine_chunks()
+    array = _flat_numbers(values)
+    if array is None:
+        array = np.array(table.with_format("numpy")[:][name])
+    elif len(array) != len(values):
+        array = array.reshape(len(values), *dataset.meta.features[name]["shape"])
+    elif pa.types.is_nested(values.type):
+        array = array[:, None]
+    # As LeRobot, which makes tensors of Python's numbers.
+    if np.issubdtype(array.dtype, np.floating):
+        return array.astype(np.float32)
+    return array.astype(np.int64) if np.issubdtype(array.dtype, np.integer) else array.copy()
+
+
+def _flat_numbers(values: pa.Array) -> NDArray[Any] | None:
+    """Returns numbers and vectors of numbers as one flat array; None for anything else.
+
+    `datasets` makes arrays row by row, and takes ten seconds for a hundred thousand.
+    """
+    while pa.types.is_list(values.type) or pa.types.is_fixed_size_list(values.type):
+        if values.null_count:
+            return None
+        values = values.flatten()
+    is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
+    if values.null_count or not (is_number or pa.types.is_boolean(values.type)):
+        return None
+    return values.to_numpy(zero_copy_only=False)
+
+
+def frame_name(dataset: LeRobotDataset, row: int, camera: str | None = None) -> str:
+    """Returns the episode, frame and file of a row, for errors."""
+    episode, frame = (
+        int(column(dataset, name).reshape(-1)[row]) for name in ("episode_index", "frame_index")
+    )
+    meta = dataset.meta
+    is_video = camera in meta.video_keys
+    path = meta.get_video_file_path(episode, camera) if is_video else meta.get_data_file_path(episode)
+    return f"frame {frame} of episode {episode} ({meta.root / path})"
+
+
+def read_frame(dataset: LeRobotDataset, row: int, camera: str) -> dict[str, Any]:
+    """Returns a row of a dataset.
+
+    Raises:
+        ValueError: An image of a camera cannot be decoded.
+    """
+    return decoding(dataset, row, camera, lambda: dataset[row])
+
+
+def decoding(dataset: LeRobotDataset, row: int, camera: str, decode: Callable[[], Any]) -> Any:
+    """Returns what a function decodes.
+
+    Raises:
+        ValueError: It fails; the message names the frame.
+    """
+    try:
+        return decode()
+    except Exception as error:
+        raise ValueError(
+            f"The image {camera} in {frame_name(dataset, row, camera)} cannot be decoded: {error}. Record "
+            "the episode again, or leave it out with --dataset.episodes."
+        ) from error
+
+
+# Checks
+
+
+def check_dataset(dataset: LeRobotDataset) -> None:
+    """Checks that a dataset is not damaged, and that what it stores twice agrees.
+
+    Raises:
+        ValueError: It is, or does not; the message names the episode and the file.
+    """
+    _check_tasks(dataset.meta)
+    _check_episodes(dataset)
+    stats = dataset.meta.stats or {}
+    for name in (ACTION, OBS_STATE):
+        if name in dataset.meta.features and not {"min", "max", "mean", "std"} <= set(stats.get(name, ())):
+            raise ValueError(
+                f"{dataset.meta.root / 'meta/stats.json'} has no statistics of `{name}`, which normalize it. "
+                "Compute them with LeRobot's lerobot-edit-dataset, or record the dataset again."
+            )
+    for name, feature in dataset.meta.features.items():
+        if name not in dataset.meta.camera_keys and str(feature["dtype"]).startswith("float"):
+            _check_numbers(dataset, name, stats.get(name, {}))
+
+
+def _check_tasks(meta: LeRobotDatasetMetadata) -> None:
+    """Checks that tasks are in the order of their indices, since LeRobot finds them by position."""
+    indices = meta.tasks["task_index"].tolist()
+    if indices != list(range(len(indices))):
+        wrong = next(n for n, index in enumerate(indices) if index != n)
+        raise ValueError(
+            f"In {meta.root / 'meta/tasks.parquet'}, row {wrong} has the `task_index` {indices[wrong]}, but "
+            "LeRobot finds tasks by their rows. Sort the rows, and number them from 0."
+        )
+
+
+def _check_episodes(dataset: LeRobotDataset) -> None:
+    """Checks that the table of episodes agrees with the frames, and that each episode has one task."""
+    meta = dataset.meta
+
+    def disagree(episode: int, problem: str) -> NoReturn:
+        raise ValueError(
+            f"Episode {episode} of {dataset.repo_id}: {problem} (frames: "
+            f"{meta.root / meta.get_data_file_path(episode)}; table: {meta.root / 'meta/episodes'}). "
+            "Convert or record the dataset again, or leave out the episode with --dataset.episodes."
+        )
+
+    chosen = sorted(range(meta.total_episodes) if dataset.episodes is None else set(dataset.episodes))
+    table = {
+        name: meta.episodes[name][:]
+        for name in ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index")
+    }
+    names = meta.tasks.index
+    numbers, index, frame_index, tasks = (
+        column(dataset, name).reshape(-1) for name in ("episode_index", "index", "frame_index", "task_index")
+    )
+    starts = np.flatnonzero(np.diff(numbers, prepend=-1))
+    if len(set(numbers[starts].tolist())) < len(starts):
+        values, counts = np.unique(numbers[starts], return_counts=True)
+        disagree(int(values[np.argmax(counts > 1)]), "its frames are not consecutive")
+    spans = episode_spans(dataset)
+    for episode in chosen:
+        if episode not in spans:
+            disagree(episode, "the table has it, but it has no frames")
+        if table["episode_index"][episode] != episode:
+            disagree(episode, f"row {episode} of the table is of episode {table['episode_index'][episode]}")
+        first, last = spans[episode]
+        said, found = table["length"][episode], last - first + 1
+        if said != found:
+            disagree(episode, f"it has {found} frames, but {said} by the table")
+        own = index[first : last + 1]
+        if (np.diff(own) != 1).any() or (frame_index[first : last + 1] != np.arange(found)).any():
+            disagree(episode, "`index` or `frame_index` does not count its frames")
+        said = table["dataset_from_index"][episode], table["dataset_to_index"][episode]
+        if said != (own[0], own[-1] + 1):
+            disagree(
+                episode,
+                f"its frames have the indices {own[0]} to {own[-1]}, but {said[0]} to {said[1] - 1} by the "
+                "table",
+            )
+        present = np.unique(tasks[first : last + 1]).tolist()
+        if not 0 <= present[0] <= present[-1] < len(names):
+            disagree(episode, f"its `task_index` is {present}, but there are {len(names)} tasks")
+        own_tasks = [names[task] for task in present]
+        if len(own_tasks) > 1:
+            disagree(
+                episode,
+                f"it has several tasks, {own_tasks}, but a demonstration shows one. Split it into one for "
+                "each task",
+            )
+        if list(table["tasks"][episode]) != own_tasks:
+            disagree(episode, f"its task is {own_tasks}, but {list(table['tasks'][episode])} by the table")
+
+
+def _check_numbers(dataset: LeRobotDataset, name: str, stats: dict[str, Any]) -> None:
+    """Checks that the numbers of a feature are finite, and within the range of its statistics."""
+    values = column(dataset, name).reshape(len(dataset.hf_dataset), -1)
+    wrong, problem = ~np.isfinite(values), "is not finite"
+    if not wrong.any() and {"min", "max"} <= stats.keys():
+        least, most = (np.asarray(stats[end], np.float64).reshape(-1) for end in ("min", "max"))
+        if len(least) == len(most) == values.shape[1]:
+            margin = _TOLERANCE * (most - least) + 1e-5 * (1 + np.maximum(abs(least), abs(most)))
+            # Not finite statistics are wrong for all.
+            wrong = ~((values >= least - margin) & (values <= most + margin))
+            problem = f"is outside of the range in {dataset.meta.root / 'meta/stats.json'}"
+    if wrong.any():
+        row, dimension = np.argwhere(wrong)[0]
+        raise ValueError(
+            f"`{name}` {problem}: dimension {dimension} is {values[row, dimension]:g} in "
+            f"{frame_name(dataset, int(row))}. {int(wrong.any(axis=1).sum())} frames are such. Leave out "
+            "damaged episodes with --dataset.episodes; compute wrong statistics again."
+        )
