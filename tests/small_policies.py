@@ -81,6 +81,7 @@ def use_short_fit(monkeypatch, steps=2):
         return torch.nn.functional.pad(crops, (0, FEATURE_DIM - crops.shape[2]))
 
     monkeypatch.setattr(feature_matching, "crop_features", colors)
+    monkeypatch.setattr(feature_matching, "_MAX_DISTANCE", 9.0)  # any proposal will do
     monkeypatch.setattr(feature_matching.FeatureMatching.fit, "__defaults__", (steps,))
 
 
