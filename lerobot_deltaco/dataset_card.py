@@ -53,10 +53,11 @@ def _save_tasks_image(root: Path) -> None:
     from matplotlib.figure import Figure
 
     plan = read_plan(root)
+    camera = plan.scene.interface.camera_keys[0]
     shown = np.unique(np.linspace(0, len(plan.task_ids) - 1, MAX_TASKS_SHOWN).round().astype(int))
     episodes = pq.read_table(
         root / "data",
-        columns=["observation.image", "benchmark.task_id"],
+        columns=[camera, "benchmark.task_id"],
         filters=[("frame_index", "==", 0), ("episode_index", "in", shown * plan.episodes_per_task)],
     ).to_pylist()
     n_columns = min(4, len(episodes))
@@ -66,7 +67,7 @@ def _save_tasks_image(root: Path) -> None:
     for axes in grid.flat:
         axes.axis("off")
     for axes, episode in zip(grid.flat, episodes, strict=False):
-        axes.imshow(Image.open(io.BytesIO(episode["observation.image"]["bytes"])))
+        axes.imshow(Image.open(io.BytesIO(episode[camera]["bytes"])))
         instruction = get_task(episode["benchmark.task_id"]).instruction
         axes.set_title(textwrap.fill(instruction, 30), fontsize=8)
     with atomic_write(root / TASKS_IMAGE) as temporary:
