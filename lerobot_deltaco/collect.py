@@ -75,8 +75,8 @@ class CollectionPlan:
         seed: Seed of the whole dataset.
         split: Purpose of the episodes; scenes of different splits never coincide. By default, the split of
             the dataset, "validation" for test and validation tasks, and "train" otherwise.
-        noise: Standard deviation of the Gaussian noise on the first three numbers of the expert's actions; with
-            joint control, that on the joints in units of 0.04 rad.
+        noise: Standard deviation of the Gaussian noise on the first three numbers of the expert's actions;
+            with joint control, that on the joints in units of 0.04 rad.
         scene: Settings of the scenes.
 
     Raises:
@@ -251,7 +251,8 @@ def dataset_features(scene: SceneConfig) -> dict[str, dict[str, Any]]:
     changed = {
         name: value
         for name, value in asdict(scene).items()
-        if name in ("objects", "adversarial_probability", "adversarial_draw", "control") and value != defaults[name]
+        if name in ("objects", "adversarial_probability", "adversarial_draw", "control")
+        and value != defaults[name]
     }
     image = {
         "dtype": "image",

@@ -180,7 +180,7 @@ def _demonstration(env: PickPlaceEnv, task_id: int) -> tuple[NDArray[np.uint8], 
         env.reset(seed=seed, options={"task_id": task_id})
         if _is_in_view(env.scene.layout):
             images = _expert_images(env, task_id, seed)
-            if len(images) <= env.scene_config.episode_length:
+            if len(images) <= env.scene_config.n_steps:
                 return images[0], images[-1], env.scene.layout
     raise RuntimeError(f"No demonstration of task {task_id} in {N_TRIES} tries.")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from gym_deltaco import CONTROL_FPS, EPISODE_STEPS
@@ -44,3 +45,9 @@ CONTROLS = {
     ),
     "joints": Control(30, 240, _JOINT_POSITIONS, _JOINT_POSITIONS, ("front", "wrist")),
 }
+
+
+def control_of(cameras: Iterable[str]) -> str | None:
+    """Returns the control whose cameras are all among some, by their names in datasets; None for neither."""
+    known = set(cameras)
+    return next((name for name, control in CONTROLS.items() if set(control.camera_keys) <= known), None)

@@ -340,7 +340,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         }
 
 
-def _box(bounds: tuple[NDArray[np.float64], NDArray[np.float64]]) -> spaces.Box:
+def _box(bounds: tuple[NDArray[np.float64], NDArray[np.float64]]) -> Any:
     low, high = bounds
     return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 

@@ -201,7 +201,7 @@ class Expert:
 
 
 class JointExpert(Expert):
-    """The expert with joint control: smooth, with a speed of its own in each episode, and pauses as people make.
+    """The expert with joint control: smooth, at its own speed in each episode, with pauses as people make.
 
     The end effector accelerates and brakes evenly towards the goal of each stage, and stands still while the
     gripper closes or opens. The joints' targets have correlated noise.
@@ -279,5 +279,7 @@ class JointExpert(Expert):
         )
         change = offset * speed / max(distance, 1e-9) - self._velocity
         largest = self._acceleration * self._step_time
-        self._velocity = self._velocity + change * min(1.0, largest / max(np.linalg.norm(change), 1e-9))
+        self._velocity = self._velocity + change * min(
+            1.0, largest / max(float(np.linalg.norm(change)), 1e-9)
+        )
         self._position = self._position + self._velocity * self._step_time
