@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import textwrap
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +30,13 @@ def dataset_card(root: Path, repo_id: str | None = None) -> str:
         root: Folder of the dataset.
         repo_id: Name of the dataset on the Hub; None if it is only in a folder.
     """
+    plan = read_plan(root)
     files = [path for name in ("data", "meta") for path in (root / name).rglob("*") if path.is_file()]
     return render(
         "benchmark_dataset.md",
         info=json.loads((root / INFO_FILE).read_text(encoding="utf-8")),
-        origin=read_description(root),
-        tasks=[get_task(task_id) for task_id in read_plan(root).task_ids],
+        origin={**read_description(root), "plan": asdict(plan)},
+        tasks=[get_task(task_id) for task_id in plan.task_ids],
         scenarios=list(SCENARIOS.values()),
         repo_id=repo_id,
         tasks_image=TASKS_IMAGE,
