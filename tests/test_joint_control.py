@@ -34,7 +34,7 @@ def env():
 def episodes():
     """Episodes of the expert in tasks of all kinds, by task."""
     with closing(PickPlaceEnv(4, SCENE)) as env:
-        return {task_id: list(expert_episode(env, task_id, seed=task_id)) for task_id in range(4, 300, 42)}
+        return {task_id: list(expert_episode(env, task_id, seed=task_id)) for task_id in range(4, 300, 60)}
 
 
 # Environment
@@ -104,7 +104,7 @@ def test_expert_succeeds_at_its_own_speed_in_every_episode(episodes):
 
 
 def test_expert_repeats_to_the_last_bit(episodes, env):
-    for step, expected in zip(expert_episode(env, 46, seed=46), episodes[46], strict=True):
+    for step, expected in zip(expert_episode(env, 64, seed=64), episodes[64], strict=True):
         np.testing.assert_array_equal(step.action, expected.action)
         np.testing.assert_array_equal(
             step.observation["pixels"]["wrist"], expected.observation["pixels"]["wrist"]
