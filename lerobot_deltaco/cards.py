@@ -88,7 +88,7 @@ def policy_card(
     encoder = getattr(config, "language_encoder", None)
     kind = str(getattr(config, "method", config.type))
     training_tasks = [] if meta is None else list(meta.tasks.index)
-    image = {} if meta is None else meta.features.get("observation.image", {}).get("info") or {}
+    image = {} if meta is None else meta.features[config.cameras[0]].get("info") or {}
     lerobot_options = set(draccus.encode(PreTrainedConfig.get_choice_class("act")()))
     own = {name: value for name, value in draccus.encode(config).items() if name not in lerobot_options}
     options = {name: value for name, value in own.items() if value is not None and name not in _HIDDEN}

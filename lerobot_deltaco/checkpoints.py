@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from gym_deltaco.control import control_of
+
 if TYPE_CHECKING:
     from lerobot.policies import PreTrainedPolicy
     from lerobot.processor import PolicyProcessorPipeline
@@ -28,6 +30,7 @@ class Checkpoint(NamedTuple):
         seed: Seed of the training.
         policy_type: Type of the policy, such as "deltaco_match" or "act".
         image_size: Height and width of the images that it was trained on, px.
+        control: Control of the benchmark's arm that it was trained with; None if unknown.
     """
 
     folder: Path
@@ -36,6 +39,7 @@ class Checkpoint(NamedTuple):
     seed: int
     policy_type: str
     image_size: int
+    control: str | None
 
     @property
     def weights_digest(self) -> str:
@@ -77,16 +81,18 @@ def _read_checkpoint(folder: Path) -> Checkpoint:
         run: dict[str, Any] = {}
         if (folder / TRAIN_CONFIG).is_file():
             run = json.loads((folder / TRAIN_CONFIG).read_text(encoding="utf-8"))
-        images = [item["shape"] for item in policy["input_features"].values() if item["type"] == "VISUAL"]
+        inputs = policy["input_features"].items()
+        images = {name: item["shape"] for name, item in inputs if item["type"] == "VISUAL"}
         return Checkpoint(
             folder,
             _step(folder),
             run.get("job_name") or folder.resolve().name,
             run.get("seed") or policy.get("seed") or 0,
             policy["type"],
-            images[0][-1],
+            next(iter(images.values()))[-1],
+            control_of(images),
         )
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, StopIteration, TypeError, AttributeError) as error:
         raise ValueError(f"The configuration of the policy in {folder} cannot be read: {error!r}.") from error
 
 

@@ -30,9 +30,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from gym_deltaco import CONTROL_FPS, ENV_ID, EXPERT_NOISE, pybullet_import
+from gym_deltaco import ENV_ID, EXPERT_NOISE, pybullet_import
 from gym_deltaco.atomic_files import write_json
-from gym_deltaco.env import ACTION_NAMES, STATE_NAMES, PickPlaceEnv
+from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, get_task, select_tasks
@@ -75,7 +75,8 @@ class CollectionPlan:
         seed: Seed of the whole dataset.
         split: Purpose of the episodes; scenes of different splits never coincide. By default, the split of
             the dataset, "validation" for test and validation tasks, and "train" otherwise.
-        noise: Standard deviation of the Gaussian noise on the first three numbers of the expert's actions.
+        noise: Standard deviation of the Gaussian noise on the first three numbers of the expert's actions;
+            with joint control, that on the joints in units of 0.04 rad.
         scene: Settings of the scenes.
 
     Raises:
@@ -196,8 +197,9 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
         speed = _collect_shards(root, plan, workers)
         write_json(root / DESCRIPTION_FILE, {**_description(plan), **_outcome(root, plan)})
         instructions = [get_task(task_id).instruction for task_id in plan.task_ids]
+        dataset_writer.number_frames(root, len(plan.shards))
         dataset_writer.write_metadata(
-            root, dataset_features(plan.scene), CONTROL_FPS, ROBOT_TYPE, instructions
+            root, dataset_features(plan.scene), plan.scene.interface.fps, ROBOT_TYPE, instructions
         )
     except BrokenProcessPool:
         raise CollectionError(
@@ -243,28 +245,34 @@ def renderer() -> str:
 
 def dataset_features(scene: SceneConfig) -> dict[str, dict[str, Any]]:
     """Returns the features of a dataset, as in LeRobot's info.json."""
+    control = scene.interface
     number = {"dtype": "int64", "shape": [1], "names": None}
     defaults = asdict(SceneConfig())
     changed = {
         name: value
         for name, value in asdict(scene).items()
-        if name in ("objects", "adversarial_probability", "adversarial_draw") and value != defaults[name]
+        if name in ("objects", "adversarial_probability", "adversarial_draw", "control")
+        and value != defaults[name]
     }
-    return {
-        "observation.image": {
-            "dtype": "image",
-            "shape": [scene.image_size, scene.image_size, 3],
-            "names": ["height", "width", "channels"],
-            # Policies do not transfer from one renderer's images to another's.
-            "info": {
-                "renderer": renderer(),
-                "benchmark": ENV_ID,
-                "ambiguity": scene.ambiguity,
-                **changed,
-            },
+    image = {
+        "dtype": "image",
+        "shape": [scene.image_size, scene.image_size, 3],
+        "names": ["height", "width", "channels"],
+        # Policies do not transfer from one renderer's images to another's.
+        "info": {
+            "renderer": renderer(),
+            "benchmark": ENV_ID,
+            "ambiguity": scene.ambiguity,
+            **changed,
         },
-        "observation.state": {"dtype": "float32", "shape": [len(STATE_NAMES)], "names": STATE_NAMES},
-        "action": {"dtype": "float32", "shape": [len(ACTION_NAMES)], "names": ACTION_NAMES},
+    }
+    vectors = {"observation.state": control.state_names, "action": control.action_names}
+    return {
+        **dict.fromkeys(control.camera_keys, image),
+        **{
+            name: {"dtype": "float32", "shape": [len(names)], "names": names}
+            for name, names in vectors.items()
+        },
         "next.reward": {"dtype": "float32", "shape": [1], "names": None},
         "next.done": {"dtype": "bool", "shape": [1], "names": None},
         "next.success": {"dtype": "bool", "shape": [1], "names": None},
@@ -304,7 +312,8 @@ def _check_folder(root: Path, plan: CollectionPlan) -> None:
         if found is not None:
             raise CollectionError(f"{root} is not empty: it holds {found.name}. Name a new folder.")
         return
-    begun, wanted = (_flat(description) for description in (read_description(root), _description(plan)))
+    begun = _flat({**read_description(root), "plan": asdict(read_plan(root))})
+    wanted = _flat(_description(plan))
     # A finished dataset remains valid when packages are updated.
     ignored = ("benchmark", "renderer") if is_finished(root) else ()
     differences = [
@@ -396,9 +405,9 @@ def _collect_shard(env: PickPlaceEnv, root: Path, plan: CollectionPlan, shard: i
         shard,
         episodes(),
         dataset_features(plan.scene),
-        CONTROL_FPS,
+        plan.scene.interface.fps,
         first_episode=first,
-        first_frame=first * plan.scene.episode_length,
+        first_frame=first * plan.scene.n_steps,  # unless episodes end before that
     )
     return shard
 
@@ -438,12 +447,14 @@ def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, numbe
         info = steps[-1].info
         if not info["is_success"]:
             continue
-        n_steps = len(steps)
-        assert n_steps == plan.scene.episode_length  # on which the indices of all frames depend
+        n_steps, cameras = len(steps), plan.scene.interface.cameras
+        observed = [step.observation for step in steps]
+        images = [[each["pixels"][name] for each in observed] for name in cameras]
+        images = images or [[each["pixels"] for each in observed]]
         privileged = (task_id, info["objects"][info["target_object"]], info["target_container"], seed)
         return {
-            "observation.image": np.stack([step.observation["pixels"] for step in steps]),
-            "observation.state": np.stack([step.observation["agent_pos"] for step in steps]),
+            **dict(zip(plan.scene.interface.camera_keys, map(np.stack, images), strict=True)),
+            "observation.state": np.stack([each["agent_pos"] for each in observed]),
             "action": np.stack([step.action for step in steps]),
             "next.reward": np.array([step.reward for step in steps], dtype=np.float32),
             "next.done": np.arange(n_steps) == n_steps - 1,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import textwrap
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +30,13 @@ def dataset_card(root: Path, repo_id: str | None = None) -> str:
         root: Folder of the dataset.
         repo_id: Name of the dataset on the Hub; None if it is only in a folder.
     """
+    plan = read_plan(root)
     files = [path for name in ("data", "meta") for path in (root / name).rglob("*") if path.is_file()]
     return render(
         "benchmark_dataset.md",
         info=json.loads((root / INFO_FILE).read_text(encoding="utf-8")),
-        origin=read_description(root),
-        tasks=[get_task(task_id) for task_id in read_plan(root).task_ids],
+        origin={**read_description(root), "plan": asdict(plan)},
+        tasks=[get_task(task_id) for task_id in plan.task_ids],
         scenarios=list(SCENARIOS.values()),
         repo_id=repo_id,
         tasks_image=TASKS_IMAGE,
@@ -53,10 +55,11 @@ def _save_tasks_image(root: Path) -> None:
     from matplotlib.figure import Figure
 
     plan = read_plan(root)
+    camera = plan.scene.interface.camera_keys[0]
     shown = np.unique(np.linspace(0, len(plan.task_ids) - 1, MAX_TASKS_SHOWN).round().astype(int))
     episodes = pq.read_table(
         root / "data",
-        columns=["observation.image", "benchmark.task_id"],
+        columns=[camera, "benchmark.task_id"],
         filters=[("frame_index", "==", 0), ("episode_index", "in", shown * plan.episodes_per_task)],
     ).to_pylist()
     n_columns = min(4, len(episodes))
@@ -66,7 +69,7 @@ def _save_tasks_image(root: Path) -> None:
     for axes in grid.flat:
         axes.axis("off")
     for axes, episode in zip(grid.flat, episodes, strict=False):
-        axes.imshow(Image.open(io.BytesIO(episode["observation.image"]["bytes"])))
+        axes.imshow(Image.open(io.BytesIO(episode[camera]["bytes"])))
         instruction = get_task(episode["benchmark.task_id"]).instruction
         axes.set_title(textwrap.fill(instruction, 30), fontsize=8)
     with atomic_write(root / TASKS_IMAGE) as temporary:

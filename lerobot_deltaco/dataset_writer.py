@@ -86,7 +86,7 @@ def write_shard(
         features: Features of the dataset, LeRobot's own included.
         fps: Frames per second.
         first_episode: Index of the first episode in the dataset.
-        first_frame: Index of its first frame in the dataset.
+        first_frame: Index of its first frame in the dataset; `number_frames` corrects it.
     """
     chunk_index, file_index = divmod(shard, FILES_PER_CHUNK)
     schema = data_schema(features)
@@ -127,6 +127,40 @@ def write_shard(
             first_frame += len(frame_index)
     with atomic_write(root / _numbered(EPISODES_FILE, shard)) as temporary:
         pq.write_table(pa.Table.from_pylist(rows), temporary, compression="snappy")
+
+
+def number_frames(root: Path, n_shards: int) -> None:
+    """Numbers the frames through all shards, where the first frame of a shard was only assumed.
+
+    Args:
+        root: Folder of the dataset, whose shards are all written.
+        n_shards: Number of shards.
+    """
+    first_frame = 0
+    for shard in range(n_shards):
+        path, data_path = root / _numbered(EPISODES_FILE, shard), root / _numbered(DATA_FILE, shard)
+        rows = pq.read_table(path).to_pylist()
+        shift = first_frame - rows[0]["dataset_from_index"]
+        first_frame = rows[-1]["dataset_to_index"] + shift
+        if not shift:
+            continue
+        # The episodes are written last, and the frames by their number: a repetition changes nothing.
+        data = pq.ParquetFile(data_path)
+        with (
+            atomic_write(data_path) as temporary,
+            pq.ParquetWriter(temporary, data.schema_arrow, compression="snappy") as writer,
+        ):
+            for group, row in enumerate(rows):
+                row["dataset_from_index"] += shift
+                row["dataset_to_index"] += shift
+                index = np.arange(row["dataset_from_index"], row["dataset_to_index"])
+                table = data.read_row_group(group)
+                column = table.schema.get_field_index("index")
+                writer.write_table(table.set_column(column, table.schema.field("index"), pa.array(index)))
+                statistics = feature_statistics(index)
+                row.update({f"stats/index/{name}": value.tolist() for name, value in statistics.items()})
+        with atomic_write(path) as temporary:
+            pq.write_table(pa.Table.from_pylist(rows), temporary, compression="snappy")
 
 
 def _numbered(file: str, number: int) -> str:

@@ -223,10 +223,10 @@ def run_episodes(
     if isinstance(policy, TaskConditionedPolicy):
         policy.set_tasks(instructions, demonstrations)
     noise = [np.random.default_rng(episode.seed) for episode in episodes]
-    for _ in range(envs[0].scene_config.episode_length):
+    for _ in range(envs[0].scene_config.n_steps):
         if callback is not None:
             callback(envs, observations)
-        stacked = {name: np.stack([each[name] for each in observations]) for name in observations[0]}
+        stacked = _stacked(observations)
         if joint_noise:
             drawn = np.stack([rng.normal(0, np.radians(joint_noise), N_JOINTS) for rng in noise])
             stacked["agent_pos"][:, :N_JOINTS] += drawn.astype(np.float32)
@@ -237,6 +237,15 @@ def run_episodes(
     if callback is not None:
         callback(envs, observations)
     return infos
+
+
+def _stacked(observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns a batch of observations, of which each may contain dictionaries."""
+    columns = {name: [each[name] for each in observations] for name in observations[0]}
+    return {
+        name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
+        for name, values in columns.items()
+    }
 
 
 def run_evaluation(evaluation: Evaluation, processes: int = 1) -> list[Outcome]:
@@ -461,8 +470,8 @@ def evaluate_checkpoints(
         demonstrations = (demo_repo_id, metadata_digest(demo_repo_id, demo_root))
     lines = []
     for checkpoint in _chosen(found, steps):
-        sized = replace(plan, scene=_with_image_size(plan.scene, checkpoint.image_size))
-        file = folder / "evaluations" / _record_name(checkpoint, sized, demonstrations)
+        fitted = replace(plan, scene=_fitted(plan.scene, checkpoint))
+        file = folder / "evaluations" / _record_name(checkpoint, fitted, demonstrations)
         if file.exists():
             (record,) = read_records(file)
             if record.weights != checkpoint.weights_digest:
@@ -474,7 +483,7 @@ def evaluate_checkpoints(
             loaded = load_policy(checkpoint.folder, overrides, rename_map)
             record = evaluate(
                 loaded,
-                sized,
+                fitted,
                 checkpoint,
                 command=command,
                 processes=processes if str(loaded.policy.config.device) == "cpu" else 1,
@@ -508,9 +517,13 @@ def _chosen(found: Sequence[Checkpoint], steps: str) -> list[Checkpoint]:
     return [available[step] for step in steps.split(",")]
 
 
-def _with_image_size(scene: SceneConfig, image_size: int) -> SceneConfig:
-    """Returns settings with the image size that a policy was trained on, unless another one is set."""
-    return replace(scene, image_size=image_size) if scene == replace(scene, image_size=48) else scene
+def _fitted(scene: SceneConfig, checkpoint: Checkpoint) -> SceneConfig:
+    """Returns settings with the control and image size of a policy's training, unless others are set."""
+    if scene.control == SceneConfig.control:
+        scene = replace(scene, control=checkpoint.control or scene.control)
+    if scene.image_size == SceneConfig.image_size:
+        scene = replace(scene, image_size=checkpoint.image_size)
+    return scene
 
 
 def _record_name(checkpoint: Checkpoint, plan: EvaluationPlan, demonstrations: tuple[str, str] | None) -> str:

@@ -16,10 +16,11 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
-from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 
-from gym_deltaco import CONTROL_FPS, ENV_ID
-from gym_deltaco.env import ACTION_NAMES, STATE_NAMES, Observation, PickPlaceEnv
+from gym_deltaco import ENV_ID
+from gym_deltaco.control import control_of
+from gym_deltaco.env import Observation, PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.simulation import Simulation
@@ -43,8 +44,8 @@ class DeltacoEnv(EnvConfig):
         task: Tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_a_validation,
             scenario_b_test, scenario_b_train, all, ...), or indices and ranges, such as 4,50-73. The paper's
             tasks are 0 to 299, those by color and shape 1000 to 1479.
-        fps: Frames per second of the videos of episodes. The simulation has no frame rate of its own.
-        scene: Settings of the scenes, such as --env.scene.ambiguity=object.
+        fps: Frames per second of the videos of episodes; 0 for that of the control, 24 or 30.
+        scene: Settings of the scenes, such as --env.scene.ambiguity=object or --env.scene.control=joints.
         render_size: Height and width of videos, px. LeRobot records up to 10 episodes of every task, and a
             frame of 256 pixels takes several times as long to render as one of 96.
         paraphrases: CSV file with sentences for the tasks. The instruction of an episode is then one of its
@@ -55,7 +56,7 @@ class DeltacoEnv(EnvConfig):
     """
 
     task: str = "scenario_a_test"
-    fps: int = CONTROL_FPS
+    fps: int = 0
     scene: SceneConfig = field(default_factory=SceneConfig)
     render_size: int = 96
     paraphrases: str | None = None
@@ -75,12 +76,18 @@ class DeltacoEnv(EnvConfig):
             logger.error("%s", error)
             raise
         # The environment's names, and what LeRobot calls them in datasets and policies.
-        self.features_map = {"pixels": OBS_IMAGE, "agent_pos": OBS_STATE, ACTION: ACTION}
-        size = self.scene.image_size
+        control, size = self.scene.interface, self.scene.image_size
+        self.fps = self.fps or control.fps
+        images = [f"pixels/{name}" for name in control.cameras] or ["pixels"]
+        self.features_map = {
+            **dict(zip(images, control.camera_keys, strict=True)),
+            "agent_pos": OBS_STATE,
+            ACTION: ACTION,
+        }
         self.features = {
-            "pixels": PolicyFeature(FeatureType.VISUAL, (size, size, 3)),
-            "agent_pos": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
-            ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),)),
+            **dict.fromkeys(images, PolicyFeature(FeatureType.VISUAL, (size, size, 3))),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (len(control.state_names),)),
+            ACTION: PolicyFeature(FeatureType.ACTION, (len(control.action_names),)),
         }
 
     @property
@@ -182,19 +189,26 @@ def check_policy_fits(
     Raises:
         ValueError: The policy was trained on something else.
     """
-    cameras = list(policy.image_features)
-    camera = rename_map.get(OBS_IMAGE, OBS_IMAGE)
+    control, cameras = scene.interface, list(policy.image_features)
+    trained_for = control_of(cameras)
+    if trained_for not in (None, scene.control):
+        raise ValueError(
+            f"The policy was trained with the control {trained_for!r}, but that of the environment is "
+            f"{scene.control!r}. Set `scene.control` to {trained_for}."
+        )
+    there = [rename_map.get(name, name) for name in control.camera_keys]
+    known = [camera for camera in there if camera in cameras]
     # Vision-language-action models (which have this option) leave out cameras that are not there, and keep
     # the image size of the model that they were fine-tuned from, whatever the dataset's was.
     can_lack_cameras = hasattr(policy, "empty_cameras")
-    if camera not in cameras or (len(cameras) > 1 and not can_lack_cameras):
-        example = json.dumps({OBS_IMAGE: cameras[0]}) if cameras else "{}"
+    if not known or (len(known) < len(cameras) and not can_lack_cameras):
+        example = json.dumps({control.camera_keys[0]: cameras[0]}) if cameras else "{}"
         raise ValueError(
             f"The policy was trained on images of {', '.join(cameras) or 'no camera'}, but the benchmark's "
-            f"environment has {camera} alone. Evaluate it where it was trained for, or, if it is the same "
-            f"camera, rename it: --rename_map='{example}'."
+            f"environment has {', '.join(there)} alone. Evaluate it where it was trained for, or, if it is "
+            f"the same camera, rename it: --rename_map='{example}'."
         )
-    trained_on = policy.image_features[camera].shape[-1]
+    trained_on = policy.image_features[known[0]].shape[-1]
     if trained_on != scene.image_size and not can_lack_cameras:
         raise ValueError(
             f"The policy was trained on images of {trained_on} pixels, but those of the environment have "
@@ -202,7 +216,10 @@ def check_policy_fits(
         )
     # Models that pad the state accept any that is short enough.
     state = None if hasattr(policy, "max_state_dim") else policy.robot_state_feature
-    sizes = ((OBS_STATE, state, len(STATE_NAMES)), (ACTION, policy.action_feature, len(ACTION_NAMES)))
+    sizes = (
+        (OBS_STATE, state, len(control.state_names)),
+        (ACTION, policy.action_feature, len(control.action_names)),
+    )
     for name, feature, size in sizes:
         if feature is not None and tuple(feature.shape) != (size,):
             raise ValueError(

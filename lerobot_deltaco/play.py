@@ -114,7 +114,7 @@ class Player:
         self._folder, self._numbers = folder, itertools.count()
         self._recorded: dict[tuple[int, int], Demonstration] = {}
         self.uses = _possible_uses(self._config)
-        self.n_steps = self._scene.episode_length
+        self.n_steps = self._scene.n_steps
 
     def default_choice(self, task_id: int, seed: int) -> Choice:
         """Returns a scene with a demonstration and an instruction that fit it."""

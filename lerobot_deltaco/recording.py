@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gym_deltaco.control import control_of
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.layout import Layout
@@ -80,7 +81,8 @@ def record_episode(
     def record(envs: Sequence[PickPlaceEnv], observations: Sequence[Any]) -> None:
         env = envs[0]
         if not first:
-            first.update(observed=observations[0]["pixels"], layout=env.scene.layout)
+            observed = first_camera(observations[0], loaded.policy.config)
+            first.update(observed=observed, layout=env.scene.layout)
         image = env.render()
         assert image is not None
         frames.append(image)
@@ -126,7 +128,7 @@ def record_demonstration(
             raise RuntimeError(f"The expert failed {_EXPERT_ATTEMPTS} times at: {task.instruction}")
     finally:
         env.close()
-    images = np.stack([step.observation["pixels"] for step in steps])
+    images = np.stack([first_camera(step.observation, config) for step in steps])
     frames = torch.from_numpy(images).permute(0, 3, 1, 2)
     pick_state = None
     if config.gripper_index is not None and config.state_dim:
@@ -143,14 +145,21 @@ def record_demonstration(
     )
 
 
+def first_camera(observation: Mapping[str, Any], config: TaskConditionedConfig) -> NDArray[np.uint8]:
+    """Returns the image of a policy's first camera in an observation of the environment, (H, W, 3)."""
+    pixels = observation["pixels"]
+    return pixels[config.cameras[0].rpartition(".")[-1]] if isinstance(pixels, Mapping) else pixels
+
+
 def benchmark_scene(config: Any) -> SceneConfig:
-    """Returns the benchmark's scene with the image size that a policy was trained on.
+    """Returns the benchmark's scene with the image size and the control that a policy was trained on.
 
     Raises:
         ValueError: The policy is not one for the benchmark.
     """
     sizes = [feature.shape[-1] for feature in config.image_features.values()]
-    scene = SceneConfig(image_size=sizes[0]) if sizes else SceneConfig()
+    control = control_of(config.image_features) or SceneConfig.control
+    scene = SceneConfig(image_size=sizes[0], control=control) if sizes else SceneConfig()
     check_policy_fits(config, scene)
     return scene
 

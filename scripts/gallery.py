@@ -127,6 +127,22 @@ def _captioned(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     return np.asarray(canvas)
 
 
+def draw_joint_control(out: Path) -> None:
+    """Draws an episode with joint control, at the end of each stage, as both cameras see it."""
+    with closing(PickPlaceEnv(scene=SceneConfig(control="joints", image_size=160))) as env:
+        steps = list(expert_episode(env, EPISODE_TASKS[0], episode_seed(0, "train", EPISODE_TASKS[0], 0)))
+        fps = env.metadata["render_fps"]
+    ends = {step.stage: (number, step) for number, step in enumerate(steps)}
+    figure, axes = _grid(2, len(ends), (1.75 * len(ends), 4))
+    for column, (number, step) in zip(axes.T, ends.values(), strict=True):
+        for ax, image in zip(column, step.observation["pixels"].values(), strict=True):
+            ax.imshow(image)
+        column[0].set_title(f"{number / fps:.1f} s\n{step.stage.value}", loc="left", fontsize=7)
+    for ax, camera in zip(axes[:, 0], step.observation["pixels"], strict=True):
+        ax.set_ylabel(camera)
+    _save(figure, out / "joint_control.png")
+
+
 def draw_ambiguity(out: Path) -> None:
     """Draws both ambiguity schemes: first and last image of a demonstration, and a new scene."""
     figure, axes = _grid(2, 3, (8.4, 7.2))
@@ -180,7 +196,7 @@ def _demonstration(env: PickPlaceEnv, task_id: int) -> tuple[NDArray[np.uint8], 
         env.reset(seed=seed, options={"task_id": task_id})
         if _is_in_view(env.scene.layout):
             images = _expert_images(env, task_id, seed)
-            if len(images) <= env.scene_config.episode_length:
+            if len(images) <= env.scene_config.n_steps:
                 return images[0], images[-1], env.scene.layout
     raise RuntimeError(f"No demonstration of task {task_id} in {N_TRIES} tries.")
 
@@ -236,7 +252,7 @@ def main(arguments: list[str] | None = None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     mpl.use("Agg")
     with mpl.rc_context({"axes.titlesize": 9, "axes.labelsize": 9}):
-        for draw in (draw_objects, draw_scenes, draw_episodes, draw_ambiguity):
+        for draw in (draw_objects, draw_scenes, draw_episodes, draw_ambiguity, draw_joint_control):
             draw(out)
 
 

@@ -61,14 +61,15 @@ def episodes():
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory, episodes):
-    """The episodes in three shards, which are written in another order."""
+    """The episodes in three shards, which are written in another order, and numbered afterwards."""
     root = tmp_path_factory.mktemp("ours") / "dataset"
     for shard in (2, 0, 1):
         first = SHARDS[shard].start
         parts = [episodes[i] for i in SHARDS[shard]]
         assert not writer.is_written(root, shard)
-        writer.write_shard(root, shard, iter(parts), FEATURES, FPS, first, sum(LENGTHS[:first]))
+        writer.write_shard(root, shard, iter(parts), FEATURES, FPS, first, 6 * first)
         assert writer.is_written(root, shard)
+    writer.number_frames(root, len(SHARDS))
     writer.write_metadata(root, FEATURES, FPS, ROBOT_TYPE, TASKS)
     return root
 

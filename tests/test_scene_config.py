@@ -9,7 +9,8 @@ from gym_deltaco.scene_config import DEFAULT_SCENE, SceneConfig
 
 def test_equal_settings_are_equal_and_immutable():
     assert SceneConfig(objects="random:100") == SceneConfig(objects="random:100") != DEFAULT_SCENE
-    assert len({SceneConfig(), DEFAULT_SCENE}) == 1
+    assert len({SceneConfig(), DEFAULT_SCENE, SceneConfig(episode_length=30)}) == 1
+    assert [SceneConfig(control=control).n_steps for control in ("position", "joints")] == [30, 240]
     with pytest.raises(dataclasses.FrozenInstanceError):
         DEFAULT_SCENE.image_size = 96
 
@@ -21,6 +22,7 @@ def test_equal_settings_are_equal_and_immutable():
         ("objects", ["some", "random:9", ["all"], None], r"`objects` must be .*random:N"),
         ("adversarial_probability", [1.1, -0.1, float("nan"), "0.6", None, True], "must be between 0 and 1"),
         ("adversarial_draw", ["both", None], r"must be one of each, scene\. Got "),
+        ("control", ["torque", None], r"must be one of position, joints\. Got "),
         ("image_size", [7, 4097, 48.0, "48", True], r"must be an integer from 8 to 4096\. Got "),
         ("episode_length", [0, 10**6, 30.0], r"must be an integer from 1 to 100000\. Got "),
     ],

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from gym_deltaco import kinematics as kin
 from gym_deltaco.arm_meshes import BASE_MESH, LINK_MESHES
-from gym_deltaco.simulation import Box, Contact, Link, Simulation
+from gym_deltaco.simulation import TIME_STEP, Box, Contact, Link, Simulation
 
 # Limits of the end effector's position
 POSITION_LOW = np.array([0.4, -0.2, -0.34])  # m
@@ -21,6 +21,12 @@ FINGER_WIDTH = 0.024  # m
 MOVE_STEPS = 10  # physics steps of a control step
 GRIP_STEPS = 75  # physics steps of a control step in which the gripper opens or closes
 _RAMP_STEPS = 10  # physics steps over which the joints' targets are interpolated
+JOINT_STEPS = 8  # physics steps of a control step with joint control, 1/30 s
+MAX_JOINT_SPEED = 3.0  # rad/s, with joint control
+MAX_GRIPPER_SPEED = 2.5  # openings/s, with joint control
+# Limits of the joints, with joint control
+JOINT_LOW = np.array([-np.pi, -1.88, -1.6, -np.pi, -2.15, -np.pi])  # rad
+JOINT_HIGH = np.array([np.pi, 1.99, 2.15, np.pi, 1.75, np.pi])  # rad
 
 _ARM_JOINTS = list(range(6))
 _FINGER_JOINTS = [6, 7]
@@ -75,15 +81,15 @@ _LINKS = (
 
 
 class Arm:
-    """The arm in one scene of a simulation, with its gripper pointing down.
+    """The arm in one scene of a simulation.
 
-    Only the gripper has collision boxes: the links above it stay clear of the table in every pose.
+    Only the gripper has collision boxes: while it points down, the links above it stay clear of the table.
 
     Attributes:
         body: Id of its body in the simulation.
         joints: Angles of its six joints, (6,), rad.
         position: Position of its end effector, (3,), m.
-        is_open: State of its gripper, as commanded.
+        is_open: State of its gripper, as commanded: whether it is more open than closed.
     """
 
     finger_links = (6, 7)
@@ -93,10 +99,11 @@ class Arm:
         self.body = simulation.add_articulated_body(BASE_MESH, _LINKS, kin.BASE_POSITION, _SURFACE)
         self._joint_targets = kin.REST_JOINTS.copy()
         self.is_open = True
+        self._opening_target = 1.0
         simulation.set_joint_positions(self.body, [*kin.REST_JOINTS, FINGER_OPEN, -FINGER_OPEN])
         simulation.mirror_joints(self.body, (6, 7), axis=(0, 1, 0), max_force=200.0)
         self._drive_arm(kin.REST_JOINTS.tolist())
-        self._drive_fingers()
+        self._drive_fingers(FINGER_OPEN)
         self._read()
 
     def command(self, position: ArrayLike, is_open: bool) -> None:
@@ -111,13 +118,37 @@ class Arm:
         n_steps = MOVE_STEPS if is_open == self.is_open else GRIP_STEPS
         if is_open != self.is_open:
             self.is_open = is_open
-            self._drive_fingers()
+            self._drive_fingers(FINGER_OPEN if is_open else FINGER_CLOSED)
         targets = (start + (goal - start) * _RAMP[:, None]).tolist()
         for step in range(n_steps):
             if step < _RAMP_STEPS:
                 self._drive_arm(targets[step])
             self._simulation.step()
         self._read()
+
+    def command_joints(self, joints: NDArray[np.float64], opening: float) -> None:
+        """Runs one control step of 1/30 s: moves the joints and the fingers, no faster than they can.
+
+        Args:
+            joints: Target angles of the six joints, (6,), rad; clipped to their limits.
+            opening: Target opening of the gripper; clipped to 0..1.
+        """
+        target = np.array([*np.clip(joints, JOINT_LOW, JOINT_HIGH), np.clip(opening, 0, 1)])
+        start = np.array([*self._joint_targets, self._opening_target])
+        goal = start + np.clip(target - start, -_MAX_MOTION, _MAX_MOTION)
+        self._joint_targets, self._opening_target = goal[:6], float(goal[6])
+        self.is_open = self._opening_target > 0.5
+        for *angles, part in (start + (goal - start) * _PROGRESS[:, None]).tolist():
+            self._drive_arm(angles)
+            self._drive_fingers(FINGER_CLOSED + part * (FINGER_OPEN - FINGER_CLOSED))
+            self._simulation.step()
+        self._read()
+
+    @property
+    def opening(self) -> float:
+        """Measured opening of the gripper: 0 closed, 1 open."""
+        left, right = self._simulation.joint_positions(self.body, _FINGER_JOINTS)
+        return float(((left - right) / 2 - FINGER_CLOSED) / (FINGER_OPEN - FINGER_CLOSED))
 
     def _read(self) -> None:
         """Updates `joints` and `position` from the simulation."""
@@ -127,8 +158,7 @@ class Arm:
     def _drive_arm(self, targets: list[float]) -> None:
         self._simulation.drive_joints(self.body, _ARM_JOINTS, targets, _ARM_FORCES, _ARM_GAINS)
 
-    def _drive_fingers(self) -> None:
-        width = FINGER_OPEN if self.is_open else FINGER_CLOSED
+    def _drive_fingers(self, width: float) -> None:
         self._simulation.drive_joints(
             self.body, _FINGER_JOINTS, [width, -width], _FINGER_FORCES, _FINGER_GAINS
         )
@@ -143,3 +173,6 @@ def _ramp(time: float) -> float:
 
 
 _RAMP = np.array([_ramp(step / _RAMP_STEPS) for step in range(1, _RAMP_STEPS + 1)])
+# Largest motion of the joints (rad) and of the gripper in a control step of joint control, and its progress
+_MAX_MOTION = np.array([*[MAX_JOINT_SPEED] * 6, MAX_GRIPPER_SPEED]) * JOINT_STEPS * TIME_STEP
+_PROGRESS = np.arange(1, JOINT_STEPS + 1) / JOINT_STEPS

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from gym_deltaco import CONTROL_FPS, pybullet_import
 from gym_deltaco import kinematics as kin
+from gym_deltaco.arm import JOINT_HIGH, JOINT_LOW
+from gym_deltaco.control import CONTROLS
 from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene import Scene
 from gym_deltaco.scene_config import DEFAULT_SCENE, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, SceneConfig
@@ -20,18 +22,25 @@ from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import Task, get_task
 
 ACTION_SCALE = 0.1  # m, motion of the end effector for an action of 1
-STATE_NAMES = [
-    *("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate"),
-    *("end_effector_x", "end_effector_y", "end_effector_z", "gripper_open"),
-]
+STATE_NAMES = CONTROLS["position"].state_names
+ACTION_NAMES = CONTROLS["position"].action_names
 N_JOINTS = 6  # whose angles come first in the state
-ACTION_NAMES = ["delta_x", "delta_y", "delta_z", "gripper"]
 
-# Bounds of `agent_pos`. Joints are within half a turn of their rest position; 0.001 allows for rounding.
-_STATE_LOW = np.array([*(kin.REST_JOINTS - np.pi), *(kin.SHOULDER - kin.REACH), 0.0]) - 1e-3
-_STATE_HIGH = np.array([*(kin.REST_JOINTS + np.pi), *(kin.SHOULDER + kin.REACH), 1.0]) + 1e-3
+# Bounds of `agent_pos`. With control "position", joints are within half a turn of their rest position, and
+# 0.001 allows for rounding; with "joints", motors overshoot a little.
+_STATE_BOUNDS = {
+    "position": (
+        np.array([*(kin.REST_JOINTS - np.pi), *(kin.SHOULDER - kin.REACH), 0.0]) - 1e-3,
+        np.array([*(kin.REST_JOINTS + np.pi), *(kin.SHOULDER + kin.REACH), 1.0]) + 1e-3,
+    ),
+    "joints": (np.array([*JOINT_LOW, 0.0]) - 0.1, np.array([*JOINT_HIGH, 1.0]) + 0.1),
+}
+_ACTION_BOUNDS = {
+    "position": (np.full(len(ACTION_NAMES), -1.0), np.full(len(ACTION_NAMES), 1.0)),
+    "joints": (np.array([*JOINT_LOW, 0.0]), np.array([*JOINT_HIGH, 1.0])),
+}
 
-Observation = dict[str, NDArray[Any]]
+Observation = dict[str, Any]
 
 
 class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
@@ -66,6 +75,20 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     at less than 12.5 rad/s), those of a real WidowX 250 at about 3 rad/s.
 
     An episode is truncated after `scene.episode_length` steps; it never terminates.
+
+    ## Joint control
+
+    With `scene.control="joints"`, the same tasks and scenes are controlled as a robot is:
+
+    - `pixels` is a dictionary of two images, `front` and `wrist`, of a camera that is mounted on the hand.
+    - `agent_pos` (7,) are the measured angles of the joints (rad) and the measured opening of the gripper
+      (0 closed, 1 open). An action (7,) are their targets, clipped to the joints' limits. Their names are
+      `waist.pos`, ..., `gripper.pos`.
+    - A step is always 8 physics steps of 1/240 s: the rate of 30 Hz, timestamps and speeds are real. In a
+      step, joints move evenly towards their targets, at 3 rad/s at most (a WidowX 250 can do about that), and
+      the gripper takes at least 0.4 s to open or close.
+    - An episode has 240 steps (8 s) by default.
+    - The gripper can be turned in any direction. Only the hand and the fingers collide with things.
 
     ## Reward and success
 
@@ -136,16 +159,16 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.render_size = render_size
         self.instructions = instructions
         self._instruction: str | None = None  # of the current episode; None is the task's template
-        image_shape = (scene.image_size, scene.image_size, 3)
+        self.metadata = {**self.metadata, "render_fps": scene.interface.fps}
+        image = spaces.Box(0, 255, (scene.image_size, scene.image_size, 3), np.uint8)
+        cameras = scene.interface.cameras
         self.observation_space: gym.Space[Any] = spaces.Dict(
             {
-                "pixels": spaces.Box(0, 255, image_shape, np.uint8),
-                "agent_pos": spaces.Box(
-                    _STATE_LOW.astype(np.float32), _STATE_HIGH.astype(np.float32), dtype=np.float32
-                ),
+                "pixels": spaces.Dict(dict.fromkeys(cameras, image)) if cameras else image,
+                "agent_pos": _box(_STATE_BOUNDS[scene.control]),
             }
         )
-        self.action_space = spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
+        self.action_space = _box(_ACTION_BOUNDS[scene.control])
         # The simulator is connected at the first reset, so that each worker process has its own.
         self._simulation: Simulation | None = None
         self._scene: Scene | None = None
@@ -157,7 +180,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     @property
     def _max_episode_steps(self) -> int:
         """Number of steps of an episode, where LeRobot's rollout looks for it."""
-        return self.scene_config.episode_length
+        return self.scene_config.n_steps
 
     @property
     def task_description(self) -> str:
@@ -227,7 +250,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         """Moves the arm.
 
         Args:
-            action: Real numbers, (4,); clipped to [-1, 1].
+            action: Real numbers, (4,), or (7,) with joint control; clipped to the action space.
 
         Returns:
             Observation, reward (1.0 once the task has succeeded), terminated (False), truncated (True from
@@ -240,14 +263,17 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """
         scene = self.scene
-        motion, gripper = np.split(_checked_action(action), [3])
-        scene.command(scene.arm.position + ACTION_SCALE * motion, is_open=bool(gripper[0] > 0))
+        *motion, gripper = self._checked_action(action)
+        if self.scene_config.control == "joints":
+            scene.command_joints(np.array(motion), gripper)
+        else:
+            scene.command(scene.arm.position + ACTION_SCALE * np.array(motion), is_open=bool(gripper > 0))
         self._n_steps += 1
         for index in range(len(scene.bodies)):
             if scene.is_grasped(index):
                 self._grasped_object = index
         info = self._info()
-        is_truncated = self._n_steps >= self.scene_config.episode_length
+        is_truncated = self._n_steps >= self.scene_config.n_steps
         return self._observation(), float(info["is_success"]), False, is_truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -269,14 +295,27 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             )
 
     def _observation(self) -> Observation:
-        arm = self.scene.arm
-        # The waist, and the wrist with it, may turn around the base any number of times.
-        joints = (arm.joints - kin.REST_JOINTS + np.pi) % (2 * np.pi) - np.pi + kin.REST_JOINTS
-        state = np.concatenate([joints, arm.position, [arm.is_open]])
-        return {
-            "pixels": self.scene.render(self.scene_config.image_size),
-            "agent_pos": state.astype(np.float32),
-        }
+        scene, arm, size = self.scene, self.scene.arm, self.scene_config.image_size
+        if self.scene_config.control == "joints":
+            state = np.array([*arm.joints, arm.opening])
+            pixels: Any = {"front": scene.render(size), "wrist": scene.render_wrist(size)}
+        else:
+            # The waist, and the wrist with it, may turn around the base any number of times.
+            joints = (arm.joints - kin.REST_JOINTS + np.pi) % (2 * np.pi) - np.pi + kin.REST_JOINTS
+            state = np.concatenate([joints, arm.position, [arm.is_open]])
+            pixels = scene.render(size)
+        return {"pixels": pixels, "agent_pos": state.astype(np.float32)}
+
+    def _checked_action(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Checks an action and clips it to the action space."""
+        low, high = _ACTION_BOUNDS[self.scene_config.control]
+        values = np.asarray(action)
+        if values.shape != low.shape:
+            names = "x, y, z and gripper" if len(low) == len(ACTION_NAMES) else "6 joints and gripper"
+            raise ValueError(f"An action must have shape {low.shape}: {names}. Got {values.shape}.")
+        if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+            raise ValueError(f"An action must consist of real, finite numbers. Got {action!r}.")
+        return np.clip(values.astype(np.float64), low, high)
 
     def _info(self) -> dict[str, Any]:
         scene, layout = self.scene, self.scene.layout
@@ -301,14 +340,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         }
 
 
-def _checked_action(action: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Checks an action and clips it to [-1, 1]."""
-    values = np.asarray(action)
-    if values.shape != (len(ACTION_NAMES),):
-        raise ValueError(f"An action must have shape (4,): x, y, z and gripper. Got {values.shape}.")
-    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
-        raise ValueError(f"An action must consist of real, finite numbers. Got {action!r}.")
-    return np.clip(values.astype(np.float64), -1.0, 1.0)
+def _box(bounds: tuple[NDArray[np.float64], NDArray[np.float64]]) -> Any:
+    low, high = bounds
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
 def _check_instructions(instructions: Mapping[int, Sequence[str]]) -> None:

@@ -10,9 +10,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_deltaco import EXPERT_NOISE
-from gym_deltaco.arm import FINGERTIP_OFFSET
+from gym_deltaco.arm import FINGER_OPEN, FINGER_THICKNESS, FINGERTIP_OFFSET, POSITION_HIGH, POSITION_LOW
 from gym_deltaco.env import ACTION_SCALE, Observation, PickPlaceEnv
-from gym_deltaco.workspace import CONTAINER_FLOOR, CONTAINER_HALF_EXTENTS, TRAY_FLOOR
+from gym_deltaco.kinematics import inverse
+from gym_deltaco.workspace import (
+    CONTAINER_FLOOR,
+    CONTAINER_HALF_EXTENTS,
+    TRAY_CENTER,
+    TRAY_FLOOR,
+    TRAY_HALF_EXTENTS,
+    TRAY_WALL_THICKNESS,
+)
+
+
+class Stage(Enum):
+    """Stage of the expert's plan."""
+
+    REACH = "move above the object"
+    DESCEND = "descend around it"
+    GRASP = "close the gripper"
+    LIFT = "lift the object straight up"
+    CARRY = "move above the container"
+    LOWER = "lower the object into it"
+    RELEASE = "open the gripper"
+    REST = "hold still"
+
 
 OPEN, CLOSED = 1.0, -1.0
 
@@ -34,25 +56,26 @@ _RELEASE_CLEARANCE = 0.012  # lowest point of the object above the container's f
 _RELEASE_TOLERANCE = 0.025  # largest error in z at the release
 _RETREAT = 0.05  # motion of the gripper upwards after the release
 
-
-class Stage(Enum):
-    """Stage of the expert's plan."""
-
-    REACH = "move above the object"
-    DESCEND = "descend around it"
-    GRASP = "close the gripper"
-    LIFT = "lift the object straight up"
-    CARRY = "move above the container"
-    LOWER = "lower the object into it"
-    RELEASE = "open the gripper"
-    REST = "hold still"
+# With joint control. Ranges are those from which the values of an episode are drawn.
+_SPEED = (0.16, 0.42)  # m/s, of the end effector
+_ACCELERATION = (0.8, 1.6)  # m/s²
+_GRIPPER_SPEED = (1.3, 2.5)  # openings/s
+_CAREFUL = {Stage.DESCEND: 0.6, Stage.LOWER: 0.6, Stage.CARRY: 0.85}  # fraction of the speed
+_FIRST_PAUSE, _LAST_PAUSE = (0, 12), (5, 20)  # steps before the first motion, and after the success
+_N_PAUSES = 0.8  # mean number of other pauses
+_PAUSE_START, _PAUSE = (12, 120), (8, 36)  # steps
+_GRIPPER_WAIT = 2  # steps after the gripper's command has reached its end
+# Largest distance from the tray's middle in x at which the open gripper's fingers are between its walls
+_BETWEEN_WALLS = TRAY_HALF_EXTENTS[0] - TRAY_WALL_THICKNESS - FINGER_OPEN - FINGER_THICKNESS - 0.002
+_JOINT_NOISE = 0.04  # rad, for a noise of 1
+_NOISE_DECAY = 0.9  # of the noise on the joints, in a step
 
 
 class Step(NamedTuple):
     """One step of an episode."""
 
     observation: Observation  # before the action
-    action: NDArray[np.float32]  # (4,)
+    action: NDArray[np.float32]  # (4,), or (7,) with joint control
     reward: float
     info: dict[str, Any]  # after the action
     stage: Stage
@@ -65,15 +88,19 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EX
         env: The environment, without wrappers.
         task_id: Index of the task, 0..299, or 1000..1479 for tasks by color and shape.
         seed: Seed of the scene, the drop point and the noise.
-        noise: Standard deviation of the noise on the first three numbers of the actions.
+        noise: Standard deviation of the noise on the first three numbers of the actions; with joint control,
+            that on joints in units of 0.04 rad.
 
     Yields:
-        Each step of the episode.
+        Each step of the episode. With joint control, it ends shortly after its success.
     """
     observation, _ = env.reset(seed=seed, options={"task_id": task_id})
     # The expert's draws must not repeat those of the scene.
-    expert = Expert(env, np.random.default_rng((seed, 1)), noise)
-    for _ in range(env.scene_config.episode_length):
+    kind = JointExpert if env.scene_config.control == "joints" else Expert
+    expert = kind(env, np.random.default_rng((seed, 1)), noise)
+    for _ in range(env.scene_config.n_steps):
+        if expert.is_done:
+            break
         action = expert.act()
         next_observation, reward, _, _, info = env.step(action)
         yield Step(observation, action, reward, info, expert.stage)
@@ -93,7 +120,13 @@ class Expert:
             command of the gripper has no noise.
         target_object: Number of the object to pick, as in the environment's info; None for the task's target.
         target_container: Number of the container to place it in; None for the task's target.
+
+    Attributes:
+        stage: Stage of the last action.
+        is_done: Whether the episode may end before its last step.
     """
+
+    is_done = False
 
     def __init__(
         self,
@@ -165,3 +198,88 @@ class Expert:
         if bottom < TRAY_FLOOR + _LIFTED_CLEARANCE:
             return Stage.LIFT, np.array([*gripper[:2], carry_z]), CLOSED
         return Stage.CARRY, np.array([*self._drop_xy, carry_z]), CLOSED
+
+
+class JointExpert(Expert):
+    """The expert with joint control: smooth, at its own speed in each episode, with pauses as people make.
+
+    The end effector accelerates and brakes evenly towards the goal of each stage, and stands still while the
+    gripper closes or opens. The joints' targets have correlated noise.
+
+    Args:
+        env: Environment with joint control, already reset.
+        rng: Source of the drop point, the speeds, the pauses and the noise.
+        noise: Standard deviation of the noise on the joints, in units of 0.04 rad.
+        target_object: As for `Expert`.
+        target_container: As for `Expert`.
+    """
+
+    def __init__(
+        self,
+        env: PickPlaceEnv,
+        rng: np.random.Generator,
+        noise: float = EXPERT_NOISE,
+        target_object: int | None = None,
+        target_container: int | None = None,
+    ) -> None:
+        super().__init__(env, rng, noise, target_object, target_container)
+        self._step_time = 1 / env.scene_config.interface.fps
+        self._speed, self._acceleration, gripper_speed = (
+            rng.uniform(*limits) for limits in (_SPEED, _ACCELERATION, _GRIPPER_SPEED)
+        )
+        self._gripper_step = gripper_speed * self._step_time
+        starts = rng.integers(*_PAUSE_START, rng.poisson(_N_PAUSES))
+        self._pauses = [(0, rng.integers(*_FIRST_PAUSE))]
+        self._pauses += [(start, start + rng.integers(*_PAUSE)) for start in starts]
+        self._steps_left = int(rng.integers(*_LAST_PAUSE))  # after the success
+        self._n_steps = 0
+        self._position = self._goal = self._scene.arm.position
+        self._velocity = np.zeros(3)
+        self._joints = self._scene.arm.joints
+        self._joint_noise = np.zeros(len(self._joints))
+        self._opening, self._command, self._wait = 1.0, OPEN, 0
+
+    def act(self) -> NDArray[np.float32]:
+        """Returns the next action, (7,): targets of the joints, rad, with noise, and of the gripper, 0..1."""
+        is_paused = any(start <= self._n_steps < end for start, end in self._pauses)
+        self._n_steps += 1
+        if not is_paused:
+            self._advance()
+        if self._scene.container_of(self._target) == self._container:
+            self._steps_left -= 1
+            self.is_done = self._steps_left < 0
+        # A pause brakes, too.
+        self._move(self._position if is_paused or self._wait else self._goal)
+        self._joints = inverse(self._position, near=self._joints)
+        fresh = self._rng.normal(0, self._noise * _JOINT_NOISE, len(self._joints))
+        self._joint_noise = _NOISE_DECAY * self._joint_noise + np.sqrt(1 - _NOISE_DECAY**2) * fresh
+        return np.array([*(self._joints + self._joint_noise), self._opening], dtype=np.float32)
+
+    def _advance(self) -> None:
+        """Plans, or waits for the gripper."""
+        end = float(self._command == OPEN)
+        self._opening += float(np.clip(end - self._opening, -self._gripper_step, self._gripper_step))
+        if self._wait:
+            self._wait -= self._opening == end
+            return
+        self.stage, goal, command = self._plan(self._scene.arm.position)
+        self._goal = np.clip(goal, POSITION_LOW, POSITION_HIGH)
+        self._goal[0] = TRAY_CENTER[0] + np.clip(goal[0] - TRAY_CENTER[0], -_BETWEEN_WALLS, _BETWEEN_WALLS)
+        if command != self._command:
+            self._command, self._wait = command, _GRIPPER_WAIT
+
+    def _move(self, goal: NDArray[np.float64]) -> None:
+        """Moves the commanded position towards a goal for one step."""
+        offset = goal - self._position
+        distance = float(np.linalg.norm(offset))
+        speed = min(
+            self._speed * _CAREFUL.get(self.stage, 1.0),
+            np.sqrt(2 * self._acceleration * distance),
+            0.5 * distance / self._step_time,
+        )
+        change = offset * speed / max(distance, 1e-9) - self._velocity
+        largest = self._acceleration * self._step_time
+        self._velocity = self._velocity + change * min(
+            1.0, largest / max(float(np.linalg.norm(change)), 1e-9)
+        )
+        self._position = self._position + self._velocity * self._step_time

@@ -14,6 +14,7 @@ from gym_deltaco.fixtures import (
     table_mesh,
     tray_mesh,
 )
+from gym_deltaco.kinematics import forward
 from gym_deltaco.layout import Layout
 from gym_deltaco.simulation import Contact, Pose, Simulation
 from gym_deltaco.workspace import (
@@ -23,6 +24,7 @@ from gym_deltaco.workspace import (
     DROP_HEIGHT,
     TRAY_CENTER,
     TRAY_FLOOR,
+    WRIST_CAMERA,
 )
 
 OBJECT_MASS = 0.012  # kg
@@ -95,6 +97,16 @@ class Scene:
         self.arm.command(position, is_open)
         self._read()
 
+    def command_joints(self, joints: NDArray[np.float64], opening: float) -> None:
+        """Runs one control step with joint control.
+
+        Args:
+            joints: Target angles of the six joints, (6,), rad.
+            opening: Target opening of the gripper, 0..1.
+        """
+        self.arm.command_joints(joints, opening)
+        self._read()
+
     def place(self, index: int, position: ArrayLike, yaw: float = 0.0) -> None:
         """Drops an object from a position of its center, (3,), m, upright and turned by `yaw`, rad."""
         self._simulation.move(self.bodies[index], position, yaw)
@@ -103,6 +115,10 @@ class Scene:
     def render(self, size: int) -> NDArray[np.uint8]:
         """Returns the image of the benchmark's camera, (size, size, 3) uint8."""
         return self._simulation.render(CAMERA, size)
+
+    def render_wrist(self, size: int) -> NDArray[np.uint8]:
+        """Returns the image of the camera on the wrist, (size, size, 3) uint8."""
+        return self._simulation.render_hand(WRIST_CAMERA, *forward(self.arm.joints), size)
 
     def object_pose(self, index: int) -> Pose:
         """Returns the pose and speed of the center of an object."""

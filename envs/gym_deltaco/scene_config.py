@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gym_deltaco import EPISODE_STEPS
+from gym_deltaco.control import CONTROLS, Control
 from gym_deltaco.object_sets import select_objects
 from gym_deltaco.tasks import get_task
 
@@ -30,7 +30,10 @@ class SceneConfig:
         adversarial_draw: Scope of a draw with that probability: "each" distractor; or the whole "scene", as
             in the authors' code.
         image_size: Height and width of the policy's image, 8..4096 px.
-        episode_length: Number of steps of an episode, 1..100000.
+        episode_length: Number of steps of an episode, 1..100000; None for the control's default, 30 steps
+            with "position" and 240 with "joints".
+        control: Control of the arm: "position", the benchmark's, changes the end effector's position;
+            "joints" takes positions of the joints at 30 Hz, as LeRobot's robots do.
 
     Raises:
         ValueError: A setting is invalid; the message says what is valid.
@@ -41,10 +44,15 @@ class SceneConfig:
     adversarial_probability: float = 0.6
     adversarial_draw: str = "each"
     image_size: int = 48
-    episode_length: int = EPISODE_STEPS
+    episode_length: int | None = None
+    control: str = "position"
 
     def __post_init__(self) -> None:
-        for name, valid in (("ambiguity", AMBIGUITIES), ("adversarial_draw", ADVERSARIAL_DRAWS)):
+        for name, valid in (
+            ("ambiguity", AMBIGUITIES),
+            ("adversarial_draw", ADVERSARIAL_DRAWS),
+            ("control", CONTROLS),
+        ):
             if getattr(self, name) not in valid:
                 raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
         select_objects(self.objects)
@@ -55,11 +63,23 @@ class SceneConfig:
             or not 0 <= probability <= 1
         ):
             raise ValueError(f"`adversarial_probability` must be between 0 and 1. Got {probability!r}.")
-        ranges = {"image_size": (MIN_IMAGE_SIZE, MAX_IMAGE_SIZE), "episode_length": (1, MAX_EPISODE_LENGTH)}
-        for name, (low, high) in ranges.items():
-            number = getattr(self, name)
+        image, length = (MIN_IMAGE_SIZE, MAX_IMAGE_SIZE), (1, MAX_EPISODE_LENGTH)
+        ranges = {"image_size": (self.image_size, image), "episode_length": (self.n_steps, length)}
+        for name, (number, (low, high)) in ranges.items():
             if type(number) is not int or not low <= number <= high:
                 raise ValueError(f"`{name}` must be an integer from {low} to {high}. Got {number!r}.")
+        if self.episode_length == self.interface.episode_length:
+            object.__setattr__(self, "episode_length", None)  # equal settings are equal
+
+    @property
+    def interface(self) -> Control:
+        """Names, cameras and rates under the control."""
+        return CONTROLS[self.control]
+
+    @property
+    def n_steps(self) -> int:
+        """Number of steps of an episode."""
+        return self.interface.episode_length if self.episode_length is None else self.episode_length
 
     def check_tasks(self, task_ids: Iterable[int]) -> None:
         """Checks that the objects include one that fits each task.

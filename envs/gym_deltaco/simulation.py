@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from gym_deltaco import pybullet_import as pybullet
-from gym_deltaco.camera import Camera
+from gym_deltaco.camera import Camera, HandCamera
 from gym_deltaco.solids import Mesh
 
 TIME_STEP = 1 / 240  # s
@@ -106,16 +106,20 @@ class Link:
     limits: tuple[float, float] | None = None
 
 
+_Matrices = tuple[Sequence[float], Sequence[float]]  # view and projection
+
+
 @functools.cache
-def camera_matrices(camera: Camera) -> tuple[Sequence[float], Sequence[float]]:
+def camera_matrices(camera: Camera) -> _Matrices:
     """Returns the view and projection matrices of a camera, 16 numbers each in column-major order."""
     view = pybullet.computeViewMatrixFromYawPitchRoll(
         camera.target, camera.distance, camera.yaw, camera.pitch, roll=0, upAxisIndex=2
     )
-    projection = pybullet.computeProjectionMatrixFOV(
-        camera.fov, aspect=1, nearVal=camera.near, farVal=camera.far
-    )
-    return view, projection
+    return view, _projection(camera)
+
+
+def _projection(camera: Camera | HandCamera) -> Sequence[float]:
+    return pybullet.computeProjectionMatrixFOV(camera.fov, aspect=1, nearVal=camera.near, farVal=camera.far)
 
 
 class Simulation:
@@ -417,6 +421,22 @@ class Simulation:
         np.copyto(image, pixels, where=(is_covered & (difference < 0))[..., None])
         return image
 
+    def render_hand(
+        self, camera: HandCamera, position: NDArray[np.float64], rotation: NDArray[np.float64], size: int
+    ) -> NDArray[np.uint8]:
+        """Renders the image of a camera that moves with the hand, (size, size, 3) uint8.
+
+        Args:
+            camera: The camera.
+            position: Position of the end effector, (3,), m.
+            rotation: Rotation of the end effector, (3, 3).
+            size: Height and width of the image, px.
+        """
+        eye, target = (position + rotation @ point for point in (camera.eye, camera.target))
+        view = pybullet.computeViewMatrix(eye.tolist(), target.tolist(), (rotation @ camera.up).tolist())
+        self._show()
+        return np.ascontiguousarray(self._image((view, _projection(camera)), size)[0])
+
     def _background(self, camera: Camera, size: int) -> _Background:
         key = (camera, size, *self._static_parts.values())
         if key not in self._backgrounds:
@@ -442,9 +462,9 @@ class Simulation:
                     pybullet.changeVisualShape(body, link, rgbaColor=color, physicsClientId=self._client)
         self._shown = static, moving
 
-    def _image(self, camera: Camera, size: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def _image(self, camera: Camera | _Matrices, size: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Renders colors, (size, size, 3), and depths, (size, size), of the visible parts."""
-        view, projection = camera_matrices(camera)
+        view, projection = camera_matrices(camera) if isinstance(camera, Camera) else camera
         _, _, pixels, depths, _ = pybullet.getCameraImage(
             size,
             size,

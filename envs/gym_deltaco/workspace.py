@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.camera import Camera
+from gym_deltaco.camera import Camera, HandCamera
 from gym_deltaco.tasks import ContainerColor, ContainerWord
 
 TABLE_TOP = -0.375  # m
@@ -29,6 +29,7 @@ CONTAINER_WALL_THICKNESS = 0.004  # m
 
 DROP_HEIGHT = -0.30  # m, height of an object's center when it is dropped into the tray
 CAMERA = Camera(target=(0.6, 0.2, -0.28), distance=0.37, yaw=180, pitch=-40)
+WRIST_CAMERA = HandCamera(eye=(-0.04, 0.0, 0.07), target=(0.07, 0.0, 0.005), up=(-1, 0, 0), fov=70)
 
 
 class Region(NamedTuple):
