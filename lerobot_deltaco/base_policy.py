@@ -3,6 +3,7 @@
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
 import contextlib
+import copy
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,14 +23,22 @@ from lerobot_deltaco.demonstrations import (
     Demonstration,
     DemonstrationBank,
     RobotData,
-    kept_frames,
     open_dataset,
     read_demonstrations,
     read_robot_data,
 )
 from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.normalization import StateLimits
-from lerobot_deltaco.task_bank import TASK_BANK, find_task_bank, read_task_bank, write_task_bank
+from lerobot_deltaco.task_bank import (
+    PROCESSORS,
+    TASK_BANK,
+    checkpoint_file,
+    configuration_digests,
+    made_processors_digest,
+    processors_digest,
+    read_task_bank,
+    write_task_bank,
+)
 
 # Normalized actions are in -1..1; a policy may overshoot, but not by that much.
 _ABSURD_ACTION = 100.0
@@ -70,6 +79,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         super().__init__(config)
         self.config: Any = config
         self._meta, self._stats = dataset_meta, dataset_stats
+        self._processors_digest: str | None = None  # of the checkpoint that was loaded
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features)
             config.set_dataset_size(dataset_meta.total_frames, dataset_meta.total_episodes)
@@ -320,7 +330,13 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             known = self.instructions
             if known is not None and self.paraphrases is not None:
                 known = self.paraphrases.left_out_of(known)
-            write_task_bank(save_directory / TASK_BANK, known, bank)
+            digests = configuration_digests(self.config)
+            processors = self._processors_digest
+            if self._stats is not None:
+                processors = made_processors_digest(self.config, self._stats)
+            if processors is not None:
+                digests[PROCESSORS] = processors
+            write_task_bank(save_directory / TASK_BANK, known, bank, digests)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:
@@ -332,18 +348,23 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             ValueError: A file of the checkpoint is damaged, or does not fit the others.
         """
         policy = super().from_pretrained(pretrained_name_or_path, **{**kwargs, "strict": True})
-        path = find_task_bank(pretrained_name_or_path, **kwargs)
-        config = policy.config
-        n_kept = len(kept_frames(0, 0, config.n_demo_frames))
-        shape = (n_kept, 3, config.image_size, config.image_size)
-        bank = read_task_bank(path, policy.instructions, shape, config.state_dim)
+        path = checkpoint_file(pretrained_name_or_path, TASK_BANK, **kwargs)
+        digests = configuration_digests(policy.config)
+        processors = processors_digest(pretrained_name_or_path, **kwargs)
+        if processors is not None:
+            digests[PROCESSORS] = processors
+        if policy._stats is not None:  # It is trained, maybe on other data than the checkpoint.
+            digests = {name: digests[name] for name in ("image_size", "n_demo_frames")}
+        bank, saved_with = read_task_bank(path, policy.instructions, digests)
+        policy._processors_digest = saved_with.get(PROCESSORS)
         # Demonstrations named on the command line replace those of the checkpoint.
         if policy.demonstrations is None and bank is not None:
-            policy.demonstrations = bank.to(config.device)
+            policy.demonstrations = bank.to(policy.config.device)
         return policy
 
     @classmethod
     def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
+        limits = copy.deepcopy(model.state_limits)
         try:
             policy = super()._load_as_safetensor(model, model_file, map_location, strict)
         except RuntimeError as error:
@@ -352,6 +373,9 @@ class TaskConditionedPolicy(PreTrainedPolicy):
                 f"{str(error).splitlines()[-1].strip()} "
                 "The config.json beside it belongs to other weights, or to another version."
             ) from error
+        if policy._stats is not None:
+            # Training normalizes states by its own dataset, not by that of the weights that it begins with.
+            policy.state_limits = limits
         name = _non_finite_weight(policy)
         if name is not None:
             raise ValueError(f"{model_file} is damaged: the weight {name} has numbers that are not finite.")
