@@ -86,7 +86,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         config.validate_features()
         self.state_limits = StateLimits(config.state_dim, dataset_stats)
         self.instructions: InstructionEmbeddings | None = None
-        self.paraphrases = None if dataset_meta is None else _read_paraphrases(config)
+        self.paraphrases = None if dataset_meta is None else _read_paraphrases(config, dataset_meta)
         self.demonstrations: DemonstrationBank | None = self._read_evaluation_bank()
         self.training_bank: DemonstrationBank | None = None
         # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.
@@ -274,6 +274,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Reads the demonstrations for evaluation that the configuration names."""
         if self.config.demo_repo_id is None or not self.config.uses_demonstrations:
             return None
+        if not self.config.demo_repo_id.strip():
+            raise ValueError(
+                "`demo_repo_id` is empty. Name a dataset, such as USER/NAME, or leave it out. With "
+                "--policy.demo_root, any name will do."
+            )
         dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
         return self._read_bank(dataset, None)
 
@@ -397,14 +402,16 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
 
 
-def _read_paraphrases(config: TaskConditionedConfig) -> Paraphrases | None:
+def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadata) -> Paraphrases | None:
     """Reads the sentences for training, by task string."""
     if config.paraphrases is None:
         return None
-    from gym_deltaco.tasks import get_task
+    from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
     from lerobot_deltaco.paraphrases import GRAMMAR, read_paraphrases
 
-    sentences = read_paraphrases(config.paraphrases, config.paraphrases_split)
+    known = {task.instruction: task.index for task in (*TASKS, *COLOR_SHAPE_TASKS)}
+    needed = [known[text] for text in meta.tasks.index if text in known]
+    sentences = read_paraphrases(config.paraphrases, config.paraphrases_split, needed)
     by_task = {get_task(task_id).instruction: own for task_id, own in sentences.items()}
     return Paraphrases(by_task, config.p_paraphrase, is_complete=config.paraphrases != GRAMMAR)
 

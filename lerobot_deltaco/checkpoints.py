@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from gym_deltaco.atomic_files import read_json
 
 if TYPE_CHECKING:
     from lerobot.policies import PreTrainedPolicy
@@ -73,10 +74,10 @@ def find_checkpoints(path: Path) -> list[Checkpoint]:
 
 def _read_checkpoint(folder: Path) -> Checkpoint:
     try:
-        policy = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        policy = read_json(folder / CONFIG)
         run: dict[str, Any] = {}
         if (folder / TRAIN_CONFIG).is_file():
-            run = json.loads((folder / TRAIN_CONFIG).read_text(encoding="utf-8"))
+            run = read_json(folder / TRAIN_CONFIG)
         images = [item["shape"] for item in policy["input_features"].values() if item["type"] == "VISUAL"]
         return Checkpoint(
             folder,

@@ -111,7 +111,7 @@ def write_report(paths: Sequence[Path], out: Path) -> Path:
     for name in TABLES:
         (out / f"{name}.csv").unlink(missing_ok=True)
     for name, table in tables.items():
-        text = table.round(6).to_csv(index=False, lineterminator="\n")
+        text = table.round(6).map(_spreadsheet_text).to_csv(index=False, lineterminator="\n")
         _replace(out / f"{name}.csv", text.encode())
     has_figures = {SUCCESS_FIGURE: bool(main), CURVES_FIGURE: any(len(item.steps) > 1 for item in main)}
     for name, draw in {SUCCESS_FIGURE: success_figure, CURVES_FIGURE: curves_figure}.items():
@@ -178,11 +178,11 @@ def _notes(everything: Sequence[Series]) -> Iterator[str]:
         main = [item for item in everything if item.group == group and not item.departures]
         ends = {item.steps[-1] for item in main}
         if len(ends) > 1:
-            yield f"The experiments of {title_of(group)!r} end at different steps: {_listed(ends)}."
+            yield f"The experiments of '{escape(title_of(group))}' end at different steps: {_listed(ends)}."
         scene_sets = {record.plan.scene_set for item in main for record in item.last}
         if len(scene_sets) > 1:
             yield (
-                f"The last evaluations of {title_of(group)!r} are of different sets of scenes, "
+                f"The last evaluations of '{escape(title_of(group))}' are of different sets of scenes, "
                 f"{_listed(scene_sets)}: differences are paired by task, but not by scene."
             )
     for series in everything:
@@ -211,7 +211,7 @@ def _origin_text(everything: Sequence[Series]) -> str:
     records = [record for series in everything for record in series.last]
     versions = sorted({f"{name} {value}" for record in records for name, value in record.versions.items()})
     commands = [
-        f"    # {series.experiment}{', ' if series.variant else ''}{series.variant}\n"
+        f"    # {' '.join(', '.join(filter(None, [series.experiment, series.variant])).split())}\n"
         + "".join(f"    {line}\n" for line in series.last[0].command.splitlines())
         for series in everything
     ]
@@ -279,8 +279,17 @@ def markdown_table(table: pd.DataFrame) -> str:
 
 
 def escape(text: str) -> str:
-    """Escapes a text for Markdown."""
-    return re.sub(r"([\\`*_\[\]<>|#~])", r"\\\1", " ".join(text.split()))
+    """Escapes a text for Markdown, and so for HTML."""
+    return re.sub(r"([\\`*_\[\]<>&|#~])", r"\\\1", " ".join(text.split()))
+
+
+def _spreadsheet_text(value: Any) -> Any:
+    """Returns a value of a CSV file; texts that a spreadsheet would compute begin with an apostrophe."""
+    return (
+        f"'{value}"
+        if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
+        else value
+    )
 
 
 # Figures
