@@ -64,7 +64,7 @@ def main() -> None:
         if "No space left on device" in str(error):
             sys.exit(
                 f"deltaco {name}: The disk of {_output_folder(arguments)} is full. Free some space, and run "
-                "the command again. A training continues from its last complete checkpoint with --resume=true "
+                "the command again. Training continues from its last complete checkpoint with --resume=true "
                 "--config_path=RUN/checkpoints/last/pretrained_model/train_config.json."
             )
         if isinstance(error, OSError):  # a file or folder that cannot be read or written

@@ -24,13 +24,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import N_TASKS, get_task, select_tasks
@@ -202,10 +202,8 @@ def write_records(path: Path, records: Sequence[EvaluationRecord]) -> None:
     schema = _schema()
     table = pa.Table.from_pandas(rows, schema, preserve_index=False)
     table = table.replace_schema_metadata({_KEY: json.dumps(headers).encode()})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    pq.write_table(table, temporary, compression="zstd", compression_level=9)
-    os.replace(temporary, path)
+    with atomic_write(path) as temporary:
+        pq.write_table(table, temporary, compression="zstd", compression_level=9)
 
 
 def read_records(*paths: Path) -> list[EvaluationRecord]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from gym_deltaco.atomic_files import write_text
 from lerobot_deltaco import report_tables
 from lerobot_deltaco.paper_results import CHANCE, LEVELS, paper_result, title_of
 from lerobot_deltaco.records import read_records
@@ -112,21 +112,15 @@ def write_report(paths: Sequence[Path], out: Path) -> Path:
         (out / f"{name}.csv").unlink(missing_ok=True)
     for name, table in tables.items():
         text = table.round(6).map(_spreadsheet_text).to_csv(index=False, lineterminator="\n")
-        _replace(out / f"{name}.csv", text.encode())
+        write_text(out / f"{name}.csv", text)
     has_figures = {SUCCESS_FIGURE: bool(main), CURVES_FIGURE: any(len(item.steps) > 1 for item in main)}
     for name, draw in {SUCCESS_FIGURE: success_figure, CURVES_FIGURE: curves_figure}.items():
         (out / name).unlink(missing_ok=True)
         if has_figures[name]:
             draw(main).savefig(out / name)
     figures = [name for name, has in has_figures.items() if has]
-    _replace(out / PAGE, _page(everything, tables, figures).encode())
+    write_text(out / PAGE, _page(everything, tables, figures))
     return out / PAGE
-
-
-def _replace(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
 
 
 # The page
