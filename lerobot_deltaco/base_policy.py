@@ -143,15 +143,17 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             FloatingPointError: The action is not finite, or absurdly large.
         """
         config = self.config
-        if config.temporal_ensemble_coeff is not None:
-            chunk = self.predict_action_chunk(batch)
-            if self._ensemble is None:
-                self._ensemble = ACTTemporalEnsembler(config.temporal_ensemble_coeff, config.chunk_size)
-            return self._ensemble.update(chunk)
-        if self._begins_episode(batch) or not self._actions:
-            chunk = self.predict_action_chunk(batch)[:, : config.n_action_steps or config.chunk_size]
-            self._actions = deque(chunk.unbind(dim=1))
-        return self._actions.popleft()
+        # In bfloat16, in which LeRobot's training evaluates, an action would depend on the rest of the batch.
+        with torch.autocast(self.step.device.type, enabled=False):
+            if config.temporal_ensemble_coeff is not None:
+                chunk = self.predict_action_chunk(batch)
+                if self._ensemble is None:
+                    self._ensemble = ACTTemporalEnsembler(config.temporal_ensemble_coeff, config.chunk_size)
+                return self._ensemble.update(chunk)
+            if self._begins_episode(batch) or not self._actions:
+                chunk = self.predict_action_chunk(batch)[:, : config.n_action_steps or config.chunk_size]
+                self._actions = deque(chunk.unbind(dim=1))
+            return self._actions.popleft()
 
     def _begins_episode(self, batch: dict[str, Any]) -> bool:
         """Returns whether an action for a batch begins an episode: after a reset, or for other tasks."""
