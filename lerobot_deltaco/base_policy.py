@@ -3,6 +3,7 @@
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
 import contextlib
+import copy
 import logging
 from collections import deque
 from collections.abc import Sequence
@@ -25,13 +26,21 @@ from lerobot_deltaco.demonstrations import (
     Demonstration,
     DemonstrationBank,
     RobotData,
-    kept_frames,
     read_demonstrations,
     read_robot_data,
 )
 from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.normalization import StateLimits
-from lerobot_deltaco.task_bank import TASK_BANK, find_task_bank, read_task_bank, write_task_bank
+from lerobot_deltaco.task_bank import (
+    PROCESSORS,
+    TASK_BANK,
+    checkpoint_file,
+    configuration_digests,
+    made_processors_digest,
+    processors_digest,
+    read_task_bank,
+    write_task_bank,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -74,13 +83,14 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         super().__init__(config)
         self.config: Any = config
         self._meta, self._stats = dataset_meta, dataset_stats
+        self._processors_digest: str | None = None  # of the checkpoint that was loaded
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features, dataset_stats or dataset_meta.stats)
             config.set_dataset_size(dataset_meta.total_frames, dataset_meta.total_episodes)
         config.validate_features()
         self.state_limits = StateLimits(config.state_dim, dataset_stats)
         self.instructions: InstructionEmbeddings | None = None
-        self.paraphrases = None if dataset_meta is None else _read_paraphrases(config)
+        self.paraphrases = None if dataset_meta is None else _read_paraphrases(config, dataset_meta)
         self.demonstrations: DemonstrationBank | None = self._read_evaluation_bank()
         self.training_bank: DemonstrationBank | None = None
         # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.
@@ -137,15 +147,17 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             FloatingPointError: The action is not finite, or absurdly large.
         """
         config = self.config
-        if config.temporal_ensemble_coeff is not None:
-            chunk = self.predict_action_chunk(batch)
-            if self._ensemble is None:
-                self._ensemble = ACTTemporalEnsembler(config.temporal_ensemble_coeff, config.chunk_size)
-            return self._ensemble.update(chunk)
-        if self._begins_episode(batch) or not self._actions:
-            chunk = self.predict_action_chunk(batch)[:, : config.n_action_steps or config.chunk_size]
-            self._actions = deque(chunk.unbind(dim=1))
-        return self._actions.popleft()
+        # In bfloat16, in which LeRobot's training evaluates, an action would depend on the rest of the batch.
+        with torch.autocast(self.step.device.type, enabled=False):
+            if config.temporal_ensemble_coeff is not None:
+                chunk = self.predict_action_chunk(batch)
+                if self._ensemble is None:
+                    self._ensemble = ACTTemporalEnsembler(config.temporal_ensemble_coeff, config.chunk_size)
+                return self._ensemble.update(chunk)
+            if self._begins_episode(batch) or not self._actions:
+                chunk = self.predict_action_chunk(batch)[:, : config.n_action_steps or config.chunk_size]
+                self._actions = deque(chunk.unbind(dim=1))
+            return self._actions.popleft()
 
     def _begins_episode(self, batch: dict[str, Any]) -> bool:
         """Returns whether an action for a batch begins an episode: after a reset, or for other tasks."""
@@ -273,6 +285,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Reads the demonstrations for evaluation that the configuration names."""
         if self.config.demo_repo_id is None or not self.config.uses_demonstrations:
             return None
+        if not self.config.demo_repo_id.strip():
+            raise ValueError(
+                "`demo_repo_id` is empty. Name a dataset, such as USER/NAME, or leave it out. With "
+                "--policy.demo_root, any name will do."
+            )
         dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
         if self._meta is not None:
             _compare_robots(self._meta, dataset.meta)
@@ -331,7 +348,13 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             known = self.instructions
             if known is not None and self.paraphrases is not None:
                 known = self.paraphrases.left_out_of(known)
-            write_task_bank(save_directory / TASK_BANK, known, bank)
+            digests = configuration_digests(self.config)
+            processors = self._processors_digest
+            if self._stats is not None:
+                processors = made_processors_digest(self.config, self._stats)
+            if processors is not None:
+                digests[PROCESSORS] = processors
+            write_task_bank(save_directory / TASK_BANK, known, bank, digests)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:
@@ -343,18 +366,23 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             ValueError: A file of the checkpoint is damaged, or does not fit the others.
         """
         policy = super().from_pretrained(pretrained_name_or_path, **{**kwargs, "strict": True})
-        path = find_task_bank(pretrained_name_or_path, **kwargs)
-        config = policy.config
-        n_kept = len(kept_frames(0, 0, config.n_demo_frames))
-        shape = (n_kept, 3, config.image_size, config.image_size)
-        bank = read_task_bank(path, policy.instructions, shape, config.state_dim)
+        path = checkpoint_file(pretrained_name_or_path, TASK_BANK, **kwargs)
+        digests = configuration_digests(policy.config)
+        processors = processors_digest(pretrained_name_or_path, **kwargs)
+        if processors is not None:
+            digests[PROCESSORS] = processors
+        if policy._stats is not None:  # It is trained, maybe on other data than the checkpoint.
+            digests = {name: digests[name] for name in ("image_size", "n_demo_frames")}
+        bank, saved_with = read_task_bank(path, policy.instructions, digests)
+        policy._processors_digest = saved_with.get(PROCESSORS)
         # Demonstrations named on the command line replace those of the checkpoint.
         if policy.demonstrations is None and bank is not None:
-            policy.demonstrations = bank.to(config.device)
+            policy.demonstrations = bank.to(policy.config.device)
         return policy
 
     @classmethod
     def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
+        limits = copy.deepcopy(model.state_limits)
         try:
             policy = super()._load_as_safetensor(model, model_file, map_location, strict)
         except RuntimeError as error:
@@ -363,6 +391,9 @@ class TaskConditionedPolicy(PreTrainedPolicy):
                 f"{str(error).splitlines()[-1].strip()} "
                 "The config.json beside it belongs to other weights, or to another version."
             ) from error
+        if policy._stats is not None:
+            # Training normalizes states by its own dataset, not by that of the weights that it begins with.
+            policy.state_limits = limits
         name = _non_finite_weight(policy)
         if name is not None:
             raise ValueError(f"{model_file} is damaged: the weight {name} has numbers that are not finite.")
@@ -431,14 +462,16 @@ def _compare_robots(training: LeRobotDatasetMetadata, shown: LeRobotDatasetMetad
             )
 
 
-def _read_paraphrases(config: TaskConditionedConfig) -> Paraphrases | None:
+def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadata) -> Paraphrases | None:
     """Reads the sentences for training, by task string."""
     if config.paraphrases is None:
         return None
-    from gym_deltaco.tasks import get_task
+    from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
     from lerobot_deltaco.paraphrases import GRAMMAR, read_paraphrases
 
-    sentences = read_paraphrases(config.paraphrases, config.paraphrases_split)
+    known = {task.instruction: task.index for task in (*TASKS, *COLOR_SHAPE_TASKS)}
+    needed = [known[text] for text in meta.tasks.index if text in known]
+    sentences = read_paraphrases(config.paraphrases, config.paraphrases_split, needed)
     by_task = {get_task(task_id).instruction: own for task_id, own in sentences.items()}
     return Paraphrases(by_task, config.p_paraphrase, is_complete=config.paraphrases != GRAMMAR)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from gym_deltaco.atomic_files import read_json
 from gym_deltaco.control import control_of
 
 if TYPE_CHECKING:
@@ -77,10 +77,10 @@ def find_checkpoints(path: Path) -> list[Checkpoint]:
 
 def _read_checkpoint(folder: Path) -> Checkpoint:
     try:
-        policy = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        policy = read_json(folder / CONFIG)
         run: dict[str, Any] = {}
         if (folder / TRAIN_CONFIG).is_file():
-            run = json.loads((folder / TRAIN_CONFIG).read_text(encoding="utf-8"))
+            run = read_json(folder / TRAIN_CONFIG)
         inputs = policy["input_features"].items()
         images = {name: item["shape"] for name, item in inputs if item["type"] == "VISUAL"}
         return Checkpoint(

@@ -3,16 +3,18 @@
 # No `from __future__ import annotations`: tyro reads the annotations of nested functions.
 
 import ast
-import json
 import logging
 import os
 import shlex
 import sys
 import textwrap
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
+
+from gym_deltaco.atomic_files import parse_json
 
 COMMANDS = {
     "collect": "Collect episodes of the scripted expert as a LeRobotDataset.",
@@ -56,9 +58,18 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit("\nInterrupted. Run the same command again to continue.")
     except Exception as error:
-        if not _is_ours(error):
-            raise
-        sys.exit(f"deltaco {name}: {error}")
+        if _is_ours(error):
+            sys.exit(f"deltaco {name}: {error}")
+        # Libraries report it as errors of their own.
+        if "No space left on device" in str(error):
+            sys.exit(
+                f"deltaco {name}: The disk of {_output_folder(arguments)} is full. Free some space, and run "
+                "the command again. Training continues from its last complete checkpoint with --resume=true "
+                "--config_path=RUN/checkpoints/last/pretrained_model/train_config.json."
+            )
+        if isinstance(error, OSError):  # a file or folder that cannot be read or written
+            sys.exit(f"deltaco {name}: {error}")
+        raise
 
 
 def _is_ours(error: BaseException) -> bool:
@@ -68,9 +79,14 @@ def _is_ours(error: BaseException) -> bool:
     purpose.
     """
     frames = traceback.extract_tb(error.__traceback__)
-    if isinstance(error, OSError):
-        return True  # a file or folder that cannot be read or written
     return bool(frames) and any(f"/{package}/" in frames[-1].filename for package in _PACKAGES)
+
+
+def _output_folder(arguments: Sequence[str]) -> Path:
+    """Returns the folder that a command writes to, as its arguments say."""
+    words = [part for word in arguments for part in word.split("=", 1)]
+    named = [words[n + 1] for n, word in enumerate(words[:-1]) if word in ("--output_dir", "--out", "--root")]
+    return Path(*named[-1:]).resolve()
 
 
 def _collect() -> Callable[..., Any]:
@@ -162,7 +178,7 @@ def _evaluate() -> Callable[..., Any]:
             demo_repo_id=demo_repo_id,
             demo_root=demo_root,
             experiment=experiment,
-            rename_map=None if rename_map is None else json.loads(rename_map),
+            rename_map=None if rename_map is None else parse_json(rename_map, "--rename-map"),
             command=shlex.join(["deltaco", *sys.argv[1:]]),
         )
 
@@ -224,14 +240,58 @@ def _experiment() -> Callable[..., Any]:
     return experiment
 
 
+@dataclass(frozen=True)
+class DatasetSource:
+    """A LeRobotDataset; without arguments, none.
+
+    Args:
+        repo_id: Repository id of the dataset; by default, the name of its folder.
+        root: Folder of the dataset; by default, it is in LeRobot's cache.
+    """
+
+    repo_id: str | None = None
+    root: Path | None = None
+
+
 def _look() -> Callable[..., Any]:
-    from lerobot_deltaco.look import look
+    import tyro
+
+    def look(
+        checkpoint: tyro.conf.Positional[str],
+        dataset: DatasetSource = DatasetSource(),  # noqa: B008
+        episodes: int = 12,
+        out: Path = Path("outputs/look"),
+    ) -> Path:
+        """Draws where a policy looks in episodes of a dataset or of the benchmark, on one page.
+
+        Args:
+            checkpoint: Folder of a policy of the type deltaco_match, or of its training run; or id of a
+                repository on the Hugging Face Hub.
+            dataset: Dataset to look at. Without one, episodes of the benchmark's test tasks are run.
+            episodes: Number of episodes, evenly spread.
+            out: Folder for the page.
+        """
+        from lerobot_deltaco.look import look
+
+        return look(checkpoint, dataset.repo_id, dataset.root, episodes, out)
 
     return look
 
 
 def _play() -> Callable[..., Any]:
-    from lerobot_deltaco.play import play
+    import tyro
+
+    def play(checkpoint: tyro.conf.Positional[str | None] = None, port: int = 7860) -> None:
+        """Serves the page on this machine until it is interrupted.
+
+        Args:
+            checkpoint: Folder of a policy or of a training run, or id of a repository on the Hugging Face
+                Hub. By default, it is the one that comes with the project.
+            port: Port to serve at.
+        """
+        from lerobot_deltaco.play import play
+
+        play(checkpoint, port)
 
     return play
 

@@ -9,7 +9,6 @@ A plan needs no simulator, and nothing here imports LeRobot or torch.
 
 from __future__ import annotations
 
-import json
 import math
 import multiprocessing
 import os
@@ -21,6 +20,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gym_deltaco import ENV_ID, EXPERT_NOISE, pybullet_import
-from gym_deltaco.atomic_files import write_json
+from gym_deltaco.atomic_files import read_json, write_json
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
@@ -229,7 +229,7 @@ def read_description(root: Path) -> dict[str, Any]:
         "plan", "benchmark" and "renderer"; of a finished dataset also "versions" of packages, and for each
         kind of task the number of "episodes" and of "attempts".
     """
-    return json.loads((root / DESCRIPTION_FILE).read_text(encoding="utf-8"))
+    return read_json(root / DESCRIPTION_FILE)
 
 
 def read_plan(root: Path) -> CollectionPlan:
@@ -352,13 +352,13 @@ def _collect_shards(root: Path, plan: CollectionPlan, workers: int) -> float | N
 def _run(root: Path, plan: CollectionPlan, shards: Sequence[int], workers: int) -> Iterator[int]:
     """Collects shards, in this process if one is enough, and yields each once it is written."""
     if workers <= 1:
-        with closing(PickPlaceEnv(scene=plan.scene)) as env:
+        with closing(PickPlaceEnv(plan.task_ids[0], plan.scene)) as env:
             for shard in shards:
                 yield _collect_shard(env, root, plan, shard)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _start_worker, (root, plan)) as executor:
-        futures = [executor.submit(_collect_in_worker, shard) for shard in shards]
+    with ProcessPoolExecutor(workers, context, _start_worker) as executor:
+        futures = [executor.submit(_collect_in_worker, root, plan, shard) for shard in shards]
         try:
             for future in as_completed(futures):
                 yield future.result()
@@ -367,15 +367,10 @@ def _run(root: Path, plan: CollectionPlan, shards: Sequence[int], workers: int) 
             raise
 
 
-_worker: tuple[PickPlaceEnv, Path, CollectionPlan]
-
-
-def _start_worker(root: Path, plan: CollectionPlan) -> None:
-    global _worker
+def _start_worker() -> None:
     # An interrupt in the terminal reaches all processes, and ends this one immediately.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    _worker = PickPlaceEnv(plan.task_ids[0], plan.scene), root, plan
 
 
 def _exit_with_parent() -> None:
@@ -386,9 +381,14 @@ def _exit_with_parent() -> None:
     os._exit(1)
 
 
-def _collect_in_worker(shard: int) -> int:
-    env, root, plan = _worker
-    return _collect_shard(env, root, plan, shard)
+def _collect_in_worker(root: Path, plan: CollectionPlan, shard: int) -> int:
+    return _collect_shard(_worker_env(plan), root, plan, shard)
+
+
+@cache
+def _worker_env(plan: CollectionPlan) -> PickPlaceEnv:
+    # Not made in the initializer, whose errors end the pool without saying why.
+    return PickPlaceEnv(plan.task_ids[0], plan.scene)
 
 
 def _collect_shard(env: PickPlaceEnv, root: Path, plan: CollectionPlan, shard: int) -> int:

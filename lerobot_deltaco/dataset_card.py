@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import textwrap
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from PIL import Image
 
-from gym_deltaco.atomic_files import atomic_write, write_text
+from gym_deltaco.atomic_files import atomic_write, read_json, write_text
 from gym_deltaco.tasks import SCENARIOS, get_task
 from lerobot_deltaco.cards import render
 from lerobot_deltaco.collect import read_description, read_plan
@@ -34,7 +33,7 @@ def dataset_card(root: Path, repo_id: str | None = None) -> str:
     files = [path for name in ("data", "meta") for path in (root / name).rglob("*") if path.is_file()]
     return render(
         "benchmark_dataset.md",
-        info=json.loads((root / INFO_FILE).read_text(encoding="utf-8")),
+        info=read_json(root / INFO_FILE),
         origin={**read_description(root), "plan": asdict(plan)},
         tasks=[get_task(task_id) for task_id in plan.task_ids],
         scenarios=list(SCENARIOS.values()),

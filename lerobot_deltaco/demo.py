@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import csv
 import io
-import json
 import os
 import subprocess
 import time
@@ -26,7 +25,7 @@ import jinja2
 import numpy as np
 import pandas as pd
 
-from gym_deltaco.atomic_files import write_json, write_text
+from gym_deltaco.atomic_files import read_json, write_json, write_text
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco import experiments
 from lerobot_deltaco.experiments import Run, available_cores, last_checkpoint, last_step, read_run_records
@@ -138,7 +137,7 @@ class Clock:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.times: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        self.times: dict[str, Any] = read_json(path) if path.is_file() else {}
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
@@ -302,7 +301,7 @@ def _scene_rows(run: Run) -> list[dict[str, Any]]:
         episodes = []
         for container, sentence in enumerate(SENTENCES):
             stem = _episode_stem(run, task_id, container)
-            containers = json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))
+            containers = read_json(stem.with_suffix(".json"))
             episodes.append(
                 {
                     "sentence": sentence,

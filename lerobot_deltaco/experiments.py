@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 from tqdm import tqdm
 
-from gym_deltaco.atomic_files import write_json
+from gym_deltaco.atomic_files import read_json, write_json
 from lerobot_deltaco.checkpoints import find_checkpoints
 from lerobot_deltaco.collect import CollectionPlan, is_finished
 from lerobot_deltaco.recipes import ExperimentError, Recipe, Scale, read_recipe
@@ -121,7 +121,7 @@ class Run:
         """
         if last_step(self.folder) == 0 or not self.settings_file.is_file():
             return
-        found = json.loads(self.settings_file.read_text(encoding="utf-8"))
+        found = read_json(self.settings_file)
         for section, settings in self._settings().items():
             if found.get(section) != settings:
                 raise ExperimentError(
@@ -204,7 +204,7 @@ def last_checkpoint(run: Path) -> Path:
 def last_step(run: Path) -> int:
     """Returns the step of the last checkpoint of a run; 0 without any."""
     path = run / "checkpoints" / "last" / "training_state" / "training_step.json"
-    return int(json.loads(path.read_text(encoding="utf-8"))["step"]) if path.is_file() else 0
+    return int(read_json(path)["step"]) if path.is_file() else 0
 
 
 def read_run_records(run: Path) -> list[EvaluationRecord]:

@@ -6,7 +6,6 @@ import base64
 import io
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,7 +16,6 @@ import torch
 from lerobot.utils.constants import ACTION
 from PIL import Image
 from tqdm import tqdm
-from tyro.conf import Positional
 
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
@@ -65,31 +63,19 @@ class View(NamedTuple):
     video: str | None = None
 
 
-@dataclass(frozen=True)
-class DatasetSource:
-    """A LeRobotDataset; without arguments, none.
-
-    Args:
-        repo_id: Repository id of the dataset; by default, the name of its folder.
-        root: Folder of the dataset; by default, it is in LeRobot's cache.
-    """
-
-    repo_id: str | None = None
-    root: Path | None = None
-
-
 def look(
-    checkpoint: Positional[str],
-    dataset: DatasetSource = DatasetSource(),  # noqa: B008
+    checkpoint: str,
+    repo_id: str | None = None,
+    root: Path | None = None,
     episodes: int = 12,
     out: Path = Path("outputs/look"),
 ) -> Path:
     """Draws where a policy looks in episodes of a dataset or of the benchmark, on one self-contained page.
 
     Args:
-        checkpoint: Folder of a policy of the type deltaco_match, or of its training run; or id of a
-            repository on the Hugging Face Hub.
-        dataset: Dataset to look at. Without one, episodes of the benchmark's test tasks are run.
+        checkpoint: Folder of a policy or of its training run, or id of a repository on the Hub.
+        repo_id: Repository id of a dataset; None for the name of its folder.
+        root: Folder of the dataset. Without both, episodes of the benchmark's test tasks are run.
         episodes: Number of episodes, evenly spread.
         out: Folder for the page.
 
@@ -108,13 +94,13 @@ def look(
             "locations. `deltaco look` needs one of the type deltaco_match."
         )
     out.mkdir(parents=True, exist_ok=True)
-    if dataset == DatasetSource():
+    if repo_id is None and root is None:
         source, result, tolerance = "scenes of the benchmark", "Successful episodes:", None
         views = _benchmark_views(loaded, episodes, out)
     else:
-        source = dataset.repo_id or Path(dataset.root or "").resolve().name
+        source = repo_id or Path(root or "").resolve().name
         result, tolerance = "Episodes with the right pick location:", TOLERANCE
-        views = _dataset_views(loaded, open_dataset("--dataset.root", source, dataset.root), episodes)
+        views = _dataset_views(loaded, open_dataset("--dataset.root", source, root), episodes)
     shown = list(tqdm(views, desc="Looking", unit="episode", total=episodes))
     page = out / "index.html"
     partial = page.with_name(".index.html.part")

@@ -8,7 +8,7 @@ so the project does not ship them: `curl -LO https://deltaco-robot.github.io/fil
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import get_args
@@ -26,7 +26,9 @@ _COLUMNS = ["task_id", "instruction"]
 _AUTHORS_COLUMNS = ["", "Task ID", "Instruction"]
 
 
-def read_paraphrases(path: str | Path, split: str = "all") -> dict[int, tuple[str, ...]]:
+def read_paraphrases(
+    path: str | Path, split: str = "all", task_ids: Iterable[int] | None = None
+) -> dict[int, tuple[str, ...]]:
     """Reads the sentences of tasks from a CSV file, or makes them from the benchmark's phrases.
 
     Args:
@@ -36,6 +38,7 @@ def read_paraphrases(path: str | Path, split: str = "all") -> dict[int, tuple[st
         split: "all"; "held_out", the last sentence of each task (with "grammar", sentences with phrases that
             are in no other); or "train", the sentences that are not held out for any task. Upper and lower
             case do not distinguish sentences.
+        task_ids: Tasks for which sentences are made with "grammar"; None for all.
 
     Returns:
         Distinct sentences by task index, in the order of the file; tasks ascending, without tasks that have
@@ -46,7 +49,9 @@ def read_paraphrases(path: str | Path, split: str = "all") -> dict[int, tuple[st
     """
     _check_split(split)
     if path == GRAMMAR:
-        return _from_grammar(split)
+        if task_ids is None:
+            task_ids = (task.index for task in (*TASKS, *COLOR_SHAPE_TASKS))
+        return {task_id: _from_grammar(task_id, split) for task_id in sorted(task_ids)}
     distinct: dict[int, dict[str, str]] = {}
     for task_id, sentence in _read_rows(path):
         distinct.setdefault(task_id, {}).setdefault(sentence.casefold(), sentence)
@@ -93,21 +98,20 @@ def choose_instructions(
         return dict.fromkeys(task_ids, (" ".join(instruction.split()),))
     if paraphrases is None:
         return None
-    sentences = read_paraphrases(paraphrases, split)
+    sentences = read_paraphrases(paraphrases, split, task_ids)
     _check_complete(sentences, task_ids, f"{paraphrases} (split {split!r})")
     return {task_id: sentences[task_id] for task_id in task_ids}
 
 
 @cache
-def _from_grammar(split: str) -> dict[int, tuple[str, ...]]:
-    found: dict[int, tuple[str, ...]] = {}
-    for task in (*TASKS, *COLOR_SHAPE_TASKS):
-        for number, own in enumerate(get_args(PhraseSplit)):
-            if split in (own, "all"):
-                rng = np.random.default_rng((task.index, number))
-                sentences = [paraphrase(task, own, rng) for _ in range(_N_FROM_GRAMMAR)]
-                found[task.index] = (*found.get(task.index, ()), *dict.fromkeys(sentences))
-    return found
+def _from_grammar(task_id: int, split: str) -> tuple[str, ...]:
+    found: list[str] = []
+    for number, own in enumerate(get_args(PhraseSplit)):
+        if split in (own, "all"):
+            rng = np.random.default_rng((task_id, number))
+            sentences = [paraphrase(get_task(task_id), own, rng) for _ in range(_N_FROM_GRAMMAR)]
+            found += dict.fromkeys(sentences)
+    return tuple(found)
 
 
 def _check_split(split: str) -> None:

@@ -14,7 +14,6 @@ from urllib.parse import urlencode
 
 import numpy as np
 from PIL import Image
-from tyro.conf import Positional
 
 from gym_deltaco.layout import Layout
 from gym_deltaco.seeding import episode_seed
@@ -523,12 +522,12 @@ def build_page(player: Player, name: str) -> gr.Blocks:
     return page
 
 
-def play(checkpoint: Positional[str | None] = None, port: int = 7860) -> None:
+def play(checkpoint: str | None = None, port: int = 7860) -> None:
     """Serves the page on this machine until it is interrupted.
 
     Args:
-        checkpoint: Folder of a policy or of a training run, or id of a repository on the Hugging Face Hub. By
-            default, it is the one that comes with the project.
+        checkpoint: Folder of a policy or of a training run, or id of a repository on the Hub; None for the
+            checkpoint that comes with the project.
         port: Port to serve at.
 
     Raises:

@@ -10,6 +10,7 @@ import ast
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, make_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -163,6 +164,7 @@ def _read_yaml(text: str, source: str) -> Any:
         raise ExperimentError(f"Cannot read {source}: {reason}") from None
 
 
+@cache
 def _read_file(path: Path) -> dict[str, Any]:
     try:
         content = _read_yaml(path.read_text(encoding="utf-8"), str(path))
@@ -264,6 +266,7 @@ def _check_names(kind: Any, settings: Any, where: str) -> None:
             _check_names(type(defaults[name]), value, f"{name} in {where}")
 
 
+@cache
 def policy_options(policy_type: str) -> Any:
     """Reads the options of a policy and their types from the source of its configuration class.
 

@@ -24,13 +24,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import N_TASKS, get_task, select_tasks
@@ -202,10 +202,8 @@ def write_records(path: Path, records: Sequence[EvaluationRecord]) -> None:
     schema = _schema()
     table = pa.Table.from_pandas(rows, schema, preserve_index=False)
     table = table.replace_schema_metadata({_KEY: json.dumps(headers).encode()})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    pq.write_table(table, temporary, compression="zstd", compression_level=9)
-    os.replace(temporary, path)
+    with atomic_write(path) as temporary:
+        pq.write_table(table, temporary, compression="zstd", compression_level=9)
 
 
 def read_records(*paths: Path) -> list[EvaluationRecord]:
@@ -247,7 +245,7 @@ def _read(path: Path) -> list[EvaluationRecord]:
             plan["scene"] = SceneConfig(**plan["scene"])
             episodes = rows[rows["evaluation"] == n].drop(columns="evaluation").reset_index(drop=True)
             records.append(EvaluationRecord(plan=EvaluationPlan(**plan), episodes=episodes, **header))
-    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
+    except (OSError, KeyError, TypeError, ValueError, RecursionError, pa.ArrowException) as error:
         raise RecordError(f"{path} is not a file of evaluation records: {error}") from error
     for record in records:
         _check(record, str(path))
@@ -281,8 +279,16 @@ def _check(record: EvaluationRecord, source: str) -> None:
     Raises:
         RecordError: They contradict each other.
     """
+    import pandas as pd
+
     rows = record.episodes
     containers = rows["object_containers"].map(list)
+
+    def is_plausible(row: Any) -> bool:
+        # After a success, the object may have been taken out again.
+        filled, held = set(row.object_containers) - {-1}, row.object_containers[row.grasped_object :][:1]
+        return not row.right_object or len(filled) != 1 or -1 in held or row.success == row.right_container
+
     is_valid = {
         "tasks and trials of the plan, each once": (
             rows["task_id"].isin(record.plan.task_ids)
@@ -298,10 +304,20 @@ def _check(record: EvaluationRecord, source: str) -> None:
         "an object in a container where that is the right one": (
             ~rows["right_container"] | containers.map(lambda found: len(set(found) - {-1}) == 1)
         ),
+        "a success if the right object alone lies in the right container, and none in the other": pd.Series(
+            map(is_plausible, rows.itertuples()), rows.index
+        ),
     }
     n_episodes = len(record.plan.task_ids) * record.plan.trials
-    if len(rows) != n_episodes or record.step < 0 or record.seconds < 0 or "benchmark" not in record.versions:
-        raise RecordError(f"{source} has an evaluation of {record.experiment!r} that lacks something.")
+    required = {
+        f"{n_episodes} episodes": len(rows) == n_episodes,
+        "a step of at least 0": record.step >= 0,
+        "a duration of at least 0 s": record.seconds >= 0,
+        "a version of the benchmark": "benchmark" in record.versions,
+    }
+    for name, holds in required.items():
+        if not holds:
+            raise RecordError(f"{source} contradicts itself: {record.experiment!r} must have {name}.")
     for name, valid in is_valid.items():
         if not valid.all():
             row = rows[~valid.astype(bool)].iloc[0]

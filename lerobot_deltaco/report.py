@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from gym_deltaco.atomic_files import write_text
 from lerobot_deltaco import report_tables
 from lerobot_deltaco.paper_results import CHANCE, LEVELS, paper_result, title_of
 from lerobot_deltaco.records import read_records
@@ -111,22 +111,16 @@ def write_report(paths: Sequence[Path], out: Path) -> Path:
     for name in TABLES:
         (out / f"{name}.csv").unlink(missing_ok=True)
     for name, table in tables.items():
-        text = table.round(6).to_csv(index=False, lineterminator="\n")
-        _replace(out / f"{name}.csv", text.encode())
+        text = table.round(6).map(_spreadsheet_text).to_csv(index=False, lineterminator="\n")
+        write_text(out / f"{name}.csv", text)
     has_figures = {SUCCESS_FIGURE: bool(main), CURVES_FIGURE: any(len(item.steps) > 1 for item in main)}
     for name, draw in {SUCCESS_FIGURE: success_figure, CURVES_FIGURE: curves_figure}.items():
         (out / name).unlink(missing_ok=True)
         if has_figures[name]:
             draw(main).savefig(out / name)
     figures = [name for name, has in has_figures.items() if has]
-    _replace(out / PAGE, _page(everything, tables, figures).encode())
+    write_text(out / PAGE, _page(everything, tables, figures))
     return out / PAGE
-
-
-def _replace(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
 
 
 # The page
@@ -178,11 +172,11 @@ def _notes(everything: Sequence[Series]) -> Iterator[str]:
         main = [item for item in everything if item.group == group and not item.departures]
         ends = {item.steps[-1] for item in main}
         if len(ends) > 1:
-            yield f"The experiments of {title_of(group)!r} end at different steps: {_listed(ends)}."
+            yield f"The experiments of '{escape(title_of(group))}' end at different steps: {_listed(ends)}."
         scene_sets = {record.plan.scene_set for item in main for record in item.last}
         if len(scene_sets) > 1:
             yield (
-                f"The last evaluations of {title_of(group)!r} are of different sets of scenes, "
+                f"The last evaluations of '{escape(title_of(group))}' are of different sets of scenes, "
                 f"{_listed(scene_sets)}: differences are paired by task, but not by scene."
             )
     for series in everything:
@@ -211,7 +205,7 @@ def _origin_text(everything: Sequence[Series]) -> str:
     records = [record for series in everything for record in series.last]
     versions = sorted({f"{name} {value}" for record in records for name, value in record.versions.items()})
     commands = [
-        f"    # {series.experiment}{', ' if series.variant else ''}{series.variant}\n"
+        f"    # {' '.join(', '.join(filter(None, [series.experiment, series.variant])).split())}\n"
         + "".join(f"    {line}\n" for line in series.last[0].command.splitlines())
         for series in everything
     ]
@@ -279,8 +273,17 @@ def markdown_table(table: pd.DataFrame) -> str:
 
 
 def escape(text: str) -> str:
-    """Escapes a text for Markdown."""
-    return re.sub(r"([\\`*_\[\]<>|#~])", r"\\\1", " ".join(text.split()))
+    """Escapes a text for Markdown, and so for HTML."""
+    return re.sub(r"([\\`*_\[\]<>&|#~])", r"\\\1", " ".join(text.split()))
+
+
+def _spreadsheet_text(value: Any) -> Any:
+    """Returns a value of a CSV file; texts that a spreadsheet would compute begin with an apostrophe."""
+    return (
+        f"'{value}"
+        if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
+        else value
+    )
 
 
 # Figures

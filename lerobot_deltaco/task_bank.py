@@ -9,38 +9,51 @@ evaluation, so that these need no dataset:
     first_images   (demonstrations, 3, H', W') uint8, at the camera's own resolution; optional
     pick_states    (demonstrations, state) float32, NaN where there is none; optional
     features       (demonstrations, features) float32, by a frozen image encoder; optional
-    metadata       language_encoder; instructions, tasks and target_objects as JSON
+    metadata       as JSON: instructions, tasks and target_objects, and SHA-256 digests of the bank itself and
+                   of what it was saved with: the configuration's options that say what the numbers of
+                   observations and actions mean, and the processors with their statistics
+
+So a checkpoint is refused if its files are not those that were saved together.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import EntryNotFoundError
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from lerobot_deltaco.demonstrations import DemonstrationBank
 from lerobot_deltaco.language import InstructionEmbeddings
 
 TASK_BANK = "tasks.safetensors"
+PROCESSORS = "processors and statistics"
 _HUB_OPTIONS = ("revision", "cache_dir", "token", "local_files_only", "force_download")
-_FORMAT = "deltaco_tasks"
-_TEXTS = ("instructions", "tasks", "target_objects")
-_UNIT_TOLERANCE = 1e-3
-_DTYPES = {
-    "embeddings": torch.float32,
-    "frames": torch.uint8,
-    "episodes": torch.int64,
-    "first_images": torch.uint8,
-    "pick_states": torch.float32,
-    "features": torch.float32,
-}
-_DIMS = {"embeddings": 2, "frames": 5, "episodes": 1, "first_images": 4, "pick_states": 2, "features": 2}
+# A single key: safetensors writes several in a random order, and equal banks would be unequal files.
+_KEY = "deltaco_tasks"
+_FEATURES = ("input_features", "output_features")
+_OPTIONS = (
+    "gripper",
+    "gripper_closed",
+    "image_size",
+    "n_demo_frames",
+    "demo_camera",
+    "one_hot_tasks",
+    "known_words",
+    "language_encoder",
+)
+_OF_THE_MACHINE = ("device", "rename_map")  # options of processor steps, which may differ
 
 
 class TaskBankError(ValueError):
@@ -48,7 +61,10 @@ class TaskBankError(ValueError):
 
 
 def write_task_bank(
-    path: Path, instructions: InstructionEmbeddings | None, demonstrations: DemonstrationBank | None
+    path: Path,
+    instructions: InstructionEmbeddings | None,
+    demonstrations: DemonstrationBank | None,
+    digests: Mapping[str, str],
 ) -> None:
     """Writes a task bank.
 
@@ -56,13 +72,13 @@ def write_task_bank(
         path: The file.
         instructions: Embeddings of instructions; None if the policy has no language encoder.
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
+        digests: Digests of what the bank is saved with, by name.
     """
     tensors: dict[str, torch.Tensor] = {}
-    known = {"format": _FORMAT}  # a file without anything else is not valid
+    texts: dict[str, Any] = {}
     if instructions is not None:
         tensors["embeddings"] = instructions.embeddings
-        known["language_encoder"] = instructions.encoder_name
-        known["instructions"] = json.dumps(list(instructions.rows))
+        texts["instructions"] = list(instructions.rows)
     if demonstrations is not None:
         tensors |= {"frames": demonstrations.frames, "episodes": demonstrations.episodes}
         if demonstrations.first_images is not None:
@@ -71,122 +87,137 @@ def write_task_bank(
             tensors["pick_states"] = demonstrations.pick_states.float()
         if demonstrations.features is not None:
             tensors["features"] = demonstrations.features[:, 0].float()
-        known["tasks"] = json.dumps(demonstrations.tasks)
-        known["target_objects"] = json.dumps(demonstrations.target_objects)
-    save_file({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, path, metadata=known)
+        texts |= {"tasks": demonstrations.tasks, "target_objects": demonstrations.target_objects}
+    tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
+    texts |= {"digests": dict(digests), "digest": _digest(texts, tensors)}
+    save_file(tensors, path, metadata={_KEY: json.dumps(texts)})
 
 
-def find_task_bank(pretrained: str | Path, **options: Any) -> Path:
-    """Returns the path of a checkpoint's task bank, downloading it if the checkpoint is on the Hub.
+def checkpoint_file(pretrained: str | Path, name: str, **options: Any) -> Path:
+    """Returns the path of a file of a checkpoint, downloading it if the checkpoint is on the Hub.
 
     Args:
         pretrained: Folder of the checkpoint, or its repository's id on the Hub.
+        name: Name of the file.
         options: Arguments of `PreTrainedPolicy.from_pretrained`; those that concern the Hub are used.
     """
     if Path(pretrained).is_dir():
-        return Path(pretrained) / TASK_BANK
+        return Path(pretrained) / name
     hub_options = {name: options[name] for name in _HUB_OPTIONS if name in options}
-    return Path(hf_hub_download(str(pretrained), TASK_BANK, **hub_options))
+    return Path(hf_hub_download(str(pretrained), name, **hub_options))
 
 
 def read_task_bank(
-    path: Path, instructions: InstructionEmbeddings | None, frames_shape: tuple[int, ...], state_dim: int
-) -> DemonstrationBank | None:
-    """Reads a task bank, and checks that it belongs to a policy.
+    path: Path, instructions: InstructionEmbeddings | None, digests: Mapping[str, str]
+) -> tuple[DemonstrationBank | None, dict[str, str]]:
+    """Reads a task bank, and checks that it belongs to a checkpoint.
 
     Args:
         path: The file.
         instructions: Cache that gets the embeddings; None if the policy has no language encoder.
-        frames_shape: Shape of the policy's demonstrations, (frames, 3, H, W).
-        state_dim: Size of the robot's state, for states at grasps.
+        digests: Digests of the checkpoint's other parts, by name; those that are missing are not checked.
 
     Returns:
-        The demonstrations; None if there are none.
+        The demonstrations, None if there are none; and the digests with which it was saved.
 
     Raises:
-        TaskBankError: The file is missing, is not a task bank, or belongs to another policy.
+        TaskBankError: The file is missing, is not a task bank, or was saved with other parts.
     """
     try:
         with safe_open(path, framework="pt") as file:
-            known = file.metadata() or {}
+            texts = json.loads((file.metadata() or {}).get(_KEY, "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        texts = {name: json.loads(known[name]) for name in _TEXTS if name in known}
-    except (OSError, SafetensorError, ValueError) as error:
+        digest, saved_with = texts.pop("digest", None), texts.pop("digests", {})
+    except (OSError, SafetensorError, ValueError, RecursionError) as error:
         raise _error(path, str(error)) from error
-    for name, tensor in tensors.items():
-        if (
-            name not in _DTYPES
-            or (tensor.dtype, tensor.ndim) != (_DTYPES[name], _DIMS[name])
-        ):  # fmt: skip
-            raise _error(
-                path, f"it has the tensor `{name}` of {tensor.dtype} and shape {tuple(tensor.shape)}"
-            )
+    if digest != _digest(texts, tensors):
+        raise _error(path, "it is damaged, or of another version")
+    for name, found in digests.items():
+        if found != saved_with.get(name):
+            raise _error(path, f"it was not saved with this checkpoint's {name}")
     if instructions is not None:
-        _add_embeddings(path, instructions, tensors.get("embeddings"), texts.get("instructions"), known)
+        new = [n for n, name in enumerate(texts["instructions"]) if name not in instructions.rows]
+        instructions.put([texts["instructions"][n] for n in new], tensors["embeddings"][new])
     if "frames" not in tensors:
-        return None
-    return _demonstrations(path, tensors, texts, frames_shape, state_dim)
-
-
-def _add_embeddings(
-    path: Path,
-    instructions: InstructionEmbeddings,
-    embeddings: torch.Tensor | None,
-    names: Any,
-    known: Mapping[str, str],
-) -> None:
-    if known.get("language_encoder") != instructions.encoder_name:
-        raise _error(
-            path,
-            f"its instructions were embedded by {known.get('language_encoder')}, and `language_encoder` is "
-            f"{instructions.encoder_name}",
-        )
-    if embeddings is None or not _are_strings(names) or len(set(names)) != len(embeddings):
-        raise _error(path, "its instructions and embeddings differ in number")
-    lengths = embeddings.norm(dim=1)
-    if not bool(((lengths - 1).abs() < _UNIT_TOLERANCE).all()):
-        raise _error(path, "its embeddings are not unit vectors")
-    new = [n for n, name in enumerate(names) if name not in instructions.rows]
-    instructions.put([names[n] for n in new], embeddings[new])
-
-
-def _demonstrations(
-    path: Path,
-    tensors: dict[str, torch.Tensor],
-    texts: dict[str, Any],
-    frames_shape: tuple[int, ...],
-    state_dim: int,
-) -> DemonstrationBank:
-    frames, tasks, objects = tensors["frames"], texts.get("tasks"), texts.get("target_objects")
-    if tuple(frames.shape[1:]) != frames_shape:
-        raise _error(path, f"its demonstrations have the shape {tuple(frames.shape[1:])}, not {frames_shape}")
-    rows = {name: len(tensor) for name, tensor in tensors.items() if name != "embeddings"}
-    if not _are_strings(tasks) or not tasks or set(rows.values()) != {len(tasks)} or "episodes" not in rows:
-        raise _error(path, f"its demonstrations differ in number: {rows}")
-    if objects is not None and len(objects) != len(tasks):
-        raise _error(path, "its target objects and demonstrations differ in number")
+        return None, saved_with
     bank = DemonstrationBank(
-        frames, tasks, tensors["episodes"].tolist(), objects, tensors.get("first_images")
+        tensors["frames"],
+        texts["tasks"],
+        tensors["episodes"].tolist(),
+        texts["target_objects"],
+        tensors.get("first_images"),
     )
-    states = tensors.get("pick_states")
-    if states is not None:
-        if states.shape[1] != state_dim or bool(states.isinf().any()):
-            raise _error(
-                path, f"its grasps have {states.shape[1]} numbers, and the robot's state {state_dim}"
-            )
-        bank.pick_states = states
+    bank.pick_states = tensors.get("pick_states")
     if "features" in tensors:
-        if not bool(tensors["features"].isfinite().all()):
-            raise _error(path, "its features are not finite")
         bank.features = tensors["features"][:, None].half()
-    return bank
-
-
-def _are_strings(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+    return bank, saved_with
 
 
 def _error(path: Path, reason: str) -> TaskBankError:
     return TaskBankError(
-        f"The task bank {path} cannot be used: {reason}. Save or fetch the checkpoint again."
+        f"The task bank {path} cannot be used: {reason}. Fetch or copy all files of the checkpoint again, or "
+        "save it again."
     )
+
+
+# Digests
+
+
+def configuration_digests(config: PreTrainedConfig) -> dict[str, str]:
+    """Returns a digest of each option that says what the numbers of observations and actions mean."""
+    options = {name: getattr(config, name) for name in _OPTIONS if hasattr(config, name)}
+    for name in _FEATURES:
+        features = (getattr(config, name) or {}).items()
+        options[name] = [[key, feature.type.name, list(feature.shape)] for key, feature in features]
+    options["normalization_mapping"] = {
+        kind: mode.name for kind, mode in config.normalization_mapping.items()
+    }
+    return {name: _digest(value, {}) for name, value in options.items()}
+
+
+def made_processors_digest(config: PreTrainedConfig, stats: Any) -> str | None:
+    """Returns the digest of the processors that LeRobot makes with statistics of a dataset."""
+    with TemporaryDirectory() as folder:
+        for processor in make_pre_post_processors(config, dataset_stats=stats):
+            processor.save_pretrained(folder)
+        return processors_digest(folder)
+
+
+def processors_digest(pretrained: str | Path, **options: Any) -> str | None:
+    """Returns the digest of a checkpoint's processors and their statistics; None if there are none.
+
+    Args:
+        pretrained: Folder of the checkpoint, or its repository's id on the Hub.
+        options: Arguments of `PreTrainedPolicy.from_pretrained`.
+
+    Raises:
+        ValueError: They are damaged.
+    """
+    found = []
+    for name in (POLICY_PREPROCESSOR_DEFAULT_NAME, POLICY_POSTPROCESSOR_DEFAULT_NAME):
+        try:
+            path = checkpoint_file(pretrained, f"{name}.json", **options)
+            text = path.read_text(encoding="utf-8")
+        except (FileNotFoundError, EntryNotFoundError):
+            return None  # a policy alone; LeRobot itself needs both
+        try:
+            for step in json.loads(text)["steps"]:
+                kept = {key: value for key, value in step["config"].items() if key not in _OF_THE_MACHINE}
+                state = step.get("state_file")
+                tensors = load_file(checkpoint_file(pretrained, state, **options)) if state else {}
+                found.append(_digest([step["registry_name"], kept], tensors))
+        except (OSError, SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+            raise ValueError(
+                f"{path} is damaged: {error!r}. Fetch or copy all files of the checkpoint again."
+            ) from error
+    return _digest(found, {})
+
+
+def _digest(value: Any, tensors: Mapping[str, torch.Tensor]) -> str:
+    """Returns the SHA-256 of a value of JSON and of tensors by name, in hexadecimal."""
+    digest = hashlib.sha256(json.dumps(value, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].cpu().contiguous()
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.view(torch.uint8).numpy() if tensor.dim() else tensor.numpy().tobytes())
+    return digest.hexdigest()

@@ -14,6 +14,7 @@ from huggingface_hub import ModelCard
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies import make_policy, make_pre_post_processors
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from small_policies import (
@@ -23,25 +24,23 @@ from small_policies import (
     demos_of,
     fake_encoder,
     observation,
-    random_moves,
     small_policy,
     use_fake_encoder,
     write_dataset,
-    write_table,
 )
 
 from lerobot_deltaco.base_config import SOURCES
 from lerobot_deltaco.base_policy import TrainingDivergedError
 from lerobot_deltaco.deltaco.configuration_deltaco import METHODS
 from lerobot_deltaco.deltaco.modeling_deltaco import DeltacoPolicy
-from lerobot_deltaco.deltaco_match.configuration_deltaco_match import TASK_INPUTS
 from lerobot_deltaco.language import LANGUAGE_ENCODERS
-from lerobot_deltaco.task_bank import TASK_BANK, TaskBankError, read_task_bank
+from lerobot_deltaco.task_bank import TASK_BANK, TaskBankError
 
 pytestmark = pytest.mark.usefixtures("fake_language")
 
 POLICY_ID = f"{USER}/policy"
 N_DEMONSTRATIONS = 2
+WEIGHTS = {"config.json", "model.safetensors", TASK_BANK}
 
 
 @pytest.fixture(scope="module")
@@ -51,9 +50,14 @@ def saved(tmp_path_factory):
         use_fake_encoder(patch)
         folder = tmp_path_factory.mktemp("checkpoint")
         dataset = write_dataset(folder / "data", TASKS[:N_DEMONSTRATIONS])
-        policy, before, _ = small_policy(dataset, **demos_of(dataset))
+        policy, before, after = small_policy(dataset, **demos_of(dataset))
         policy(before(batch_of(dataset, [0, 5])))
+        policy.demonstrations.pick_states = torch.tensor([[0.0, 1.0], [torch.nan] * 2])
         policy.save_pretrained(folder / "policy")
+        assert {path.name for path in (folder / "policy").iterdir()} == WEIGHTS
+        assert policy.config.demo_root not in (folder / "policy" / "config.json").read_text()
+        for processor in (before, after):
+            processor.save_pretrained(folder / "policy")
         seen = before(observation(dataset, TASKS[:N_DEMONSTRATIONS]))
         return folder / "policy", seen, policy.eval().select_action(seen)
 
@@ -75,8 +79,6 @@ def edit(path, change):
 
 def test_checkpoint_is_complete_and_names_no_sources(saved):
     folder, seen, expected = saved
-    assert {path.name for path in folder.iterdir()} == {"config.json", "model.safetensors", TASK_BANK}
-    assert str(folder.parent) not in (folder / "config.json").read_text()
     loaded = DeltacoPolicy.from_pretrained(folder)
     assert [getattr(loaded.config, name) for name in SOURCES] == [None] * 3
     assert torch.equal(loaded.select_action(seen), expected)
@@ -112,76 +114,88 @@ def test_policy_is_saved_by_either_signature_of_lerobot(make, tmp_path, with_sta
 # The task bank
 
 
-def set_tensor(name, function):
-    return lambda tensors, known: tensors.update({name: function(tensors[name])})
+def test_equal_policies_are_equal_files(saved, tmp_path):
+    for name in ("one", "other"):
+        DeltacoPolicy.from_pretrained(saved[0]).save_pretrained(tmp_path / name)
+    for name in WEIGHTS:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+    assert (tmp_path / "one" / TASK_BANK).read_bytes() == (saved[0] / TASK_BANK).read_bytes()
 
 
-def set_known(name, value):
-    return lambda tensors, known: known.update({name: value})
+def edit_config(name, value):
+    def change(folder):
+        path = folder / "config.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {name: value}))
+
+    return change
+
+
+def edit_step(change):
+    def edit_steps(folder):
+        path = folder / "policy_preprocessor.json"
+        content = json.loads(path.read_text())
+        change(content["steps"])
+        path.write_text(json.dumps(content))
+
+    return edit_steps
+
+
+def edit_bank(change):
+    return lambda folder: edit(folder / TASK_BANK, change)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (set_tensor("embeddings", lambda x: 1000 * x), "its embeddings are not unit vectors"),
-        (set_tensor("embeddings", lambda x: x * torch.nan), "its embeddings are not unit vectors"),
-        (set_tensor("embeddings", lambda x: x[:1]), "its instructions and embeddings differ in number"),
-        (set_tensor("embeddings", lambda x: x.double()), "it has the tensor `embeddings` of torch.float64"),
-        (set_tensor("frames", lambda x: x.float()), "it has the tensor `frames` of torch.float32"),
-        (set_tensor("frames", lambda x: x[..., :8]), "its demonstrations have the shape"),
-        (set_tensor("frames", lambda x: x[:1]), "its demonstrations differ in number"),
-        (set_tensor("episodes", lambda x: x[:1]), "its demonstrations differ in number"),
-        (lambda tensors, known: tensors.pop("episodes"), "its demonstrations differ in number"),
-        (lambda tensors, known: tensors.update(more=torch.zeros(2)), "it has the tensor `more`"),
-        (set_known("instructions", '["same", "same"]'), "its instructions and embeddings differ in number"),
-        (set_known("instructions", "[1, 2]"), "its instructions and embeddings differ in number"),
-        (set_known("instructions", "no JSON"), "Expecting value"),
-        (set_known("tasks", "[]"), "its demonstrations differ in number"),
-        (set_known("target_objects", "[1]"), "its target objects and demonstrations differ in number"),
-        (
-            set_known("language_encoder", "all-MiniLM-L6-v2"),
-            "its instructions were embedded by all-MiniLM-L6",
-        ),
+        (edit_bank(lambda tensors, _: tensors["embeddings"].mul_(1000)), "it is damaged"),
+        (edit_bank(lambda tensors, _: tensors.pop("pick_states")), "it is damaged"),
+        (edit_bank(lambda tensors, _: tensors["episodes"].add_(1)), "it is damaged"),
+        (edit_bank(lambda _, known: known.update(deltaco_tasks="[" * 100_000)), "maximum recursion depth"),
+        (edit_bank(lambda _, known: known.clear()), "it is damaged, or of another version"),
+        (edit_config("gripper", "0"), "not saved with this checkpoint's gripper"),
+        (edit_config("gripper_closed", "high"), "not saved with this checkpoint's gripper_closed"),
+        (edit_config("language_encoder", "all-MiniLM-L6-v2"), "this checkpoint's language_encoder"),
+        (lambda folder: scale_statistics(folder), "this checkpoint's processors and statistics"),
+        (edit_step(lambda steps: steps.pop(0)), "this checkpoint's processors and statistics"),
+        (edit_step(lambda steps: steps[-1]["config"]["norm_map"].update(STATE="IDENTITY")), "processors and"),
+        (lambda folder: (folder / TASK_BANK).unlink(), "No such file"),
+        (lambda folder: (folder / TASK_BANK).write_bytes(b"no tensors at all"), "header"),
     ],
 )
-def test_damaged_task_bank_is_an_error(checkpoint, change, message):
-    edit(checkpoint / TASK_BANK, change)
+def test_parts_that_do_not_belong_together_are_an_error(checkpoint, change, message):
+    change(checkpoint)
     with pytest.raises(
-        TaskBankError, match=f"{TASK_BANK} cannot be used: {message}.*Save or fetch the check"
+        TaskBankError,
+        match=f"(?s){TASK_BANK} cannot be used: .*{message}.* all files of the checkpoint again",
     ):
         DeltacoPolicy.from_pretrained(checkpoint)
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no tensors at all"])
-def test_task_bank_that_is_none_is_an_error(checkpoint, content):
-    (checkpoint / TASK_BANK).unlink()
-    if content is not None:
-        (checkpoint / TASK_BANK).write_bytes(content)
-    with pytest.raises(TaskBankError, match=f"{TASK_BANK} cannot be used"):
+def scale_statistics(folder):
+    (file,) = folder.glob("policy_preprocessor*.safetensors")
+    edit(file, lambda tensors, _: tensors["observation.state.mean"].mul_(2))
+
+
+def test_damaged_processors_are_an_error(checkpoint):
+    (checkpoint / "policy_preprocessor.json").write_text("[" * 100_000)
+    with pytest.raises(
+        ValueError, match="policy_preprocessor.json is damaged: RecursionError.*Fetch or copy"
+    ):
         DeltacoPolicy.from_pretrained(checkpoint)
 
 
-@pytest.mark.parametrize("encoder", ["all-MiniLM-L6-v2", "all-distilroberta-v1"], ids=["as large", "larger"])
-def test_another_language_encoder_is_an_error(make, tmp_path, encoder):
-    policy, _, _ = make()
-    policy.save_pretrained(tmp_path)
-    policy.config.language_encoder = encoder
-    with pytest.raises(ValueError, match="L3-v2, and `language_encoder` is all|does not have the weights"):
-        DeltacoPolicy.from_pretrained(tmp_path, config=policy.config)
-
-
-def test_task_bank_of_another_robot_is_an_error(tmp_path):
-    table = write_table(tmp_path / "data", random_moves(2))
-    policy, _, _ = small_policy(table, "deltaco_match", **demos_of(table))
-    policy.save_pretrained(tmp_path / "policy")
-    shape = (2, 3, policy.config.image_size, policy.config.image_size)
-
-    def read(state_dim):
-        return read_task_bank(tmp_path / "policy" / TASK_BANK, None, shape, state_dim)
-
-    assert torch.equal(read(3).pick_states, policy.demonstrations.pick_states)
-    with pytest.raises(TaskBankError, match="its grasps have 3 numbers, and the robot's state 5"):
-        read(5)
+def test_training_continues_on_other_data_than_that_of_its_checkpoint(checkpoint, tmp_path):
+    """States are normalized by the new dataset's statistics, and so are those of the new checkpoint."""
+    dataset = write_dataset(tmp_path / "data", [*TASKS, *TASKS])
+    edit(checkpoint / "model.safetensors", lambda tensors, _: tensors["state_limits.scale"].fill_(0.5))
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_path = checkpoint
+    policy = make_policy(config, ds_meta=dataset.meta)
+    assert policy.state_limits.scale.tolist() == [1.0, 1.0]
+    policy.save_pretrained(tmp_path / "new")
+    for processor in make_pre_post_processors(config, dataset_stats=dataset.meta.stats):
+        processor.save_pretrained(tmp_path / "new")
+    DeltacoPolicy.from_pretrained(tmp_path / "new")
 
 
 # Weights
@@ -235,17 +249,17 @@ def card_of(dataset, policy_type="deltaco", train_config=None, **options):
     ("policy_type", "options"),
     [
         *(("deltaco", {"method": method}) for method in METHODS),
-        *(("deltaco_match", {"inputs": inputs}) for inputs in TASK_INPUTS),
+        ("deltaco_match", {}),
     ],
 )
 def test_every_kind_of_policy_has_a_card(dataset, policy_type, options):
     card = card_of(dataset, policy_type, **options)
-    (name,) = options.values()
+    name = options.get("method", "both")
     assert f"# {policy_type}, trained on {REPO_ID}\n" in card.text
     assert "3 tasks" in card.text
     if policy_type == "deltaco":
         assert f"| method | {name} |".replace("_", r"\_") in card.text
-    takes_demonstrations = name in ("deltaco", "demo_only", "bc_z", "mcil", "both", "demonstration")
+    takes_demonstrations = name in ("deltaco", "demo_only", "bc_z", "mcil", "both")
     assert ("--policy.demo_repo_id" in card.text) == takes_demonstrations
     assert "number 1 is the gripper, which small values close" in card.text
     assert str(dataset.root) not in card.text
@@ -317,9 +331,8 @@ def test_pushed_policy_is_fetched_by_its_id(tmp_path):
         )
         assert result.returncode == 0, result.stderr[-3000:]
         files = hub.repos["model", POLICY_ID].files()
-        weights = {"config.json", "model.safetensors", TASK_BANK}
         processors = {"policy_preprocessor.json", "policy_postprocessor.json"}
-        assert {*weights, *processors, "train_config.json", "README.md"} <= set(files)
+        assert {*WEIGHTS, *processors, "train_config.json", "README.md"} <= set(files)
         for name in ("README.md", "config.json"):
             assert str(tmp_path) not in files[name].decode()
         assert json.loads(files["config.json"])["demo_root"] is None

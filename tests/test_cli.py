@@ -8,6 +8,7 @@ from dataclasses import fields
 
 import pytest
 from fresh_python import run_python
+from safetensors import SafetensorError
 
 from lerobot_deltaco import cli
 
@@ -21,8 +22,6 @@ SLOW_PACKAGES = {
     "torch",
     "transformers",
 }
-# `look` and `play` are functions of modules that load policies.
-QUICK = [name for name in cli.COMMANDS if name not in ("look", "play")]
 PROGRAM = """
 import sys
 from lerobot_deltaco import cli
@@ -42,7 +41,7 @@ for name in sys.argv[1:]:
 @pytest.fixture(scope="module")
 def helps():
     """What the help of the command, and of each subcommand, prints, and which slow packages it imports."""
-    names = ["", *QUICK]
+    names = ["", *cli.COMMANDS]
     result = run_python(PROGRAM, *names, ",".join(SLOW_PACKAGES))
     assert result.returncode == 0, result.stderr
     parts = re.findall(r"(.*?)^END (.*?)$\n", result.stdout, re.MULTILINE | re.DOTALL)
@@ -55,7 +54,7 @@ def test_the_help_lists_all_commands(helps):
         assert re.search(rf"^  {name} +{re.escape(description)}$", text, re.MULTILINE)
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", cli.COMMANDS)
 def test_help_is_quick_and_explains_every_option(helps, name):
     text, slow = helps[name]
     assert f"usage: deltaco {name}" in text
@@ -115,6 +114,26 @@ def test_an_error_that_a_user_can_act_on_is_one_line(monkeypatch, error, message
     with pytest.raises(SystemExit) as caught:
         run_with(monkeypatch, fail)
     assert caught.value.code == message
+
+
+@pytest.mark.parametrize("error", [RuntimeError, OSError, SafetensorError])
+def test_a_full_disk_is_named_whatever_reports_it(monkeypatch, error):
+    def fail() -> None:
+        raise error("I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(cli, "_train", lambda arguments: fail())
+    monkeypatch.setattr(sys, "argv", ["deltaco", "train", "--steps=3", "--output_dir=/mnt/full/run"])
+    with pytest.raises(
+        SystemExit, match=r"^deltaco train: The disk of /mnt/full/run is full. .*--resume=true"
+    ):
+        cli.main()
+
+
+def test_a_mistyped_option_of_json_is_one_line(monkeypatch):
+    for text in ("{'a': 'b'}", "[" * 100_000):
+        monkeypatch.setattr(sys, "argv", ["deltaco", "evaluate", "checkpoint", "--rename-map", text])
+        with pytest.raises(SystemExit, match=r"^deltaco evaluate: --rename-map is not valid JSON: .*\.$"):
+            cli.main()
 
 
 def test_a_bug_shows_its_traceback(monkeypatch):

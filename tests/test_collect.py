@@ -167,6 +167,11 @@ def test_scene_settings_reach_the_scenes_and_the_features(tmp_path):
     assert read_plan(tmp_path) == plan
 
 
+def test_held_out_objects_stand_in_no_scene(tmp_path):
+    plan = CollectionPlan("4", 1, scene=SceneConfig(objects="fold_0:100"))  # task 0 is held out
+    assert collect(tmp_path, plan).episodes == {"name": 1}
+
+
 def test_shards_cover_all_episodes_once():
     for episodes_per_task in (1, 11, 15, 500, 16000):
         plan = CollectionPlan("4", episodes_per_task)

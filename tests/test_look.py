@@ -13,7 +13,7 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import OBJECTS, TASKS, get_task
 from lerobot_deltaco import look as room
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
-from lerobot_deltaco.look import DatasetSource, look
+from lerobot_deltaco.look import look
 from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_found, write_video
 from lerobot_deltaco.recording import load_conditioned, record_demonstration, record_episode
 
@@ -129,7 +129,7 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     folder = save_tiny_policy(tmp_path / "policy")
     drawn = []
     monkeypatch.setattr(room, "draw_found", lambda *args: drawn.append(args) or draw_found(*args))
-    page = look(str(folder), DatasetSource(root=tmp_path / "data"), 3, tmp_path / "out")
+    page = look(str(folder), root=tmp_path / "data", episodes=3, out=tmp_path / "out")
     text = page.read_text()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["index.html"]
     assert text.count("data:image/jpeg;base64") == 3
@@ -161,4 +161,4 @@ def test_what_does_not_fit_is_an_error_that_says_so(tmp_path):
     other.save_episode()
     other.finalize()
     with pytest.raises(ValueError, match=r"needs 'observation.image'.*observation.images.top"):
-        look(str(folder), DatasetSource(root=tmp_path / "other"), out=tmp_path / "out")
+        look(str(folder), root=tmp_path / "other", out=tmp_path / "out")

@@ -143,6 +143,13 @@ def test_acting_in_batches_of_any_size_leaves_the_batch_unchanged(make):
         if made.config.temporal_ensemble_coeff is None:
             assert torch.equal(second, chunk[:, 1 % made.config.n_action_steps])
         assert_same(kept, batch)
+    # The first sample acts as it does alone, also where LeRobot's training evaluates in bfloat16.
+    alone = made.before(observation(made.data, made.tasks[:1]))
+    for together in (False, True):
+        made.policy.reset()
+        with torch.autocast("cpu", torch.bfloat16):
+            found = made.policy.select_action(batch if together else alone)
+        torch.testing.assert_close(found[:1], first[:1], rtol=0, atol=1e-5)
 
 
 def test_optimizer_changes_every_weight_of_the_networks(make):

@@ -57,6 +57,7 @@ CONTRADICTIONS = {
     "a grasped object from -1 to 2": {"grasped_object": 3},
     "a grasped object where it is the right one": {"grasped_object": -1},
     "an object in a container where": {"object_containers": [[-1, -1, -1]] * 12},
+    "a success if the right object alone": {"right_container": False},
 }
 
 
@@ -76,8 +77,13 @@ def test_contradictions_are_refused(tmp_path, monkeypatch, message):
 
 def test_an_incomplete_evaluation_is_refused(tmp_path):
     record = make_record()
-    with pytest.raises(RecordError, match="lacks something"):
-        write_records(tmp_path / "some.parquet", [replace(record, episodes=record.episodes[:-1])])
+    for changes, message in (
+        ({"episodes": record.episodes[:-1]}, "must have 12 episodes"),
+        ({"step": -1}, "must have a step of at least 0"),
+        ({"versions": {}}, "must have a version of the benchmark"),
+    ):
+        with pytest.raises(RecordError, match=message):
+            write_records(tmp_path / "some.parquet", [replace(record, **changes)])
 
 
 def test_datasets_below_a_folder_are_passed_over_and_those_above_do_not_matter(tmp_path):

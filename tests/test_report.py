@@ -299,7 +299,8 @@ def test_the_papers_results_have_names_and_an_order():
 
 
 def test_a_report_has_the_tables_of_its_records(tmp_path):
-    records = [make_record(r"mine/a|b_*c*_$x$", seed, step) for seed in (0, 1) for step in (1000, 2000)]
+    name = r"=mine/a|b_*c*_$x$"
+    records = [make_record(name, seed, step) for seed in (0, 1) for step in (1000, 2000)]
     write_records(tmp_path / "records.parquet", records)
     page = write_report([tmp_path], tmp_path / "out")
     text = page.read_text(encoding="utf-8")
@@ -310,6 +311,7 @@ def test_a_report_has_the_tables_of_its_records(tmp_path):
     assert "50.0 [" in text
     table = pd.read_csv(page.parent / "success.csv")
     assert table.loc[0, "training_seeds"] == "0 1"
+    assert table.loc[0, "experiment"] == f"'{name}"  # no formula in a spreadsheet
     assert table.loc[0, "success"] == 0.5
     # A later report leaves no tables of the earlier one.
     write_records(tmp_path / "records.parquet", records[:1])
@@ -320,7 +322,7 @@ def test_a_report_has_the_tables_of_its_records(tmp_path):
 
 
 def test_names_are_escaped():
-    assert escape("a_b|*c*\n[d](e) `f` <g>") == r"a\_b\|\*c\* \[d\](e) \`f\` \<g\>"
+    assert escape("a_b|*c*\n[d](e) `f` <g> &lt;") == r"a\_b\|\*c\* \[d\](e) \`f\` \<g\> \&lt;"
 
 
 def test_counterfactuals_alone_make_a_report(tmp_path):

@@ -39,12 +39,12 @@ def save_tiny_policy(folder, **options):
         output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
         **options,
     )
-    policy = DeltacoMatchPolicy(config).eval()
+    stats = {"observation.state": {"mean": torch.zeros(10), "std": torch.ones(10)}}
+    policy = DeltacoMatchPolicy(config, stats).eval()
     frames = torch.randint(0, 256, (len(DEMONSTRATED), 2, 3, 48, 48), dtype=torch.uint8)
     tasks = [TASKS[task_id].instruction for task_id in DEMONSTRATED]
     policy.demonstrations = DemonstrationBank(frames, tasks, range(len(tasks)), [4, 26])
     policy.save_pretrained(folder)
-    stats = {"observation.state": {"mean": torch.zeros(10), "std": torch.ones(10)}}
     for processor in make_pre_post_processors(config, dataset_stats=stats):
         processor.save_pretrained(folder)
     return folder

@@ -1,4 +1,4 @@
-"""Writes files whole or not at all: under another name first, then renamed."""
+"""Writes files whole or not at all: under another name first, then renamed. Reads JSON."""
 
 from __future__ import annotations
 
@@ -31,3 +31,33 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, content: Any, indent: int = 4) -> None:
     """Writes a JSON file."""
     write_text(path, json.dumps(content, indent=indent, ensure_ascii=False) + "\n")
+
+
+def parse_json(text: str, source: object) -> Any:
+    """Returns the content of a text of JSON.
+
+    Args:
+        text: The text.
+        source: Where it is from, for the error.
+
+    Raises:
+        ValueError: It is not JSON, or nested too deeply.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{source} is not valid JSON: {error}.") from None
+
+
+def read_json(path: Path) -> Any:
+    """Returns the content of a JSON file.
+
+    Raises:
+        OSError: It cannot be read.
+        ValueError: It is damaged.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not valid JSON: {error}.") from None
+    return parse_json(text, path)
