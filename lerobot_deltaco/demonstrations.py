@@ -155,8 +155,8 @@ class DemonstrationBank(torch.nn.Module):
         """
         rows = self.rows.get(task, [])
         if target_object is not None:
-            moved = self.target_objects or [None] * len(self)
-            rows = [row for row in rows if moved[row] == target_object]
+            moved = self.target_objects
+            rows = [row for row in rows if moved is not None and moved[row] == target_object]
         if not rows:
             raise ValueError(
                 f"There is no demonstration of the task {task!r}"

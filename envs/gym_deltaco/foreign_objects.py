@@ -91,7 +91,9 @@ def _folder() -> Path:
 
 def _read_obj(text: str) -> tuple[np.ndarray, np.ndarray, list[slice]]:
     """Returns vertices (V, 3), faces (F, 3), and the vertices of each convex part."""
-    vertices, faces, starts = [], [], []
+    vertices: list[list[float]] = []
+    faces: list[list[int]] = []
+    starts: list[int] = []
     for key, *values in filter(None, map(str.split, text.splitlines())):
         if key == "o":
             starts.append(len(vertices))
