@@ -2,7 +2,7 @@
 
 Rates are fractions, 0..1. The episodes of a task are alike, and training seeds share the evaluation scenes,
 so neither are independent trials. Therefore, intervals come from a bootstrap over tasks, in which a task is
-drawn with all its episodes of all training seeds. Near 0 and 1, where it says little, they are Wilson's.
+drawn with all its episodes of all training seeds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from gym_deltaco.workspace import Quadrant, container_matches
 from lerobot_deltaco.records import EvaluationRecord, scene_columns
 
 N_DRAWS = 10_000
-_FEW = 5  # successes or failures, with which the bootstrap says little
 _SEED = 0  # of the bootstrap, so that a report is a function of its records
 N_BEST_SETS = 10  # evaluation sets that the paper averages
 NOVELTIES = ("training_task", "other_words", "unnamed_target", "never_target")
@@ -72,12 +71,8 @@ def task_rates(episodes: pd.DataFrame) -> pd.Series:
 
 
 def success_interval(episodes: pd.DataFrame) -> Estimate:
-    """Returns the success rate with its 95 % interval, by bootstrap over tasks, or Wilson's near 0 and 1."""
-    count, total = int(episodes["success"].sum()), len(episodes)
-    estimate = bootstrap(task_rates(episodes))
-    if _FEW <= count <= total - _FEW:
-        return estimate
-    return Estimate(estimate.value, *wilson_interval(count, total))
+    """Returns the success rate with its 95 % interval by bootstrap over tasks."""
+    return bootstrap(task_rates(episodes))
 
 
 def paired_difference(episodes: pd.DataFrame, reference: pd.DataFrame) -> Estimate | None:
