@@ -70,6 +70,7 @@ class DeltacoEnv(EnvConfig):
                     "Only a demonstration says which foreign object is meant, and LeRobot's evaluation looks "
                     "for it by the sentence. Evaluate foreign objects with `deltaco evaluate`."
                 )
+            self.scene = self.scene.for_tasks(self.task)
             self.scene.check_tasks(task_ids)
             if self.max_parallel_tasks != 1:
                 raise ValueError(

@@ -20,7 +20,7 @@ def test_nothing_gives_foreign_targets_away():
 
 def test_adversarial_distractors_give_the_target_away():
     uniform, adversarial = (
-        chance_levels(range(24, 32), SceneConfig(adversarial_probability=p), first_trial=1000) for p in (0, 1)
+        chance_levels(range(24, 32), SceneConfig(adversarial_probability=p), n_trials=30) for p in (0, 1)
     )
     rule = "most shared colors and shapes"
     assert uniform["random object"] == adversarial["random object"] == pytest.approx(1 / 3)
