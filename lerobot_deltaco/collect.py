@@ -95,12 +95,8 @@ class CollectionPlan:
             number = getattr(self, name)
             if not lowest <= number < math.inf:
                 raise ValueError(f"`{name}` must be at least {lowest}. Got {number}.")
+        object.__setattr__(self, "scene", self.scene.for_tasks(self.tasks))
         self.scene.check_tasks(self.task_ids)
-        if self.tasks.strip() == "scenario_a_clean_train" and self.scene.objects == "all":
-            raise ValueError(
-                "Scenes of scenario_a_clean_train show no test objects. Set the scene's `objects` to "
-                "scenario_a_train."
-            )
         if self.split is None:
             object.__setattr__(self, "split", self._default_split())
         if self.split not in get_args(Split):
@@ -109,6 +105,8 @@ class CollectionPlan:
     def _default_split(self) -> Split:
         if self.tasks in DATA_SETS:
             return DATA_SETS[self.tasks][1]
+        if self.tasks.strip() == "foreign":
+            return "validation"
         for kind in ("_test", "_validation"):
             held_out = TASK_SETS[f"scenario_a{kind}"]
             if self.tasks.endswith(kind) and set(self.task_ids) <= set(held_out):
@@ -124,6 +122,11 @@ class CollectionPlan:
             return select_tasks(self.tasks)
         except ValueError as error:
             raise ValueError(f"{error} Also valid are the datasets {', '.join(DATA_SETS)}.") from None
+
+    @property
+    def instructions(self) -> list[str]:
+        """Instructions, in the order of their index in the dataset; foreign objects share theirs."""
+        return list(dict.fromkeys(get_task(task_id).instruction for task_id in self.task_ids))
 
     @property
     def n_episodes(self) -> int:
@@ -196,10 +199,9 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
             write_json(root / DESCRIPTION_FILE, _description(plan))
         speed = _collect_shards(root, plan, workers)
         write_json(root / DESCRIPTION_FILE, {**_description(plan), **_outcome(root, plan)})
-        instructions = [get_task(task_id).instruction for task_id in plan.task_ids]
         dataset_writer.number_frames(root, len(plan.shards))
         dataset_writer.write_metadata(
-            root, dataset_features(plan.scene), plan.scene.interface.fps, ROBOT_TYPE, instructions
+            root, dataset_features(plan.scene), plan.scene.interface.fps, ROBOT_TYPE, plan.instructions
         )
     except BrokenProcessPool:
         raise CollectionError(
@@ -392,12 +394,14 @@ def _worker_env(plan: CollectionPlan) -> PickPlaceEnv:
 
 
 def _collect_shard(env: PickPlaceEnv, root: Path, plan: CollectionPlan, shard: int) -> int:
+    instructions = plan.instructions
+
     def episodes() -> Iterator[dataset_writer.Episode]:
         for index in plan.shards[shard]:
             task_id, number = _task_and_number(plan, index)
             frames = collect_episode(env, plan, task_id, number)
-            task_index = index // plan.episodes_per_task
-            yield dataset_writer.Episode(frames, get_task(task_id).instruction, task_index)
+            instruction = get_task(task_id).instruction
+            yield dataset_writer.Episode(frames, instruction, instructions.index(instruction))
 
     first = plan.shards[shard].start
     dataset_writer.write_shard(

@@ -149,20 +149,29 @@ class DemonstrationBank(torch.nn.Module):
             None if self.target_objects is None else self.target_objects[row],
         )
 
-    def of_task(self, task: str) -> list[Demonstration]:
+    def of_task(self, task: str, target_object: int | None = None) -> list[Demonstration]:
         """Returns the demonstrations of a task.
+
+        Args:
+            task: Task string.
+            target_object: Index of the object that they move, where the task string does not say which.
 
         Raises:
             ValueError: There are none; the message names tasks that have some.
         """
-        if task not in self.rows:
+        rows = self.rows.get(task, [])
+        if target_object is not None:
+            moved = self.target_objects
+            rows = [row for row in rows if moved is not None and moved[row] == target_object]
+        if not rows:
             raise ValueError(
-                f"There is no demonstration of the task {task!r}. There are demonstrations of "
+                f"There is no demonstration of the task {task!r}"
+                f"{'' if target_object is None else f' with object {target_object}'}. There are some of "
                 f"{len(self.rows)} tasks, such as {next(iter(self.rows))!r}. Name a dataset that has the "
                 "task with --policy.demo_repo_id and --policy.demo_root. If its wording differs, choose an "
                 "episode with --policy.demo_episode."
             )
-        return [self[row] for row in self.rows[task]]
+        return [self[row] for row in rows]
 
     def of_episode(self, episode: int) -> Demonstration:
         """Returns the demonstration of an episode of the dataset.

@@ -168,7 +168,8 @@ class Evaluation:
         assert policy is not None
         if policy.config.demo_episode is not None:
             return [self._bank.of_episode(policy.config.demo_episode)]
-        known = self._bank.of_task(get_task(episode.demonstration_task).instruction)
+        task = get_task(episode.demonstration_task)
+        known = self._bank.of_task(task.instruction, task.target_object)
         n_each = self.plan.n_demonstrations
         return [known[(episode.trial * n_each + n) % len(known)] for n in range(n_each)]
 

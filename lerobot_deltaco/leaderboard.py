@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -15,11 +17,28 @@ from lerobot_deltaco.paper_results import PAPER_RESULTS, small_scale_experiment,
 from lerobot_deltaco.records import read_records
 from lerobot_deltaco.report import markdown_table
 from lerobot_deltaco.report_tables import KINDS, ReportError, Series, make_series
-from lerobot_deltaco.statistics import Estimate, paired_difference
+from lerobot_deltaco.statistics import Estimate, paired_difference, wilson_interval
 
 LEADERBOARD_PAGE, PAPER_PAGE = Path("docs", "leaderboard.md"), Path("docs", "paper.md")
 ROWS_FILE = Path("results", "leaderboard.csv")
-TASKS, AMBIGUITY = "scenario_a_test", "container"  # of the leaderboard
+# Title of each section, and a sentence about its rows
+_SECTIONS = {
+    "paper": (
+        "Trained on the paper's 198 tasks",
+        "Scenario A's test tasks. The test objects are distractors in training scenes, as in the paper.",
+    ),
+    "without": (
+        "Trained without the test objects",
+        "Scenario A's test tasks. No training scene shows their objects.",
+    ),
+    "single": ("Single inputs", "Scenario A's test tasks. The policy receives one of the two inputs."),
+    "bounds": ("Upper bounds", "Scenario A's test tasks, on which these policies were trained."),
+    "foreign": (
+        "Foreign objects",
+        "The 96 tasks of `foreign`, 384 episodes. No policy was trained on such objects.",
+    ),
+}
+_FEW = 5  # successes, with fewer of which the bootstrap's interval is too narrow
 NOT_RUN = "not run"
 BEGIN, END = "<!-- Made from the records in results/. -->", "<!-- End of what is made from records. -->"
 # DeL-TaCo's row, the reference for the other rows of a table of the paper.
@@ -45,41 +64,57 @@ def replace_section(page: str, begin: str, end: str, text: str) -> str:
 
 
 def leaderboard(root: Path) -> str:
-    """Returns the leaderboard in Markdown, best first.
+    """Returns the sections of the leaderboard in Markdown, the rows of each best first.
 
     Args:
-        root: Folder of the repository, with the rows in `results/leaderboard.csv`: name of the method, its
-            inputs, file and experiment of its records, and its training.
+        root: Folder of the repository, with the rows in `results/leaderboard.csv`: section, name of the
+            method, its inputs, file and experiment of its records, and its training data.
 
     Raises:
         RecordError: A file has no valid records.
         ReportError: A file lacks the experiment, or has it for other tasks.
     """
-    rows = []
+    rows: dict[str, list[tuple[Any, Series]]] = {name: [] for name in _SECTIONS}
     for row in pd.read_csv(root / ROWS_FILE).itertuples():
-        series = _find(root / "results" / row.records, row.experiment)
-        if (series.settings["tasks"], series.settings["ambiguity"]) != (TASKS, AMBIGUITY):
+        rows[row.section].append((row, _find(root / "results" / row.records, row.experiment)))
+    return "\n".join(_section(name, rows[name]) for name in _SECTIONS)
+
+
+def _section(name: str, rows: Sequence[tuple[Any, Series]]) -> str:
+    tasks = "foreign" if name == "foreign" else "scenario_a_test"
+    cells = []
+    for row, series in sorted(rows, key=lambda pair: -pair[1].success.value):
+        if (series.settings["tasks"], series.settings["ambiguity"]) != (tasks, "container"):
             raise ReportError(
-                f"The leaderboard is of the tasks {TASKS!r} with the ambiguity scheme {AMBIGUITY!r}. "
-                f"{row.experiment!r} in {row.records} has {series.settings['tasks']!r} and "
-                f"{series.settings['ambiguity']!r}."
+                f"The section {name!r} of the leaderboard is of the tasks {tasks!r} in ambiguity scheme "
+                f"container. {row.experiment!r} in {row.records} has {series.settings['tasks']!r} and "
+                f"{series.settings['ambiguity']}."
             )
         kinds = series.episodes["task_id"].map(lambda task_id: get_task(task_id).kind)
         by_kind = series.episodes["success"].groupby(kinds).mean()
-        rows.append(
+        n_seeds = len(series.seeds)
+        cells.append(
             {
-                "rate": series.success.value,
                 "method": row.method,
                 "given": row.given,
-                "success, % [95 %]": _text(series.success),
-                **{kind: f"{100 * by_kind[kind]:.1f}" for kind in KINDS if kind in by_kind},
-                "seeds": str(len(series.seeds)),
-                "training": row.training,
-                "experiment": f"`{row.experiment}`",
+                "success, % [95 %]": _success(series),
+                "name / color / shape": " / ".join(f"{100 * by_kind[k]:.0f}" for k in KINDS if k in by_kind),
+                "training": row.data + (f"; {n_seeds} seeds" if n_seeds > 1 else ""),
+                "experiment": f"`{row.experiment}` ({_scenes(series)})",
             }
         )
-    table = pd.DataFrame(rows).sort_values("rate", ascending=False, kind="stable")
-    return markdown_table(table.drop(columns="rate"))
+    table = pd.DataFrame(cells)
+    if name == "foreign":
+        table = table.drop(columns="name / color / shape")
+    title, text = _SECTIONS[name]
+    scenes = ", ".join(sorted({_scenes(series) for _, series in rows}))
+    return f"## {title}\n\n{text} Scenes: {scenes}.\n\n{markdown_table(table)}"
+
+
+def _scenes(series: Series) -> str:
+    """Returns the scenes of an evaluation as the page abbreviates them."""
+    plan = series.last[0].plan
+    return f"{plan.seed}" if plan.scene_set is None else f"{plan.seed}/{plan.scene_set}"
 
 
 def paper_tables(root: Path) -> str:
@@ -111,7 +146,7 @@ def _paper_row(name: str, reference: str, series: Series | None, deltaco: Series
     return {
         "row": published.label,
         "paper, % (SD)": f"{100 * published.rate:.1f} ({100 * published.sd:.1f})",
-        "here, % [95 %]": _text(series.success) if series else NOT_RUN,
+        "here, % [95 %]": _success(series) if series else NOT_RUN,
         "seeds": str(len(series.seeds)) if series else "",
         "paper: less DeL-TaCo": "" if is_reference else f"{100 * difference:+.1f}",
         "here: less DeL-TaCo [95 %]": "" if is_reference or not paired else _text(paired, "+"),
@@ -128,6 +163,14 @@ def _find(file: Path, experiment: str) -> Series:
     if len(found) != 1:
         raise ReportError(f"{file} must have {experiment!r} in one setting. It has {len(found)}.")
     return found[0]
+
+
+def _success(series: Series) -> str:
+    """Returns a success rate with its interval: Wilson's if few episodes succeeded, else by bootstrap."""
+    success, n_episodes = series.episodes["success"], len(series.episodes)
+    if success.sum() < _FEW:
+        return _text(Estimate(success.mean(), *wilson_interval(int(success.sum()), n_episodes)))
+    return _text(series.success)
 
 
 def _text(estimate: Estimate, sign: str = "") -> str:

@@ -65,7 +65,14 @@ class DeltacoEnv(EnvConfig):
 
     def __post_init__(self) -> None:
         try:
-            self.scene.check_tasks(select_tasks(self.task))
+            task_ids = select_tasks(self.task)
+            if any(get_task(task_id).kind == "foreign" for task_id in task_ids):
+                raise ValueError(
+                    "Only a demonstration says which foreign object is meant, and LeRobot's evaluation looks "
+                    "for it by the sentence. Evaluate foreign objects with `deltaco evaluate`."
+                )
+            self.scene = self.scene.for_tasks(self.task)
+            self.scene.check_tasks(task_ids)
             if self.max_parallel_tasks != 1:
                 raise ValueError(
                     "`max_parallel_tasks` must be 1: a policy holds the task of one episode. To use more "

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import N_TASKS, get_task, select_tasks
+from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.paraphrases import GRAMMAR
 
 if TYPE_CHECKING:
@@ -92,6 +92,7 @@ class EvaluationPlan:
     joint_noise: float = 0.0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "scene", self.scene.for_tasks(self.tasks))
         self.scene.check_tasks(self.task_ids)
         least = {"trials": 1, "seed": 0, "scene_set": 0, "n_demonstrations": 1}
         for name, smallest in least.items():
@@ -295,7 +296,9 @@ def _check(record: EvaluationRecord, source: str) -> None:
             & rows["trial"].between(0, record.plan.trials - 1)
             & ~rows.duplicated(["task_id", "trial"])
         ),
-        "a demonstrated task of the benchmark, or -1": rows["demonstration_task"].between(-1, N_TASKS - 1),
+        "a demonstrated task of the plan, or -1": rows["demonstration_task"].isin(
+            {-1, *record.plan.task_ids}
+        ),
         "containers -1, 0 or 1 of three objects": containers.map(
             lambda found: len(found) == _N_OBJECTS and set(found) <= {-1, 0, 1}
         ),

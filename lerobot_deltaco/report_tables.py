@@ -32,7 +32,7 @@ from lerobot_deltaco.statistics import (
     wilson_interval,
 )
 
-KINDS = ("name", "color", "shape", "color_shape")
+KINDS = ("name", "color", "shape", "color_shape", "foreign")
 # Settings that never belong to the main ones of a group.
 _MAIN = {"counterfactual": "none", "without": "none", "wording": TEMPLATES}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.simulation import Simulation, camera_matrices
-from gym_deltaco.tasks import OBJECTS, SCENARIOS, SHAPES, get_task
+from gym_deltaco.tasks import OBJECTS, SCENARIOS, SHAPES, TASK_SETS, get_task
 from gym_deltaco.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 
 # Tasks of all kinds with various containers: six names, three colors, three shapes
@@ -76,16 +76,25 @@ def _object_views(simulation: Simulation, model: ObjectModel) -> tuple[NDArray[n
 
 def draw_scenes(out: Path) -> None:
     """Draws the first image of an episode of several tasks, for people and for a policy."""
+    _draw_scenes(SCENE_TASKS, SceneConfig(), out / "scenes.png")
+
+
+def draw_foreign_scenes(out: Path) -> None:
+    """Draws the first image of an episode of several tasks with foreign objects."""
+    _draw_scenes(TASK_SETS["foreign"][:12], SceneConfig(objects="foreign"), out / "foreign_objects.png")
+
+
+def _draw_scenes(task_ids: Sequence[int], scene: SceneConfig, path: Path) -> None:
     figure, axes = _grid(4, 6, (13.6, 11.0))
-    with closing(PickPlaceEnv()) as env:
-        for (left, right), task_id in zip(axes.reshape(-1, 2), SCENE_TASKS, strict=True):
+    with closing(PickPlaceEnv(task_ids[0], scene)) as env:
+        for (left, right), task_id in zip(axes.reshape(-1, 2), task_ids, strict=True):
             observation, _ = env.reset(
                 seed=episode_seed(0, "train", task_id, 0), options={"task_id": task_id}
             )
             left.imshow(env.scene.render(VIEW_SIZE))
             right.imshow(observation["pixels"], interpolation="nearest")
             left.set_title(textwrap.fill(f"{task_id}: {env.task_description}", 58), loc="left")
-    _save(figure, out / "scenes.png")
+    _save(figure, path)
 
 
 def draw_episodes(out: Path) -> None:
@@ -252,7 +261,14 @@ def main(arguments: list[str] | None = None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     mpl.use("Agg")
     with mpl.rc_context({"axes.titlesize": 9, "axes.labelsize": 9}):
-        for draw in (draw_objects, draw_scenes, draw_episodes, draw_ambiguity, draw_joint_control):
+        for draw in (
+            draw_objects,
+            draw_scenes,
+            draw_foreign_scenes,
+            draw_episodes,
+            draw_ambiguity,
+            draw_joint_control,
+        ):
             draw(out)
 
 

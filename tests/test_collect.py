@@ -215,7 +215,6 @@ def test_held_out_tasks_are_for_validation():
         ({"seed": -1}, "`seed` must be at least 0"),
         ({"noise": float("nan")}, "`noise` must be at least 0. Got nan"),
         ({"split": "test"}, "`split` must be one of train, validation. Got 'test'"),
-        ({"tasks": "scenario_a_clean_train"}, "Set the scene's `objects` to scenario_a_train"),
     ],
 )
 def test_invalid_plans_are_refused(arguments, message):

@@ -11,7 +11,10 @@ import gallery
 
 def test_gallery_draws_every_image(tmp_path):
     gallery.main([str(tmp_path)])
-    names = {"objects_by_shape.png", "scenes.png", "episode.gif", "ambiguity.png", "joint_control.png"}
+    names = {
+        *("objects_by_shape.png", "scenes.png", "foreign_objects.png"),
+        *("episode.gif", "ambiguity.png", "joint_control.png"),
+    }
     assert {path.name for path in tmp_path.iterdir()} == names
     for name in names:
         with Image.open(tmp_path / name) as image:

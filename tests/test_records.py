@@ -51,7 +51,7 @@ def test_a_folder_is_searched(tmp_path):
 
 
 CONTRADICTIONS = {
-    "a demonstrated task of the benchmark, or -1": {"demonstration_task": 777},
+    "a demonstrated task of the plan, or -1": {"demonstration_task": 777},
     "tasks and trials of the plan": {"trial": 0},
     "containers -1, 0 or 1 of three objects": {"object_containers": [[2, -1, -1]] * 12},
     "a grasped object from -1 to 2": {"grasped_object": 3},

@@ -4,7 +4,9 @@ import functools
 import hashlib
 import json
 import multiprocessing
+import re
 from contextlib import closing
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +18,7 @@ from gym_deltaco.expert import expert_episode
 from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene_config import AMBIGUITIES, SceneConfig
 from gym_deltaco.tasks import get_task
+from lerobot_deltaco.records import EvaluationPlan
 
 # Task, seed and settings of scenes
 SCENES = [
@@ -85,6 +88,19 @@ def test_scene_has_its_fixed_layout_and_image(number):
         observation, _ = env.reset(seed=seed)
         assert layout_digest(env.scene.layout) == LAYOUTS[number]
         assert hashlib.sha256(observation["pixels"].tobytes()).hexdigest() == IMAGES[number]
+
+
+def test_scenes_of_the_protocol_are_those_on_its_page():
+    page = (Path(__file__).parents[1] / "docs/benchmark.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| `(\w{16})` \| `(\w{16})` \|$", page, re.MULTILINE)
+    assert len(rows) == 12
+    protocol, foreign = EvaluationPlan(), EvaluationPlan("foreign", seed=9300)
+    for number, layout, image in rows:
+        plan = protocol if int(number) in protocol.task_ids else foreign
+        with closing(PickPlaceEnv(int(number), plan.scene)) as env:
+            observation, _ = env.reset(seed=plan.scene_seed(int(number), 0))
+            assert layout_digest(env.scene.layout).startswith(layout)
+            assert hashlib.sha256(observation["pixels"].tobytes()).hexdigest().startswith(image)
 
 
 # Episodes

@@ -188,11 +188,11 @@ def test_invalid_selection_is_an_error_that_says_what_is_valid(selections, messa
 
 
 def test_task_id_must_be_an_integer_in_range():
-    for index in (0, 299, 1000, 1479, np.int64(4), np.uint8(4)):
+    for index in (0, 299, 1000, 1479, 2500, 7999, np.int64(4), np.uint8(4)):
         assert get_task(index).index == index
         assert type(get_task(index).index) is int
-    for index in (-1, 300, 999, 1480, 4.0, np.float32(4), True, np.bool_(1), "4", None, [4]):
-        with pytest.raises(ValueError, match=r"integer from 0 to 299, or from 1000 to 1479 .*\. Got "):
+    for index in (-1, 300, 999, 1480, 2499, 8500, 4.0, np.float32(4), True, np.bool_(1), "4", None, [4]):
+        with pytest.raises(ValueError, match=r"integer from 0 to 299, from 1000 to 1479 .*\. Got "):
             get_task(index)
 
 

@@ -8,9 +8,19 @@ from types import MappingProxyType
 
 import numpy as np
 
+from gym_deltaco.foreign_objects import foreign_label, foreign_model, is_foreign
 from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.random_objects import FIRST_INDEX, random_label, random_model
-from gym_deltaco.tasks import FOLDS, OBJECTS, SCENARIOS, ObjectLabel, fold_pairs
+from gym_deltaco.tasks import (
+    FIRST_FOREIGN_INDEX,
+    FOLDS,
+    FOREIGN_MESHES,
+    MESHES,
+    OBJECTS,
+    SCENARIOS,
+    ObjectLabel,
+    fold_pairs,
+)
 
 OBJECT_SETS = MappingProxyType(
     {
@@ -19,11 +29,14 @@ OBJECT_SETS = MappingProxyType(
         "all": OBJECTS,
         # Without the 8 test objects of scenario A.
         "scenario_a_train": tuple(label for label in OBJECTS if label.index in SCENARIOS["a"].train_rows),
+        "foreign": tuple(foreign_label(FIRST_FOREIGN_INDEX + mesh) for mesh in FOREIGN_MESHES),
+        # Also those that the expert does not manage
+        "foreign_unchecked": tuple(foreign_label(FIRST_FOREIGN_INDEX + mesh) for mesh in MESHES),
     }
 )
 MAX_OBJECTS = 10_000
 # Default objects of task sets that do not draw their scenes from all objects
-_OBJECTS_OF_TASK_SETS = MappingProxyType({"scenario_a_clean_train": "scenario_a_train"})
+_OBJECTS_OF_TASK_SETS = MappingProxyType({"scenario_a_clean_train": "scenario_a_train", "foreign": "foreign"})
 
 
 def select_objects(name: str) -> tuple[ObjectLabel, ...]:
@@ -69,22 +82,27 @@ def _with_random_objects(name: str, n_objects: int, fold: int | None) -> tuple[O
 
 
 def find_label(index: int) -> ObjectLabel:
-    """Returns name, shape and color of one of the paper's objects (index 0..31) or a random one (32..10007).
+    """Returns name, shape and color of an object: 0..31 the paper's, 32..10007 random, 20500..20999 foreign.
 
     Raises:
         ValueError: The index is not a non-negative integer.
     """
     _check_index(index)
+    if is_foreign(index):
+        return foreign_label(index)
     return OBJECTS[index] if index < FIRST_INDEX else random_label(index)
 
 
 def find_model(index: int) -> ObjectModel:
-    """Returns the geometry of one of the paper's objects (index 0..31) or a random one (32..10007).
+    """Returns the geometry of an object: 0..31 the paper's, 32..10007 random, 20500..20999 foreign.
 
     Raises:
         ValueError: The index is not a non-negative integer.
+        ImportError: The object is foreign, and PyBullet is not installed.
     """
     _check_index(index)
+    if is_foreign(index):
+        return foreign_model(index)
     return object_model(index) if index < FIRST_INDEX else random_model(index)
 
 
@@ -92,7 +110,8 @@ def _check_index(index: int) -> None:
     if not isinstance(index, (int, np.integer)) or index < 0:
         raise ValueError(
             f"An object's index must be an integer of at least 0: 0 to {FIRST_INDEX - 1} are the paper's "
-            f"objects, {FIRST_INDEX} and above random ones. Got {index!r}."
+            f"objects, {FIRST_FOREIGN_INDEX + MESHES[0]} to {FIRST_FOREIGN_INDEX + MESHES[-1]} foreign ones, "
+            f"all others random ones. Got {index!r}."
         )
 
 

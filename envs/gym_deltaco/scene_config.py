@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gym_deltaco.control import CONTROLS, Control
-from gym_deltaco.object_sets import select_objects
+from gym_deltaco.object_sets import default_objects, select_objects
 from gym_deltaco.tasks import get_task
 
 AMBIGUITIES = ("container", "object")
@@ -24,7 +24,8 @@ class SceneConfig:
             does not tell which of the two containers is meant. "object" (ii): the target has an identical
             twin, and only a demonstration tells which of the two is meant.
         objects: Set of objects from which scenes are drawn: "all", the paper's 32; "scenario_a_train", the 24
-            training objects of scenario A; or "random:N", these 24 and N - 24 random objects.
+            training objects of scenario A; "random:N", these 24 and N - 24 random objects; or "foreign",
+            meshes that come with PyBullet. For a task set that needs others than "all", it is these.
         adversarial_probability: Probability that a distractor shares the target's color or shape, 0..1. It is
             0.6 in the paper's data; with 0, distractors are uniform. Unused with ambiguity "object".
         adversarial_draw: Scope of a draw with that probability: "each" distractor; or the whole "scene", as
@@ -80,6 +81,10 @@ class SceneConfig:
     def n_steps(self) -> int:
         """Number of steps of an episode."""
         return self.interface.episode_length if self.episode_length is None else self.episode_length
+
+    def for_tasks(self, tasks: str) -> SceneConfig:
+        """Returns the settings with the objects that a selection of tasks needs, unless others are set."""
+        return replace(self, objects=default_objects(tasks)) if self.objects == "all" else self
 
     def check_tasks(self, task_ids: Iterable[int]) -> None:
         """Checks that the objects include one that fits each task.

@@ -5,20 +5,24 @@ are containers: green, red, front, back, left, right. The index of a task is `50
 appendix A).
 
 Beyond the paper's table, 80 rows (50..129) ask for an object by color and shape, `50 + 10 * color + shape`,
-since random objects have no names. The index of such a task is `1000 + 80 * column + row - 50`.
+since random objects have no names. The index of such a task is `1000 + 80 * column + row - 50`. Rows 500 to
+999 ask for a "thing", which only a demonstration shows: a mesh of `gym_deltaco.foreign_objects` with that
+number. The index of such a task is `2000 + 1000 * column + row`.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Integral
+from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-TaskKind = Literal["name", "color", "shape", "color_shape"]
+TaskKind = Literal["name", "color", "shape", "color_shape", "foreign"]
 ContainerColor = Literal["green", "red"]
 ContainerWord = Literal["green", "red", "front", "back", "left", "right"]
 
@@ -41,14 +45,16 @@ CONTAINER_WORDS: tuple[ContainerWord, ...] = ("green", "red", "front", "back", "
 
 @dataclass(frozen=True)
 class ObjectLabel:
-    """Name, shape and color of an object; its geometry is in `gym_deltaco.objects` or `random_objects`.
+    """Name, shape and color of an object.
+
+    Its geometry is in `gym_deltaco.objects`, `random_objects` or `foreign_objects`.
 
     Attributes:
         index: 0..31 for the paper's objects, in the order of its table (0..23 are scenario A's training
-            objects); 32..10007 for random objects.
-        name: Name of the object, such as "conic cup". No instruction uses the name of a random object.
-        shape: One of `SHAPES`.
-        color: One of `COLORS`.
+            objects); 32..10007 for random objects; 20500..20999 for foreign ones.
+        name: Name of the object, such as "conic cup". No instruction uses that of a random or foreign object.
+        shape: One of `SHAPES`; of a foreign object, its name, so that it shares it with no other.
+        color: One of `COLORS`; of a foreign object, its name.
     """
 
     index: int
@@ -104,21 +110,28 @@ _FIRST_COLOR_ROW = len(OBJECTS)
 _FIRST_SHAPE_ROW = _FIRST_COLOR_ROW + len(COLORS)
 _N_PAIRS = len(COLORS) * len(SHAPES)
 _PAIR_TASKS = range(1000, 1000 + N_COLUMNS * _N_PAIRS)
+_FOREIGN_TASKS = range(2000, 2000 + N_COLUMNS * 1000)
+MESHES = range(500, 1000)  # of PyBullet's 1,000 random ones; the benchmark never uses the others
+FIRST_FOREIGN_INDEX = 20_000  # index of the object that mesh 0 would be
+FOREIGN_FILE = Path(__file__).with_name("foreign_objects.json")
 
 
 @dataclass(frozen=True)
 class Task:
-    """A task: put an object, given by name, color, shape, or color and shape, into a container.
+    """A task: put an object, given by name, color, shape, or both, or by a demonstration, into a container.
 
     Attributes:
-        index: 0..299, `50 * column + row`; or 1000..1479 for tasks by color and shape.
+        index: 0..299, `50 * column + row`; 1000..1479 for tasks by color and shape; or
+            `2000 + 1000 * column + row` for foreign objects.
     """
 
     index: int
 
     @property
     def row(self) -> int:
-        """Row of the task table: 0..31 names, 32..39 colors, 40..49 shapes, 50..129 colors with shapes."""
+        """Row of the task table: 0..31 names, 32..39 colors, 40..49 shapes, 50..129 both, 500..999 meshes."""
+        if self.index in _FOREIGN_TASKS:
+            return self.index % 1000
         if self.index in _PAIR_TASKS:
             return N_ROWS + (self.index - _PAIR_TASKS.start) % _N_PAIRS
         return self.index % N_ROWS
@@ -126,6 +139,8 @@ class Task:
     @property
     def column(self) -> int:
         """Column of the task table, 0..5: an index into `CONTAINER_WORDS`."""
+        if self.index in _FOREIGN_TASKS:
+            return (self.index - _FOREIGN_TASKS.start) // 1000
         if self.index in _PAIR_TASKS:
             return (self.index - _PAIR_TASKS.start) // _N_PAIRS
         return self.index // N_ROWS
@@ -136,7 +151,7 @@ class Task:
         if self.row < _FIRST_COLOR_ROW:
             return "name"
         if self.row >= N_ROWS:
-            return "color_shape"
+            return "foreign" if self.row in MESHES else "color_shape"
         return "color" if self.row < _FIRST_SHAPE_ROW else "shape"
 
     @property
@@ -154,8 +169,15 @@ class Task:
         """Indices of the paper's objects that the instruction describes."""
         return tuple(label.index for label in OBJECTS if self.describes(label))
 
+    @property
+    def target_object(self) -> int | None:
+        """Index of the object that a demonstration has to move; None if the instruction describes it."""
+        return FIRST_FOREIGN_INDEX + self.row if self.kind == "foreign" else None
+
     def describes(self, label: ObjectLabel) -> bool:
-        """Returns whether the instruction describes an object."""
+        """Returns whether the task asks for an object, by its instruction or its demonstration."""
+        if self.target_object is not None:
+            return label.index == self.target_object
         if self.kind == "name":
             return label.index == self.row
         if self.kind == "color":
@@ -181,6 +203,8 @@ class Task:
     @property
     def object_phrase(self) -> str:
         """Object in the words of the instruction, such as "blue colored object"."""
+        if self.kind == "foreign":
+            return "thing"
         if self.kind == "name":
             label = OBJECTS[self.row]
             return f"{label.color} colored, {label.shape} shaped {label.name}"
@@ -295,16 +319,19 @@ def get_task(index: int) -> Task:
     """Returns the task of an index.
 
     Args:
-        index: 0..299 for the paper's tasks, 1000..1479 for tasks by color and shape.
+        index: 0..299 for the paper's tasks, 1000..1479 for tasks by color and shape, and
+            `2000 + 1000 * column + mesh` for foreign objects.
 
     Raises:
         ValueError: The index is not an integer, or out of range.
     """
     is_integer = isinstance(index, Integral) and not isinstance(index, bool)
-    if not is_integer or not (0 <= index < N_TASKS or index in _PAIR_TASKS):
+    is_foreign = is_integer and index in _FOREIGN_TASKS and index % 1000 in MESHES
+    if not is_integer or not (0 <= index < N_TASKS or index in _PAIR_TASKS or is_foreign):
         raise ValueError(
-            f"`task_id` must be an integer from 0 to {N_TASKS - 1}, or from {_PAIR_TASKS.start} to "
-            f"{_PAIR_TASKS.stop - 1} for tasks by color and shape. Got {index!r}."
+            f"`task_id` must be an integer from 0 to {N_TASKS - 1}, from {_PAIR_TASKS.start} to "
+            f"{_PAIR_TASKS.stop - 1} for tasks by color and shape, or from {_FOREIGN_TASKS.start} on, ending "
+            f"in {MESHES.start} to {MESHES.stop - 1}, for foreign objects. Got {index!r}."
         )
     return TASKS[int(index)] if index < N_TASKS else Task(int(index))
 
@@ -336,6 +363,10 @@ def _fold_validation_tasks(fold: int) -> tuple[int, ...]:
     return tuple(task.index for task in TASKS if set(task.targets) & set(FOLDS[fold]))
 
 
+# The first meshes that the expert manages. Each is the target of one task, so that none is more likely than
+# the two distractors beside it.
+FOREIGN_MESHES: tuple[int, ...] = tuple(json.loads(FOREIGN_FILE.read_text(encoding="utf-8")))[:96]
+
 TASK_SETS = MappingProxyType(
     {
         "all": tuple(range(N_TASKS)),
@@ -350,6 +381,11 @@ TASK_SETS = MappingProxyType(
         # For the objects "fold_K:N", and for "scenario_a_train"
         **{f"scenario_a_fold_{fold}_train": _fold_train_tasks(fold) for fold in range(len(FOLDS))},
         **{f"scenario_a_fold_{fold}_validation": _fold_validation_tasks(fold) for fold in range(len(FOLDS))},
+        # For the objects "foreign": one task for each mesh, the containers in turn
+        "foreign": tuple(
+            _FOREIGN_TASKS.start + 1000 * (number % N_COLUMNS) + mesh
+            for number, mesh in enumerate(FOREIGN_MESHES)
+        ),
     }
 )
 
