@@ -10,7 +10,6 @@ import sys
 import textwrap
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -240,40 +239,28 @@ def _experiment() -> Callable[..., Any]:
     return experiment
 
 
-@dataclass(frozen=True)
-class DatasetSource:
-    """A LeRobotDataset; without arguments, none.
-
-    Args:
-        repo_id: Repository id of the dataset; by default, the name of its folder.
-        root: Folder of the dataset; by default, it is in LeRobot's cache.
-    """
-
-    repo_id: str | None = None
-    root: Path | None = None
-
-
 def _look() -> Callable[..., Any]:
     import tyro
 
     def look(
         checkpoint: tyro.conf.Positional[str],
-        dataset: DatasetSource = DatasetSource(),  # noqa: B008
+        dataset: str | None = None,
         episodes: int = 12,
         out: Path = Path("outputs/look"),
-    ) -> Path:
+    ) -> str:
         """Draws where a policy looks in episodes of a dataset or of the benchmark, on one page.
 
         Args:
             checkpoint: Folder of a policy of the type deltaco_match, or of its training run; or id of a
                 repository on the Hugging Face Hub.
-            dataset: Dataset to look at. Without one, episodes of the benchmark's test tasks are run.
+            dataset: Folder of a LeRobotDataset, or its id on the Hub. Without one, episodes of the
+                benchmark's test tasks are run.
             episodes: Number of episodes, evenly spread.
             out: Folder for the page.
         """
         from lerobot_deltaco.look import look
 
-        return look(checkpoint, dataset.repo_id, dataset.root, episodes, out)
+        return look(checkpoint, dataset, episodes, out)
 
     return look
 
