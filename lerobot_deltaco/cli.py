@@ -10,7 +10,7 @@ import sys
 import textwrap
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,6 +18,8 @@ from gym_deltaco.atomic_files import parse_json
 
 COMMANDS = {
     "collect": "Collect episodes of the scripted expert as a LeRobotDataset.",
+    "toy": "Write a dataset of a toy robot, to go through the tutorial without a robot.",
+    "check": "Show what a policy would take from a dataset, before it is trained.",
     "train": "Train a policy: `lerobot-train` over frames in memory.",
     "evaluate": "Evaluate a policy on the benchmark, and record every episode.",
     "report": "Write tables and figures from the records of evaluations.",
@@ -125,6 +127,28 @@ def _collect() -> Callable[..., Any]:
         return "\n".join(lines)
 
     return collect
+
+
+def _toy() -> Callable[..., Any]:
+    import tyro
+
+    def toy(
+        root: tyro.conf.Positional[Path], episodes_per_task: int = 6, new_object: bool = False, seed: int = 0
+    ) -> str:
+        """Writes a dataset of the toy robot, which can be trained on and controlled as a real one.
+
+        Args:
+            root: Folder of the dataset.
+            episodes_per_task: Number of episodes of each of its 8 tasks.
+            new_object: Write episodes of 2 tasks with an object that the other dataset does not have.
+            seed: Seed of the scenes.
+        """
+        from lerobot_deltaco.toy_robot.record import write_toy_dataset
+
+        n_frames = write_toy_dataset(root, episodes_per_task, new_object, seed)
+        return f"The dataset in {root} has {n_frames:,} frames."
+
+    return toy
 
 
 def _train(arguments: list[str]) -> None:
@@ -241,16 +265,51 @@ def _experiment() -> Callable[..., Any]:
 
 
 @dataclass(frozen=True)
-class DatasetSource:
-    """A LeRobotDataset; without arguments, none.
+class PolicyOptions:
+    """Options of `deltaco train` on which it depends what is taken from a dataset.
 
     Args:
-        repo_id: Repository id of the dataset; by default, the name of its folder.
-        root: Folder of the dataset; by default, it is in LeRobot's cache.
+        demo_camera: Name of the camera of demonstrations. By default, the first.
+        gripper: Gripper's dimension of the action: an index, or "auto" for the last one whose name contains
+            "gripper".
+        gripper_closed: Whether low or high values of the gripper's dimension mean closed.
+        image_size: Height and width to which images are scaled, px.
+        chunk_size: Number of steps that the policy predicts at once, on which the time depends.
     """
 
-    repo_id: str | None = None
-    root: Path | None = None
+    demo_camera: str | None = None
+    gripper: str = "auto"
+    gripper_closed: str = "low"
+    image_size: int = 48
+    chunk_size: int = 1
+
+
+def _check() -> Callable[..., Any]:
+    import tyro
+
+    def check(
+        dataset: tyro.conf.Positional[str],
+        policy: PolicyOptions = PolicyOptions(),  # noqa: B008
+        batch_size: int = 64,
+        steps: int = 8000,
+        episodes: int = 48,
+        out: Path = Path("outputs/check"),
+    ) -> str:
+        """Shows what a policy would take from a dataset, on one self-contained page.
+
+        Args:
+            dataset: Folder of a LeRobotDataset, or its id on the Hugging Face Hub.
+            policy: Options as for `deltaco train`.
+            batch_size: Batch size that the time of training is estimated for.
+            steps: Number of training steps that it is estimated for.
+            episodes: Number of episodes to show; those that are left out come first.
+            out: Folder for the page.
+        """
+        from lerobot_deltaco.check import check
+
+        return check(dataset, asdict(policy), batch_size, steps, episodes, out)
+
+    return check
 
 
 def _look() -> Callable[..., Any]:
@@ -258,22 +317,23 @@ def _look() -> Callable[..., Any]:
 
     def look(
         checkpoint: tyro.conf.Positional[str],
-        dataset: DatasetSource = DatasetSource(),  # noqa: B008
+        dataset: str | None = None,
         episodes: int = 12,
         out: Path = Path("outputs/look"),
-    ) -> Path:
+    ) -> str:
         """Draws where a policy looks in episodes of a dataset or of the benchmark, on one page.
 
         Args:
             checkpoint: Folder of a policy of the type deltaco_match, or of its training run; or id of a
                 repository on the Hugging Face Hub.
-            dataset: Dataset to look at. Without one, episodes of the benchmark's test tasks are run.
+            dataset: Folder of a LeRobotDataset, or its id on the Hub. Without one, episodes of the
+                benchmark's test tasks are run.
             episodes: Number of episodes, evenly spread.
             out: Folder for the page.
         """
         from lerobot_deltaco.look import look
 
-        return look(checkpoint, dataset.repo_id, dataset.root, episodes, out)
+        return look(checkpoint, dataset, episodes, out)
 
     return look
 

@@ -64,6 +64,24 @@ def open_dataset(
     return dataset
 
 
+def open_folder_or_hub(name: str) -> LeRobotDataset:
+    """Opens and checks the dataset in a folder, or of an id on the Hugging Face Hub.
+
+    Raises:
+        FileNotFoundError: The folder holds no dataset.
+        ValueError: The dataset is damaged.
+    """
+    folder = Path(name)
+    if not folder.exists() and len(folder.parts) == 2:
+        return open_dataset("", name, None)
+    if not (folder / "meta/info.json").exists():
+        raise FileNotFoundError(
+            f"There is no dataset in {name}: meta/info.json is missing. Check the spelling, or name one of "
+            "the Hub, as USER/NAME."
+        )
+    return open_dataset("", folder.resolve().name, folder)
+
+
 @contextmanager
 def missing_files_named(
     repo_id: str, root: str | Path | None, episodes: Sequence[int] | None = None

@@ -67,7 +67,7 @@ class FramesInMemory(torch.utils.data.Dataset):
                 "--dataset.image_transforms, or train with `lerobot-train`."
             )
         self._dataset = dataset
-        _check_memory(dataset, image_size)
+        memory_for_frames(dataset, image_size)
         check_dataset(dataset)
         cameras = dataset.meta.camera_keys
         self.columns: dict[str, Tensor] = {}
@@ -181,8 +181,8 @@ def _collate(batch: Sequence[_Frame], *, collate_fn_map: Any = None) -> dict[str
 default_collate_fn_map[_Frame] = _collate
 
 
-def _check_memory(dataset: LeRobotDataset, image_size: int | None) -> None:
-    """Checks that the frames fit into memory.
+def memory_for_frames(dataset: LeRobotDataset, image_size: int | None) -> int:
+    """Returns the memory that the frames of a dataset take, bytes.
 
     Raises:
         MemoryError: They do not.
@@ -203,6 +203,7 @@ def _check_memory(dataset: LeRobotDataset, image_size: int | None) -> None:
             f"{allowed / 1e9:.1f} GB may be used here. Train on fewer episodes (--dataset.episodes), or with "
             "`lerobot-train`, which reads them from the disk."
         )
+    return needed
 
 
 def _camera_images(

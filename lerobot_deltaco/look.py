@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import base64
-import io
-import os
 from collections.abc import Iterator, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import jinja2
 import numpy as np
 import torch
 from lerobot.utils.constants import ACTION
-from PIL import Image
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.base_config import TaskConditionedConfig
 from lerobot_deltaco.checkpoints import LoadedPolicy
-from lerobot_deltaco.dataset_reading import open_dataset
+from lerobot_deltaco.dataset_reading import open_folder_or_hub
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, Found
-from lerobot_deltaco.demonstrations import read_demonstrations, read_robot_data
+from lerobot_deltaco.demonstrations import as_uint8, read_demonstrations, read_robot_data
 from lerobot_deltaco.evaluate import Simulators
+from lerobot_deltaco.pages import data_uri, picture_uri, write_page
 from lerobot_deltaco.pictures import (
     MIN_SIDE,
     PICK_COLOR,
@@ -52,35 +48,36 @@ class View(NamedTuple):
         title: Instruction.
         picture: Picture by `draw_found`, as a data URI.
         text: Description of the episode.
-        is_right: Whether the pick location is right, or the episode succeeded; None if it is not known.
+        right: Whether the pick and the place location are right, or whether the episode succeeded; None for
+            what is not known.
         video: Video of the episode, as a data URI; None without one.
     """
 
     title: str
     picture: str
     text: str
-    is_right: bool | None
+    right: tuple[bool | None, ...]
     video: str | None = None
 
 
 def look(
     checkpoint: str,
-    repo_id: str | None = None,
-    root: Path | None = None,
+    dataset: str | None = None,
     episodes: int = 12,
     out: Path = Path("outputs/look"),
-) -> Path:
+) -> str:
     """Draws where a policy looks in episodes of a dataset or of the benchmark, on one self-contained page.
 
     Args:
-        checkpoint: Folder of a policy or of its training run, or id of a repository on the Hub.
-        repo_id: Repository id of a dataset; None for the name of its folder.
-        root: Folder of the dataset. Without both, episodes of the benchmark's test tasks are run.
+        checkpoint: Folder of a policy of the type deltaco_match, or of its training run; or id of a
+            repository on the Hugging Face Hub.
+        dataset: Folder of a LeRobotDataset, or its id on the Hub. Without one, episodes of the benchmark's
+            test tasks are run.
         episodes: Number of episodes, evenly spread.
         out: Folder for the page.
 
     Returns:
-        The page.
+        How many are right, and where the page is.
 
     Raises:
         ValueError: The policy finds no locations, or does not fit the dataset.
@@ -94,36 +91,33 @@ def look(
             "locations. `deltaco look` needs one of the type deltaco_match."
         )
     out.mkdir(parents=True, exist_ok=True)
-    if repo_id is None and root is None:
-        source, result, tolerance = "scenes of the benchmark", "Successful episodes:", None
+    if dataset is None:
+        results, tolerance = ["Successful episodes"], None
         views = _benchmark_views(loaded, episodes, out)
     else:
-        source = repo_id or Path(root or "").resolve().name
-        result, tolerance = "Episodes with the right pick location:", TOLERANCE
-        views = _dataset_views(loaded, open_dataset("--dataset.root", source, root), episodes)
-    shown = list(tqdm(views, desc="Looking", unit="episode", total=episodes))
-    page = out / "index.html"
-    partial = page.with_name(".index.html.part")
-    known = [view.is_right for view in shown if view.is_right is not None]
-    template = resources.files("lerobot_deltaco").joinpath("look.html").read_text(encoding="utf-8")
-    text = (
-        jinja2.Environment(autoescape=True)
-        .from_string(template)
-        .render(
-            checkpoint=checkpoint,
-            source=source,
-            views=shown,
-            result=result,
-            n_right=sum(known),
-            n_known=len(known),
-            tolerance=tolerance,
-            pick_color=f"rgb{PICK_COLOR}",
-            place_color=f"rgb{PLACE_COLOR}",
+        results, tolerance = (
+            [f"Episodes with the right {what} location" for what in ("pick", "place")],
+            TOLERANCE,
         )
+        views = _dataset_views(loaded, open_folder_or_hub(dataset), episodes)
+    shown = list(tqdm(views, desc="Looking", unit="episode", total=episodes))
+    rates = []
+    for n, text in enumerate(results):
+        known = [view.right[n] for view in shown if view.right[n] is not None]
+        rates += [(text, sum(known), len(known))] if known else []
+    page = out / "index.html"
+    write_page(
+        "look.html",
+        page,
+        checkpoint=checkpoint,
+        source=dataset or "scenes of the benchmark",
+        views=shown,
+        rates=rates,
+        tolerance=tolerance,
+        pick_color=f"rgb{PICK_COLOR}",
+        place_color=f"rgb{PLACE_COLOR}",
     )
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, page)
-    return page
+    return "\n".join([*(f"{text}: {n_right} of {n}" for text, n_right, n in rates), f"See {page}."])
 
 
 def _benchmark_views(loaded: LoadedPolicy, n_episodes: int, out: Path) -> Iterator[View]:
@@ -153,9 +147,9 @@ def _benchmark_views(loaded: LoadedPolicy, n_episodes: int, out: Path) -> Iterat
         is_success = bool(recording.info["is_success"])
         text = "success" if is_success else "failure"
         text = f"Task {task.index}: {text}{_how_sure(policy, task.instruction, recording.found)}"
-        uri = _data_uri("video/mp4", video.read_bytes())
+        uri = data_uri("video/mp4", video.read_bytes())
         video.unlink()
-        yield View(task.instruction, _picture_uri(picture), text, is_success, uri)
+        yield View(task.instruction, picture_uri(picture), text, (is_success,), uri)
     simulators.close()
 
 
@@ -178,38 +172,47 @@ def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: in
     for episode in chosen:
         shown = [] if bank is None else [bank.of_episode(partners[episode])]
         item = dataset[data.spans[episode][0]]
-        # Videos are read as uint8, images as floats in 0..1.
-        observation = {
-            name: item[name].float() / 255 if item[name].dtype == torch.uint8 else item[name]
-            for name in config.input_features
-        }
+        observation = {name: item[name] for name in config.input_features}
+        observation |= {name: as_uint8(item[name]).float() / 255 for name in config.cameras}
         policy.reset()
         policy.set_tasks([tasks[episode]], [shown])
         with torch.inference_mode():
             policy.select_action(loaded.preprocessor({**observation, "task": tasks[episode]}))
         found: Found = policy.found
-        recorded, is_right, text = None, None, "no grasp is recorded"
+        recorded, right, text = None, (None, None), "no grasp is recorded"
         if bool(keyframes.found[episode]):
             states = keyframes.states[episode].to(config.device)
             recorded = policy.robot_states.to_image(states).clamp(-1, 1).cpu()
-            distance = float((found.locations[0, 0].cpu() - recorded[0]).norm())
-            is_right = distance < TOLERANCE
-            text = f"pick location {50 * distance:.0f} % of the image's side from the recorded grasp"
+            distances = (found.locations[0].cpu() - recorded).norm(dim=1)
+            right = tuple((distances < TOLERANCE).tolist())
+            pick, place = (50 * distances).tolist()
+            text = (
+                f"pick and place locations {pick:.0f} and {place:.0f} % of the image's side from the recorded"
+            )
         if bank is not None:
             own = partners[episode] == episode
             text += ", demonstrated by " + ("itself" if own else f"episode {partners[episode]}")
         text += _how_sure(policy, tasks[episode], found)
-        image = (observation[config.cameras[0]] * 255).round().to(torch.uint8)
-        scene = image.permute(1, 2, 0).numpy()
-        ends = demonstration_ends(shown[0]) if shown else None
-        picture = draw_found(scene, ends, found, 0, recorded)
-        yield View(tasks[episode], _picture_uri(picture), f"Episode {episode}: {text}", is_right)
+        ends = None
+        if shown:
+            ends = np.stack(
+                [_image(dataset, row, config.cameras[0]) for row in data.spans[partners[episode]]]
+            )
+        picture = draw_found(
+            _image(dataset, data.spans[episode][0], config.cameras[0]), ends, found, 0, recorded
+        )
+        yield View(tasks[episode], picture_uri(picture), f"Episode {episode}: {text}", right)
+
+
+def _image(dataset: LeRobotDataset, row: int, camera: str) -> NDArray[np.uint8]:
+    """Returns an image at the camera's own resolution, (H, W, 3)."""
+    return as_uint8(dataset[row][camera]).permute(1, 2, 0).numpy()
 
 
 def _how_sure(policy: DeltacoMatchPolicy, instruction: str, found: Found) -> str:
     """Returns how sure a policy is of what to pick, and which words count, as the end of a sentence."""
     words = [
-        word if word == meant else f"{word} ({meant})"
+        word if word == meant else f"{word}, understood as {meant}"
         for word, meant in policy.feature_matching.understood(instruction)
     ]
     return f"; {100 * found.p_pick[0]:.0f} % sure; words for the object: {', '.join(words) or 'none'}"
@@ -246,13 +249,3 @@ def _partner(tasks: Sequence[str], episode: int) -> int:
 def _spread(n: int, n_chosen: int) -> list[int]:
     """Returns at most `n_chosen` of the numbers below n, evenly spread."""
     return np.linspace(0, n - 1, min(n, n_chosen)).round().astype(int).tolist()
-
-
-def _picture_uri(picture: Image.Image) -> str:
-    buffer = io.BytesIO()
-    picture.save(buffer, "JPEG", quality=90)
-    return _data_uri("image/jpeg", buffer.getvalue())
-
-
-def _data_uri(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"

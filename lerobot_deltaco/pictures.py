@@ -58,8 +58,8 @@ def draw_found(
         for location in recorded.tolist():
             _draw_cross(picture, location)
     pick, place = found.locations[sample].tolist()
-    _draw_mark(picture, pick, PICK_COLOR, "pick")
-    _draw_mark(picture, place, PLACE_COLOR, "place")
+    draw_mark(picture, pick, PICK_COLOR, "pick")
+    draw_mark(picture, place, PLACE_COLOR, "place")
     if demonstration_ends is None:
         return picture
     gap = max(4, picture.height // 80)
@@ -90,7 +90,7 @@ def _pixel(picture: Image.Image, location: Sequence[float]) -> tuple[float, floa
     return (location[0] + 1) / 2 * picture.width, (location[1] + 1) / 2 * picture.height
 
 
-def _draw_mark(picture: Image.Image, location: Sequence[float], color: Color, name: str) -> None:
+def draw_mark(picture: Image.Image, location: Sequence[float], color: Color, name: str) -> None:
     """Draws a ring for a pick, or a square for a place, with its name."""
     draw, (x, y) = ImageDraw.Draw(picture), _pixel(picture, location)
     radius, line = min(picture.size) / 18, max(2, min(picture.size) // 130)

@@ -13,6 +13,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
@@ -70,19 +71,7 @@ class _InMemoryTraining:
         config.num_workers = 0
         with missing_files_named(config.dataset.repo_id, config.dataset.root, config.dataset.episodes):
             dataset, held_back = self._make_datasets(config)
-        if isinstance(policy, TaskConditionedConfig):
-            features = dataset_to_policy_features(dataset.meta.features)
-            check_image_shapes({name: features[name].shape for name in dataset.meta.camera_keys})
-        if dataset.meta.depth_keys or dataset.meta.has_language_columns:
-            raise ValueError(
-                "The dataset has depth images or columns of messages, which only `lerobot-train` prepares."
-            )
-        image_size = None
-        if isinstance(policy, TaskConditionedConfig):
-            # Scale images beforehand if that takes less memory.
-            shapes = [dataset.meta.features[camera]["shape"] for camera in dataset.meta.camera_keys]
-            if any(3 * policy.image_size**2 < np.prod(shape) for shape in shapes):
-                image_size = policy.image_size
+        image_size = image_size_in_memory(dataset, policy)
         self._config, self._frames = config, FramesInMemory(dataset, image_size)
         # The policy, which gets the metadata, draws its demonstrations from these frames.
         dataset.meta.frames_in_memory = self._frames
@@ -113,6 +102,27 @@ class _InMemoryTraining:
             seed=options.get("seed", 0),
             use=use,
         )
+
+
+def image_size_in_memory(dataset: LeRobotDataset, policy: PreTrainedConfig) -> int | None:
+    """Returns the size to which images are scaled in memory; None for their own.
+
+    Raises:
+        ValueError: The dataset cannot be held in memory.
+    """
+    if isinstance(policy, TaskConditionedConfig):
+        features = dataset_to_policy_features(dataset.meta.features)
+        check_image_shapes({name: features[name].shape for name in dataset.meta.camera_keys})
+    if dataset.meta.depth_keys or dataset.meta.has_language_columns:
+        raise ValueError(
+            "The dataset has depth images or columns of messages, which only `lerobot-train` prepares."
+        )
+    if isinstance(policy, TaskConditionedConfig):
+        # Scale images beforehand if that takes less memory.
+        shapes = [dataset.meta.features[camera]["shape"] for camera in dataset.meta.camera_keys]
+        if any(3 * policy.image_size**2 < np.prod(shape) for shape in shapes):
+            return policy.image_size
+    return None
 
 
 class _ResumableSampler(EpisodeAwareSampler):

@@ -129,20 +129,23 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     folder = save_tiny_policy(tmp_path / "policy")
     drawn = []
     monkeypatch.setattr(room, "draw_found", lambda *args: drawn.append(args) or draw_found(*args))
-    page = look(str(folder), root=tmp_path / "data", episodes=3, out=tmp_path / "out")
-    text = page.read_text()
+    report = look(str(folder), str(tmp_path / "data"), 3, tmp_path / "out")
+    text = (tmp_path / "out/index.html").read_text()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["index.html"]
     assert text.count("data:image/jpeg;base64") == 3
     # The first two demonstrate each other, the third itself; the scenes have the dataset's own size.
     assert [text.count(f"by {who}") for who in ("episode 1", "episode 0", "itself")] == [1, 1, 1]
     assert [args[0].shape for args in drawn] == [(96, 96, 3)] * 3
-    right = [bool((args[2].locations[0, 0] - args[4][0]).norm() < room.TOLERANCE) for args in drawn]
-    assert f"Episodes with the right pick location: <b>{sum(right)} of 3</b>" in text
+    assert [args[1].shape for args in drawn] == [(2, 96, 96, 3)] * 3
+    for n, what in enumerate(("pick", "place")):
+        right = [bool((args[2].locations[0, n] - args[4][n]).norm() < room.TOLERANCE) for args in drawn]
+        assert f"Episodes with the right {what} location: <b>{sum(right)} of 3</b>" in text
+        assert f"Episodes with the right {what} location: {sum(right)} of 3\n" in report
 
 
 def test_without_a_dataset_episodes_of_the_benchmark_are_run(tmp_path):
-    page = look(str(save_tiny_policy(tmp_path / "policy")), episodes=2, out=tmp_path / "out")
-    text = page.read_text()
+    look(str(save_tiny_policy(tmp_path / "policy")), episodes=2, out=tmp_path / "out")
+    text = (tmp_path / "out/index.html").read_text()
     assert text.count("data:image/jpeg;base64") == text.count("data:video/mp4;base64") == 2
     assert "of 2</b>" in text
 
@@ -161,4 +164,6 @@ def test_what_does_not_fit_is_an_error_that_says_so(tmp_path):
     other.save_episode()
     other.finalize()
     with pytest.raises(ValueError, match=r"needs 'observation.image'.*observation.images.top"):
-        look(str(folder), root=tmp_path / "other", out=tmp_path / "out")
+        look(str(folder), str(tmp_path / "other"), out=tmp_path / "out")
+    with pytest.raises(FileNotFoundError, match="There is no dataset in"):
+        look(str(folder), str(tmp_path / "nothing"), out=tmp_path / "out")

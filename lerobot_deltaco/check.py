@@ -1,0 +1,447 @@
+"""`deltaco check`: shows what a policy would take from a dataset, before it is trained.
+
+What it shows is made by the training's own code, up to the point at which the training would refuse.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import psutil
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.constants import ACTION, OBS_STATE
+from PIL import Image
+from torch import Tensor
+from torch.utils.data import default_collate
+from tqdm import tqdm
+
+from lerobot_deltaco.base_config import dimension_names
+from lerobot_deltaco.dataset_reading import open_folder_or_hub
+from lerobot_deltaco.deltaco_match import feature_matching, proposals
+from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM
+from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
+from lerobot_deltaco.deltaco_match.keyframes import Grasp, find_grasps
+from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.demonstrations import (
+    DemonstrationBank,
+    as_uint8,
+    read_demonstrations,
+    read_robot_data,
+    resize_images,
+)
+from lerobot_deltaco.frames import memory_for_frames
+from lerobot_deltaco.pages import picture_uri, write_page
+from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
+from lerobot_deltaco.train import image_size_in_memory
+
+_PICTURE_HEIGHT = 180  # px
+# A camera stands still if at least this fraction of the edges in an episode's first image stay where they
+# are: of fixed cameras in the benchmark and of the toy robot 0.6 to 0.8, of its wrist's below 0.1.
+_MIN_STAYING, _COMPARED_SIZE, _EDGES, _SAME = 0.4, 48, 0.2, 0.5
+_PAUSE = 0.05  # of the usual highest speed (the 95th percentile), below which the arm hardly moves
+_TIMED_STEPS, _TIMED_FRAMES = 3, 64
+
+
+class EpisodeView(NamedTuple):
+    """An episode on the page.
+
+    Attributes:
+        number: Index of the episode.
+        task: Its task.
+        text: Its length, and whether it is left out.
+        pictures: Four images, as data URIs.
+        course: Points of the gripper's course, in 0..1, as in SVG.
+        lines: Times of the grasp and the release, in 0..1.
+    """
+
+    number: int
+    task: str
+    text: str
+    pictures: list[str]
+    course: str
+    lines: list[float]
+
+
+class TrainingStart:
+    """What training would make of a dataset before its first step, as far as it gets.
+
+    Args:
+        dataset: The dataset.
+        config: Configuration of the policy.
+
+    Attributes:
+        refusal: Why training would refuse; None if it would not.
+        warnings: What training would warn of.
+        bytes: Memory for the frames.
+        policy: The policy; None if the configuration does not fit the dataset.
+        bank: The episodes as demonstrations; None if they were not read.
+        grasps: The grasp of each episode, or why there is none; empty if unknown.
+    """
+
+    def __init__(self, dataset: LeRobotDataset, config: DeltacoMatchConfig) -> None:
+        self.dataset, self.config = dataset, config
+        self.refusal: str | None = None
+        self.bytes, self.image_size = 0, config.image_size
+        self.policy: DeltacoMatchPolicy | None = None
+        self.bank: DemonstrationBank | None = None
+        self.grasps: list[Grasp | str] = []
+        with _warnings() as self.warnings:
+            try:
+                self._begin()
+            except (ValueError, MemoryError) as error:
+                self.refusal = str(error)
+
+    def _begin(self) -> None:
+        dataset, config = self.dataset, self.config
+        size = image_size_in_memory(dataset, config)
+        self.bytes = memory_for_frames(dataset, size)
+        self.policy = make_policy(config, ds_meta=dataset.meta).train()
+        self.policy.feature_matching.fitted.fill_(True)  # the fit takes minutes, and is left out
+        data = read_robot_data(dataset, range(dataset.meta.total_episodes), config.cameras[0])
+        self.grasps = find_grasps(config.gripper_opening(data.actions), data.spans)
+        self.bank = read_demonstrations(dataset, config.cameras[0], config.image_size, config.n_demo_frames)
+        self.policy.set_training_data(self.bank, data)
+        with_grasp = zip(self.bank.tasks, self.grasps, strict=True)
+        feature_matching._Pairs([task for task, grasp in with_grasp if isinstance(grasp, Grasp)])
+
+    @property
+    def locations(self) -> Tensor | None:
+        """Pick and place locations of the episodes, (episodes, 2, 2) in -1..1; None if they are not known."""
+        known = None if self.policy is None else self.policy.training_locations
+        return None if known is None else known.locations.cpu()
+
+
+def check(
+    dataset: str,
+    options: Mapping[str, Any],
+    batch_size: int = 64,
+    steps: int = 8000,
+    episodes: int = 48,
+    out: Path = Path("outputs/check"),
+) -> str:
+    """Shows what a policy would take from a dataset, on one self-contained page.
+
+    Args:
+        dataset: Folder of a LeRobotDataset, or its id on the Hugging Face Hub.
+        options: Options of the policy, as for `deltaco train`.
+        batch_size: Batch size that the time of training is estimated for.
+        steps: Number of training steps that it is estimated for.
+        episodes: Number of episodes to show; those that are left out come first.
+        out: Folder for the page.
+
+    Returns:
+        The report.
+
+    Raises:
+        ValueError: Training would refuse the dataset; the message has the reason, and the report.
+    """
+    opened = open_folder_or_hub(dataset)
+    config = DeltacoMatchConfig(**options)
+    start = TrainingStart(opened, config)
+    meta = opened.meta
+    tasks = [names[0] for names in meta.episodes["tasks"]]
+    views, staying = _read_episodes(start, tasks, episodes)
+    facts = [
+        ("dataset", f"{meta.total_episodes} episodes, {meta.total_frames:,} frames, {meta.fps} per second"),
+        *_camera_facts(config, staying),
+        *_gripper_facts(start),
+        *_unit_facts(start),
+        *_pause_facts(opened),
+    ]
+    if start.refusal is None:
+        facts += _estimates(start, batch_size, steps)
+    warnings = [
+        *start.warnings,
+        *_task_warnings(meta.episodes["tasks"]),
+        *_camera_warnings(config, staying),
+    ]
+    found = Counter(
+        task for task, grasp in zip(tasks, start.grasps, strict=False) if isinstance(grasp, Grasp)
+    )
+    counts = [(task, n, found[task]) for task, n in Counter(tasks).items()]
+    page = out / "index.html"
+    write_page(
+        "check.html",
+        page,
+        source=dataset,
+        refusal=start.refusal,
+        warnings=warnings,
+        facts=facts,
+        tasks=counts,
+        dimensions=_dimensions(start),
+        views=views,
+        n_episodes=meta.total_episodes,
+        has_locations=start.locations is not None,
+    )
+    lines = [
+        *(f"{name + ':':15} {text}" for name, text in facts),
+        *(f"task:           {n} episodes, {n_found} with a grasp: {task}" for task, n, n_found in counts),
+        *(f"left out:       episode {view.number}: {view.text}" for view in views if not view.lines),
+        *(f"warning:        {warning}" for warning in warnings),
+        f"See {page}.",
+    ]
+    report = "\n".join(lines)
+    if start.refusal is not None:
+        raise ValueError(f"Training would refuse this dataset. {start.refusal}\n{report}")
+    return report
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """Collects what the project warns of."""
+    found: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("lerobot_deltaco")
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        yield found
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = True
+
+
+# Episodes
+
+
+def _read_episodes(
+    start: TrainingStart, tasks: Sequence[str], n_shown: int
+) -> tuple[list[EpisodeView], dict[str, float]]:
+    """Returns views of episodes, and for each camera the fraction of edges that stay where they are."""
+    dataset, config, meta = start.dataset, start.config, start.dataset.meta
+    cameras = [name for name in meta.camera_keys if name not in meta.depth_keys]
+    demo_camera = config.cameras[0] if start.policy is not None else next(iter(cameras), None)
+    grasps: Sequence[Grasp | str] = start.grasps or [""] * len(tasks)
+    is_left_out = [isinstance(grasp, str) and bool(start.grasps) for grasp in grasps]
+    left_out = np.flatnonzero(is_left_out)[:n_shown].tolist()
+    others = np.flatnonzero(np.logical_not(is_left_out))
+    n_others = min(len(others), n_shown - len(left_out))
+    chosen = left_out + others[np.linspace(0, len(others) - 1, n_others).round().astype(int)].tolist()
+    gripper = config.gripper_index if start.grasps else None
+    actions = np.stack(dataset.hf_dataset.with_format("numpy")[ACTION]) if gripper is not None else None
+    views, staying = [], defaultdict(list)
+    for episode in tqdm(chosen, desc="Reading episodes", unit="episode", leave=False):
+        row, grasp = meta.episodes[episode], grasps[episode]
+        first, last = row["dataset_from_index"], row["dataset_to_index"] - 1
+        times = np.linspace(first, last, 4).round().astype(int).tolist()
+        if isinstance(grasp, Grasp):
+            times = [first, grasp.grasp, grasp.release, last]
+        items = [dataset[time] for time in times]
+        for camera in cameras:
+            staying[camera].append(_staying_edges(torch.stack([item[camera] for item in items[:3]])))
+        images = [] if demo_camera is None else [item[demo_camera] for item in items]
+        located = start.locations if isinstance(grasp, Grasp) else None
+        marks = [] if located is None else list(zip(located[episode], (PICK_COLOR, PLACE_COLOR), strict=True))
+        text = f"{(last - first + 1) / meta.fps:.1f} s"
+        if is_left_out[episode]:
+            text += f", left out: {grasp}"
+        course, lines = "", list[float]()
+        if actions is not None:
+            values = actions[first : last + 1, gripper]
+            heights = 1 - (values - values.min()) / max(np.ptp(values), 1e-9)
+            at = np.linspace(0, 1, len(values))
+            course = " ".join(f"{x:.3f},{y:.3f}" for x, y in zip(at, heights, strict=True))
+            if isinstance(grasp, Grasp):
+                lines = [round(float(at[time - first]), 3) for time in times[1:3]]
+        views.append(EpisodeView(episode, tasks[episode], text, _strip(images, marks), course, lines))
+    return views, {camera: float(np.median(values)) for camera, values in staying.items()}
+
+
+def _strip(images: Sequence[Tensor], marks: Sequence[tuple[Tensor, tuple[int, int, int]]]) -> list[str]:
+    """Returns images (3, H, W) as data URIs, the first with marks at its locations."""
+    found = []
+    for n, image in enumerate(images):
+        picture = Image.fromarray(as_uint8(image).permute(1, 2, 0).numpy())
+        width = round(picture.width * _PICTURE_HEIGHT / picture.height)
+        picture = picture.resize((width, _PICTURE_HEIGHT), Image.Resampling.BICUBIC)
+        for (location, color), name in zip(marks if n == 0 else [], ("pick", "place"), strict=False):
+            draw_mark(picture, location.tolist(), color, name)
+        found.append(picture_uri(picture))
+    return found
+
+
+def _staying_edges(images: Tensor) -> float:
+    """Returns the fraction of the edges in the first of some images that are also in the others."""
+    gray = resize_images(images, _COMPARED_SIZE).float().mean(dim=1)
+    changes = [gray.diff(dim=dim).flatten(1) for dim in (1, 2)]
+    edges = torch.cat(changes, dim=1)
+    first, others = edges[0], edges[1:]
+    strong = first.abs() > first.abs().quantile(1 - _EDGES)
+    if not bool(strong.any()):
+        return 0.0
+    return ((others - first).abs() < _SAME * first.abs())[:, strong].float().mean().item()
+
+
+# Facts, each with its name
+
+
+def _camera_facts(config: DeltacoMatchConfig, staying: dict[str, float]) -> list[tuple[str, str]]:
+    chosen = config.cameras[0] if config.image_features else None
+    return [
+        (
+            "demo camera" if camera == chosen else "camera",
+            f"{camera} {'stands still' if fraction >= _MIN_STAYING else 'moves'} "
+            f"({100 * fraction:.0f} % of the edges stay where they are)",
+        )
+        for camera, fraction in staying.items()
+    ]
+
+
+def _camera_warnings(config: DeltacoMatchConfig, staying: dict[str, float]) -> list[str]:
+    if not config.image_features or staying.get(config.cameras[0], 1.0) >= _MIN_STAYING:
+        return []
+    still = [camera for camera, fraction in staying.items() if fraction >= _MIN_STAYING]
+    advice = f"Set --policy.demo_camera={still[0]}." if still else "No camera of the dataset does."
+    return [
+        f"The demonstration camera, {config.cameras[0]}, does not seem to stand still, as it must. {advice}"
+    ]
+
+
+def _gripper_facts(start: TrainingStart) -> list[tuple[str, str]]:
+    if not start.grasps:
+        return []
+    n_found = sum(isinstance(grasp, Grasp) for grasp in start.grasps)
+    return [
+        (
+            "gripper",
+            f"{start.config.name_gripper(start.dataset.meta.features)}; {start.config.gripper_closed} values "
+            "close it",
+        ),
+        ("grasps", f"in {n_found} of {len(start.grasps)} episodes; others are left out"),
+    ]
+
+
+def _pause_facts(dataset: LeRobotDataset) -> list[tuple[str, str]]:
+    """Returns how often the arm hardly moves."""
+    if OBS_STATE not in dataset.meta.features:
+        return []
+    columns = dataset.hf_dataset.select_columns([OBS_STATE, "episode_index"]).with_format("numpy")[:]
+    states = np.stack(columns[OBS_STATE]).astype(np.float64).reshape(len(dataset), -1)
+    speeds = (np.abs(np.diff(states, axis=0)) / np.ptp(states, axis=0).clip(1e-9)).max(axis=1)
+    episodes = np.asarray(columns["episode_index"])
+    speeds = speeds[episodes[1:] == episodes[:-1]]
+    pauses = speeds < _PAUSE * np.quantile(speeds, 0.95)
+    return [("pauses", f"the arm hardly moves in {100 * pauses.mean():.0f} % of the frames")]
+
+
+def _dimensions(start: TrainingStart) -> dict[str, list[tuple[str, float, float]]]:
+    """Returns the name, the minimum and the maximum of each dimension of the state and the action."""
+    found, meta = {}, start.dataset.meta
+    for feature in {OBS_STATE, ACTION} & set(meta.features) & set(meta.stats):
+        low, high = (np.ravel(meta.stats[feature][end]).tolist() for end in ("min", "max"))
+        # Names that cannot be read are an error of the policy.
+        names = dimension_names(meta.features[feature]) if start.policy is not None else []
+        names = names or [str(n) for n in range(len(low))]
+        found[feature] = list(zip(names, low, high, strict=True))
+    return found
+
+
+def _unit_facts(start: TrainingStart) -> list[tuple[str, str]]:
+    """Returns guesses of the units, from the ranges of all dimensions but the gripper's."""
+    facts = []
+    for feature, dimensions in sorted(_dimensions(start).items(), reverse=True):
+        arm = [(a, b) for name, a, b in dimensions if "gripper" not in name.lower()] or [(0.0, 0.0)]
+        low, high = min(a for a, _ in arm), max(b for _, b in arm)
+        greatest = max(-low, high)
+        unit = "radians" if greatest <= 2 * np.pi else "degrees, or LeRobot's -100..100"
+        unit = "-1..1, or meters" if greatest <= 1 else unit
+        facts.append(("units", f"{feature}: from {low:.4g} to {high:.4g}, so probably {unit}"))
+    return facts
+
+
+def _task_warnings(tasks_of_episodes: Sequence[Sequence[str]]) -> list[str]:
+    counts = Counter(tasks[0] for tasks in tasks_of_episodes)
+    warnings = [
+        f"Episode {episode} has {len(tasks)} tasks, of which only the first counts: {tasks[0]!r}."
+        for episode, tasks in enumerate(tasks_of_episodes)
+        if len(tasks) > 1
+    ]
+    single = [task for task, n in counts.items() if n == 1]
+    if single:
+        warnings.append(
+            f"{len(single)} tasks have a single episode, which demonstrates itself, such as {single[0]!r}. "
+            "Record at least two."
+        )
+    return warnings
+
+
+# Time and memory
+
+
+def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[str, str]]:
+    """Measures a few steps of training, and returns what all of it would take."""
+    dataset, config, policy, bank = start.dataset, start.config, start.policy, start.bank
+    assert policy is not None
+    assert bank is not None
+    windows = resolve_delta_timestamps(config, dataset.meta)
+    timed = LeRobotDataset(dataset.repo_id, dataset.root, delta_timestamps=windows, return_uint8=True)
+    some = range(min(_TIMED_FRAMES, len(dataset)))
+    reading = _seconds(lambda: [dataset[n] for n in some], 1) / len(some) * len(dataset)
+    batch = default_collate([timed[n % len(timed)] for n in range(batch_size)])
+    for camera in dataset.meta.camera_keys:
+        batch[camera] = resize_images(batch[camera], config.image_size).float() / 255
+    batch = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)[0](batch)
+    optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
+
+    def step() -> None:
+        policy.forward(batch)[0].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    step()  # the first one is slower
+    per_step, fit = _seconds(step), _seconds_of_fit(bank, policy)
+    total = reading + fit + steps * per_step
+    memory = start.bytes + psutil.Process().memory_info().rss
+    return [
+        (
+            "time",
+            f"about {total / 60:.0f} minutes on this machine ({config.device}) for {steps:,} steps of "
+            f"{batch_size}: {reading / 60:.1f} to read the frames, {fit / 60:.1f} to fit feature matching, "
+            f"{1000 * per_step:.0f} ms a step",
+        ),
+        ("memory", f"about {memory / 1e9:.1f} GB, of which the frames take {start.bytes / 1e9:.2f}"),
+    ]
+
+
+def _seconds_of_fit(bank: DemonstrationBank, policy: DeltacoMatchPolicy) -> float:
+    """Returns the time that the fit of feature matching takes, from the time of its parts."""
+    known = policy.training_locations
+    assert known is not None
+    matching = FeatureMatching(policy.config.known_words, policy.config.crop_size).to(bank.frames.device)
+    rows = known.found.nonzero().flatten()
+    images, picks, generator = bank.frames[rows, 0], known.locations[rows, 0], torch.Generator()
+    native = images if bank.first_images is None else bank.first_images[rows]
+    matching.requires_grad_(True)
+    n_timed = 2 * _TIMED_STEPS
+    propose = _seconds(lambda: matching.propose.fit(images, picks, generator, n_timed), 1) / n_timed
+    crops = torch.rand(64, 1 + proposals.N_PROPOSALS, FEATURE_DIM, device=images.device)
+    compare = _seconds(lambda: sum(part.sum() for part in matching.compare(crops, generator)).backward())
+    some = slice(0, 16)
+    small = images[some].float() / 255
+    describe = _seconds(lambda: matching.describe(small, native[some], picks[some])) / len(small)
+    n_scenes = min(len(rows), feature_matching._MAX_EPISODES)
+    return (
+        proposals.FIT_STEPS * propose
+        + feature_matching.FIT_STEPS * compare
+        + n_scenes * proposals.N_PROPOSALS * describe
+    )
+
+
+def _seconds(function: Callable[[], object], n_calls: int = _TIMED_STEPS) -> float:
+    """Returns the time of a call, in seconds, as the mean of some calls."""
+    began = time.perf_counter()
+    for _ in range(n_calls):
+        function()
+    return (time.perf_counter() - began) / n_calls

@@ -1,0 +1,43 @@
+"""Self-contained HTML pages, from the templates beside this file."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from PIL import Image
+
+from gym_deltaco.atomic_files import write_text
+
+
+def write_page(template: str, path: Path, **values: Any) -> None:
+    """Writes a page.
+
+    Args:
+        template: Name of the template.
+        path: File to write; its folder is made.
+        values: Values for the template.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        undefined=jinja2.StrictUndefined,
+        autoescape=True,
+        trim_blocks=True,
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, environment.get_template(template).render(**values))
+
+
+def picture_uri(picture: Image.Image) -> str:
+    """Returns a picture as a data URI."""
+    buffer = io.BytesIO()
+    picture.save(buffer, "JPEG", quality=90)
+    return data_uri("image/jpeg", buffer.getvalue())
+
+
+def data_uri(kind: str, content: bytes) -> str:
+    """Returns a file of a media type, such as "video/mp4", as a data URI."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,0 +1,115 @@
+"""`deltaco check`: its report agrees with the training."""
+
+import sys
+
+import pytest
+import torch
+from small_policies import (
+    COLORS,
+    EPISODES,
+    TABLE_TASKS,
+    batch_of,
+    random_moves,
+    small_policy,
+    write_dataset,
+    write_table,
+)
+
+from lerobot_deltaco import cli
+from lerobot_deltaco.check import _staying_edges, check
+from lerobot_deltaco.toy_robot.world import CAMERAS, ToyWorld, joints_at
+
+
+def checked(root, out, **options):
+    """The report, and the page; a report of a refusal is that of the error."""
+    try:
+        report = check(str(root), {"image_size": 24, **options}, 4, 100, out=out)
+    except ValueError as error:
+        report = str(error)
+    return report, (out / "index.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    return write_table(tmp_path_factory.mktemp("data") / "table", random_moves(26))
+
+
+def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path):
+    report, page = checked(table.root, tmp_path)
+    assert "Training would refuse" not in report
+    assert "demo camera:    observation.image stands still" in report
+    assert "dimension 2 of the action (gripper); low values close it" in report
+    assert "in 26 of 26 episodes" in report
+    assert all(f"13 episodes, 13 with a grasp: {task}" in report for task in TABLE_TASKS)
+    assert "for 100 steps of 4" in report
+    # The training's own warning, of a joint that never moves.
+    assert report.count("warning:") == report.count("hardly move in the training data") == 1
+    assert page.count("data:image/jpeg;base64") == 4 * 26
+    assert "would refuse" not in page
+
+
+def test_the_direction_of_the_gripper_is_the_one_given(table, tmp_path):
+    report, _ = checked(table.root, tmp_path, gripper_closed="high")
+    assert "high values close it" in report
+    assert "in 0 of 26 episodes" in report
+    assert report.count("left out:       episode") == 26
+    assert "Set --policy.gripper_closed=low" in report
+
+
+@pytest.mark.parametrize("n_episodes", [3, 24])
+def test_a_refusal_is_the_error_of_the_training(n_episodes, tmp_path, monkeypatch, short_fit):
+    # The second dataset has enough episodes, but each is of another task.
+    tasks = [f"move the red object {'x' * n}left" for n in range(n_episodes)]
+    for task in tasks:
+        monkeypatch.setitem(COLORS, task, COLORS[TABLE_TASKS[0]])
+    moves = [(task, *move[1:]) for task, move in zip(tasks, random_moves(n_episodes), strict=True)]
+    dataset = write_table(tmp_path / "data", moves)
+    report, page = checked(dataset.root, tmp_path / "out")
+    policy, before, _ = small_policy(dataset, "deltaco_match")
+    with pytest.raises(ValueError, match="episodes") as error:
+        policy(before(batch_of(dataset, [0])))
+    assert report.startswith(f"Training would refuse this dataset. {error.value}\n")
+    assert "would refuse" in page
+
+
+def test_what_does_not_fit_is_shown_without_a_policy(tmp_path):
+    dataset = write_dataset(tmp_path / "data")
+    report, page = checked(dataset.root, tmp_path / "out", gripper="none")
+    assert report.startswith("Training would refuse this dataset. `deltaco_match` learns where")
+    assert "observation.images.wrist moves" in report
+    assert "1 episodes, 0 with a grasp: wave" in report
+    assert "have a single episode" in report
+    assert page.count("data:image/jpeg;base64") == 4 * len(EPISODES)
+
+
+def test_tasks_with_the_same_words_are_named(table, tmp_path, monkeypatch):
+    same = ["move the red object 1", "Move the red object 2!"]
+    for task in same:
+        monkeypatch.setitem(COLORS, task, COLORS[TABLE_TASKS[0]])
+    moves = [(same[n % 2], *move[1:]) for n, move in enumerate(random_moves(24))]
+    report, _ = checked(write_table(tmp_path / "data", moves).root, tmp_path / "out")
+    assert "cannot tell 2 of 2 tasks from others by their instructions" in report
+    assert all(repr(task) in report for task in same)
+
+
+def test_the_command_ends_with_1_and_the_reason(tmp_path, monkeypatch, capsys):
+    dataset = write_dataset(tmp_path / "data")
+    monkeypatch.setattr(sys, "argv", ["deltaco", "check", str(dataset.root), "--out", str(tmp_path / "out")])
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--policy.demo_camera=observation.images.wrist"])
+    with pytest.raises(SystemExit, match="deltaco check: Training would refuse this dataset") as end:
+        cli.main()
+    assert "demo camera:    observation.images.wrist" in str(end.value.code)
+
+
+def test_a_moving_camera_is_told_from_one_that_stands_still():
+    world = ToyWorld(0)
+    seen = [world.images()]
+    for x, y in ((0.2, 0.1), (0.22, -0.1)):
+        world.joints = joints_at(x, y, 0.05, 50)
+        seen.append(world.images())
+    front, wrist = (
+        _staying_edges(torch.stack([torch.from_numpy(images[camera]).permute(2, 0, 1) for images in seen]))
+        for camera in CAMERAS
+    )
+    assert front > 0.6
+    assert wrist < 0.2
