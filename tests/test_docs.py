@@ -25,7 +25,7 @@ DOCS = ROOT / "docs"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "results/README.md")),
-    *(ROOT / name for name in ("checkpoints/pick_place/README.md", "envhub/README.md")),
+    ROOT / "checkpoints/pick_place/README.md",
     *sorted(DOCS.glob("*.md")),
 ]
 
