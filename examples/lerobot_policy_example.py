@@ -21,7 +21,8 @@ from torch import Tensor, nn
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.demonstrations import open_dataset, read_demonstrations, read_robot_data
 
-N_WORDS, DIM, HAND = 4096, 32, slice(6, 9)  # the end effector's x, y, z in the state
+N_WORDS, DIM, N_SCENES = 4096, 32, 32  # of a batch's samples, those on which finding is trained
+HAND = slice(6, 9)  # the end effector's x, y, z in the state
 
 
 @PreTrainedConfig.register_subclass("example")
@@ -70,7 +71,7 @@ class ExamplePolicy(PreTrainedPolicy):
         )
 
     def find(self, scenes: Tensor, sentences: list[str], ends: Tensor) -> Tensor:
-        """Returns where the hand should grasp and release, (batch, 2, 3) in m.
+        """Returns where the hand should grasp and release, and where it grasped, each (batch, 3) in m.
 
         Args:
             scenes: First image of each episode, (batch, 3, H, W) in 0..1.
@@ -78,16 +79,18 @@ class ExamplePolicy(PreTrainedPolicy):
             ends: First and last image of each demonstration, (batch, 2, 3, H, W) in 0..1.
         """
         scene, first, last = self.encoder(torch.cat([scenes, ends[:, 0], ends[:, 1]])).chunk(3)
-        moved = self.attention(torch.cat([first, first - last], 1)).flatten(2).softmax(2)
-        descriptor = F.normalize(torch.einsum("bns,bcs->bc", moved, first.flatten(2)), dim=1)
+        moved = self.attention(torch.cat([first, (first - last).abs()], 1))[:, 0]
+        descriptor = F.normalize(pool(first, moved)[:, 2:], dim=1)
         picks = 20 * torch.einsum("bc,bchw->bhw", descriptor, F.normalize(scene, dim=1))
         words = [f". {text.lower()} .".split() for text in sentences]
         pairs = [[zlib.crc32("".join(pair).encode()) % N_WORDS for pair in pairwise(own)] for own in words]
         flat, starts = sum(pairs, []), torch.tensor([0, *map(len, pairs[:-1])]).cumsum(0)
-        said = self.words(torch.tensor(flat, device=scene.device), starts.to(scene.device))
+        said = 10 * self.words(torch.tensor(flat, device=scene.device), starts.to(scene.device))
         places = torch.einsum("bc,bchw->bhw", said, self.places(scene))
         pick, place = self.locate
-        return torch.stack([pick(pool(scene, picks)), place(pool(scene, places))], dim=1)
+        return torch.stack(
+            [pick(pool(scene, picks)), place(pool(scene, places)), pick(pool(first, moved))], 1
+        )
 
     def act(self, states: Tensor, targets: Tensor) -> Tensor:
         """Returns actions (batch, 4): a motion, and the logit of an open gripper."""
@@ -102,11 +105,13 @@ class ExamplePolicy(PreTrainedPolicy):
             keyframes = find_keyframes(robot.states, robot.actions[:, 3], robot.spans)
             self.targets = keyframes.states[..., HAND].to(self.config.device)
         generator = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
-        own, tasks = batch["episode_index"], batch["task"]
+        own, tasks = batch["episode_index"][:N_SCENES], batch["task"][:N_SCENES]
         others = self.bank.draw_other_episodes(own, tasks, generator)
         found = self.find(self.bank.frames[own, 0] / 255, tasks, self.bank.frames[others] / 255)
-        finding = F.smooth_l1_loss(found, self.targets[own], beta=0.02)
-        noisy = self.targets[own] + 0.005 * torch.randn_like(found)
+        wanted = torch.cat([self.targets[own], self.targets[others, :1]], 1)
+        finding = F.smooth_l1_loss(found, wanted, beta=0.02)
+        targets = self.targets[batch["episode_index"]]
+        noisy = targets + 0.005 * torch.randn_like(targets)
         predicted = self.act(batch["observation.state"], noisy)
         motion = F.smooth_l1_loss(predicted[:, :3], batch["action"][:, :3], beta=0.1)
         gripper = F.binary_cross_entropy_with_logits(predicted[:, 3], (batch["action"][:, 3] > 0).float())
@@ -122,11 +127,9 @@ class ExamplePolicy(PreTrainedPolicy):
     def select_action(self, batch):
         if self.found is None:
             # With `lerobot-eval --env.demonstrations=true`, the demonstration is part of the observation.
-            sentences, ends = self.tasks or (
-                batch["task"],
-                batch["observation.demonstration_image"][:, [0, -1]],
-            )
-            self.found = self.find(batch["observation.image"], sentences, ends / 255)
+            shown = batch.get("observation.demonstration_image")
+            sentences, ends = self.tasks or (batch["task"], shown[:, [0, -1]])
+            self.found = self.find(batch["observation.image"], sentences, ends / 255)[:, :2]
         action = self.act(batch["observation.state"], self.found)
         return torch.cat([action[:, :3], action[:, 3:].sign()], 1)
 
