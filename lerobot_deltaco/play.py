@@ -216,7 +216,7 @@ class Player:
         return Run(video, picture, verdict, self._confidence(recording.found, sentence), footnote)
 
     def _confidence(self, found: Found | None, sentence: str) -> str:
-        if found is None or found.p_pick is None:
+        if found is None:
             return ""
         mapped = dict(self._loaded.policy.feature_matching.understood(sentence))
         read = ", ".join(f"“{typed}” as “{word}”" for typed, word in mapped.items() if typed != word)

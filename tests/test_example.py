@@ -40,14 +40,14 @@ def checkpoint(tmp_path_factory):
 def received(monkeypatch):
     """What the network of the example receives: sentence, and ends of the demonstration."""
     policy, found = sys.modules["lerobot_policy_example"].ExamplePolicy, set()
-    act = policy.act
+    find = policy.find
 
-    def noted(self, images, states, sentences, ends):
+    def noted(self, scenes, sentences, ends):
         pixels = (255 * ends).round().byte().contiguous().numpy()
         found.update((text, own.tobytes()) for text, own in zip(sentences, pixels, strict=True))
-        return act(self, images, states, sentences, ends)
+        return find(self, scenes, sentences, ends)
 
-    monkeypatch.setattr(policy, "act", noted)
+    monkeypatch.setattr(policy, "find", noted)
     return found
 
 
