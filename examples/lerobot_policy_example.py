@@ -59,9 +59,15 @@ class ExamplePolicy(PreTrainedPolicy):
     def __init__(self, config: ExampleConfig, dataset_stats=None, dataset_meta=None) -> None:
         super().__init__(config)
         self.meta, self.bank, self.tasks, self.found = dataset_meta, None, None, None
-        layers = nn.Conv2d(3, DIM, 5, 2, 2), nn.ReLU(), nn.Conv2d(DIM, DIM, 3, 1, 1), nn.ReLU()
+        layers = (
+            nn.Conv2d(3, DIM, 5, 2, 2),
+            nn.ReLU(),
+            nn.BatchNorm2d(DIM),
+            nn.Conv2d(DIM, DIM, 3, 1, 1),
+            nn.ReLU(),
+        )
         self.encoder = nn.Sequential(*layers, nn.Conv2d(DIM, DIM, 3, 1, 1))
-        self.attention = nn.Conv2d(2 * DIM, 1, 1)
+        self.attention = nn.Sequential(nn.Conv2d(6, DIM, 5, 2, 2), nn.ReLU(), nn.Conv2d(DIM, 1, 3, 1, 1))
         self.words = nn.EmbeddingBag(N_WORDS, DIM, mode="sum")
         nn.init.zeros_(self.words.weight)  # words that were never trained on say nothing
         self.places = nn.Conv2d(DIM, DIM, 3, 1, 1)
@@ -78,8 +84,8 @@ class ExamplePolicy(PreTrainedPolicy):
             sentences: Instruction of each.
             ends: First and last image of each demonstration, (batch, 2, 3, H, W) in 0..1.
         """
-        scene, first, last = self.encoder(torch.cat([scenes, ends[:, 0], ends[:, 1]])).chunk(3)
-        moved = self.attention(torch.cat([first, (first - last).abs()], 1))[:, 0]
+        scene, first = self.encoder(torch.cat([scenes, ends[:, 0]])).chunk(2)
+        moved = 20 * self.attention(torch.cat([ends[:, 0], ends[:, 0] - ends[:, 1]], 1))[:, 0]
         descriptor = F.normalize(pool(first, moved)[:, 2:], dim=1)
         picks = 20 * torch.einsum("bc,bchw->bhw", descriptor, F.normalize(scene, dim=1))
         words = [f". {text.lower()} .".split() for text in sentences]
@@ -109,7 +115,7 @@ class ExamplePolicy(PreTrainedPolicy):
         others = self.bank.draw_other_episodes(own, tasks, generator)
         found = self.find(self.bank.frames[own, 0] / 255, tasks, self.bank.frames[others] / 255)
         wanted = torch.cat([self.targets[own], self.targets[others, :1]], 1)
-        finding = F.smooth_l1_loss(found, wanted, beta=0.02)
+        finding = F.smooth_l1_loss(found, wanted, beta=0.005)
         targets = self.targets[batch["episode_index"]]
         noisy = targets + 0.005 * torch.randn_like(targets)
         predicted = self.act(batch["observation.state"], noisy)
