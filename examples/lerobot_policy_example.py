@@ -13,13 +13,14 @@ from itertools import pairwise
 import torch
 import torch.nn.functional as F  # noqa: N812
 from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.datasets import LeRobotDataset
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.processor import make_default_pre_post_processors
 from torch import Tensor, nn
 
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
-from lerobot_deltaco.demonstrations import open_dataset, read_demonstrations, read_robot_data
+from lerobot_deltaco.demonstrations import read_demonstrations, read_robot_data
 
 N_WORDS, DIM, N_SCENES = 4096, 32, 32  # of a batch's samples, those on which finding is trained
 HAND = slice(6, 9)  # the end effector's x, y, z in the state
@@ -105,7 +106,7 @@ class ExamplePolicy(PreTrainedPolicy):
 
     def forward(self, batch):
         if self.bank is None:  # once: of the training episodes, others than the sample's are demonstrations
-            dataset = open_dataset("--dataset.root", self.meta.repo_id, self.meta.root)
+            dataset = LeRobotDataset(self.meta.repo_id, root=self.meta.root)
             self.bank = read_demonstrations(dataset, "observation.image", 48, 2).to(self.config.device)
             robot = read_robot_data(dataset, range(len(self.bank)))
             keyframes = find_keyframes(robot.states, robot.actions[:, 3], robot.spans)
@@ -133,8 +134,7 @@ class ExamplePolicy(PreTrainedPolicy):
     def select_action(self, batch):
         if self.found is None:
             # With `lerobot-eval --env.demonstrations=true`, the demonstration is part of the observation.
-            shown = batch.get("observation.demonstration_image")
-            sentences, ends = self.tasks or (batch["task"], shown[:, [0, -1]])
+            sentences, ends = self.tasks or (batch["task"], batch["observation.demonstration"])
             self.found = self.find(batch["observation.image"], sentences, ends / 255)[:, :2]
         action = self.act(batch["observation.state"], self.found)
         return torch.cat([action[:, :3], action[:, 3:].sign()], 1)

@@ -149,8 +149,8 @@ class EvaluationEnv(PickPlaceEnv):
     closed environment passes its simulator on to the next one, since starting one takes 50 ms.
 
     Args:
-        demonstrations: Whether every observation also has the key `demonstration`: the first and the last image
-            of the protocol's demonstration of the task, (2, 3, H, W) uint8.
+        demonstrations: Whether every observation also has the key `demonstration`: the first and the last
+            image of the protocol's demonstration of the task, (2, 3, H, W) uint8.
         arguments: Arguments of `PickPlaceEnv`.
     """
 

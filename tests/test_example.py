@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_eval
 from tiny_runs import run_training
 
@@ -14,7 +15,7 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.checkpoints import find_checkpoints, load_policy
 from lerobot_deltaco.collect import CollectionPlan, collect
-from lerobot_deltaco.demonstrations import as_uint8, open_dataset
+from lerobot_deltaco.demonstrations import as_uint8
 from lerobot_deltaco.evaluate import Evaluation, evaluate_checkpoints
 from lerobot_deltaco.lerobot_env import EvaluationEnv
 from lerobot_deltaco.records import EvaluationPlan, read_records
@@ -60,7 +61,7 @@ def test_evaluations_give_the_demonstrations_of_the_protocol(checkpoint, receive
         assert shown in get_task(task_id).targets
     # The same as the task's only episode in E102.
     collect(tmp_path / "e102", CollectionPlan(TASKS, 1, split="validation"))
-    dataset = open_dataset("", "test/e102", tmp_path / "e102")
+    dataset = LeRobotDataset("test/e102", root=tmp_path / "e102")
     for episode in dataset.meta.episodes:
         ends = [episode["dataset_from_index"], episode["dataset_to_index"] - 1]
         images = torch.stack([dataset[index]["observation.image"] for index in ends])
@@ -97,10 +98,9 @@ def test_an_observation_has_the_demonstration_on_request():
     env = EvaluationEnv(task_id=24, demonstrations=True)
     check_env(env, skip_render_check=True)
     first, other = (env.reset(options={"task_id": task_id})[0] for task_id in (24, 35))
-    assert (first["demonstration_image"] != other["demonstration_image"]).any()
-    assert (
-        env.step(env.action_space.sample())[0]["demonstration_state"] == other["demonstration_state"]
-    ).all()
+    assert (first["demonstration"] != other["demonstration"]).any()
+    later = env.step(env.action_space.sample())[0]
+    assert (later["demonstration"] == other["demonstration"]).all()
 
 
 def test_lerobot_finds_the_example():
