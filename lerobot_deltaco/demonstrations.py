@@ -51,6 +51,8 @@ class Demonstration:
         features: Features of the frames from a frozen image encoder, (features,); None without one.
         episode: Index of the episode in its dataset; None if it is not from a dataset.
         target_object: Index of the object that it moves; None if it is not known.
+        states: The robot's state in each frame, (frames, state); None if they were not kept.
+        actions: The action after each frame, (frames, action); None if they were not kept.
     """
 
     task: str
@@ -60,6 +62,8 @@ class Demonstration:
     features: Tensor | None = None
     episode: int | None = None
     target_object: int | None = None
+    states: Tensor | None = None
+    actions: Tensor | None = None
 
 
 class DemonstrationBank(torch.nn.Module):

@@ -12,6 +12,7 @@ from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import Task, get_task
 from lerobot_deltaco.demonstrations import DemonstrationBank
+from lerobot_deltaco.expert_demonstrations import ExpertBank
 from lerobot_deltaco.paraphrases import choose_instructions
 from lerobot_deltaco.records import EvaluationPlan
 
@@ -34,7 +35,7 @@ class Episode(NamedTuple):
     demonstration_task: int
 
 
-def draw_episodes(plan: EvaluationPlan, bank: DemonstrationBank | None = None) -> list[Episode]:
+def draw_episodes(plan: EvaluationPlan, bank: DemonstrationBank | ExpertBank | None = None) -> list[Episode]:
     """Draws the episodes of an evaluation: the first trial of each task, then the second ones, and so on.
 
     Args:

@@ -37,6 +37,7 @@ from lerobot_deltaco.base_policy import TaskConditionedPolicy
 from lerobot_deltaco.checkpoints import Checkpoint, LoadedPolicy, find_checkpoints, load_policy
 from lerobot_deltaco.demonstrations import Demonstration, DemonstrationBank
 from lerobot_deltaco.episodes import Episode, draw_episodes
+from lerobot_deltaco.expert_demonstrations import ExpertBank
 from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.optimization import keep_freed_memory
 from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord, read_records, write_records
@@ -124,7 +125,6 @@ class Evaluation:
         self.loaded, self.plan = loaded, plan
         policy = loaded.policy
         check_policy_fits(policy.config, plan.scene, loaded.rename_map)
-        self._conditioned = policy if isinstance(policy, TaskConditionedPolicy) else None
         self._bank = _bank_for(policy, plan)
         episodes = draw_episodes(plan, self._bank)
         if getattr(policy.config, "method", None) == "mcil":
@@ -164,10 +164,9 @@ class Evaluation:
         """Returns the demonstrations of an episode; the trials of a task use its demonstrations in turn."""
         if self._bank is None or episode.demonstration_task < 0:
             return []
-        policy = self._conditioned
-        assert policy is not None
-        if policy.config.demo_episode is not None:
-            return [self._bank.of_episode(policy.config.demo_episode)]
+        config = self.loaded.policy.config
+        if isinstance(self._bank, DemonstrationBank) and config.demo_episode is not None:
+            return [self._bank.of_episode(config.demo_episode)]
         task = get_task(episode.demonstration_task)
         known = self._bank.of_task(task.instruction, task.target_object)
         n_each = self.plan.n_demonstrations
@@ -182,7 +181,7 @@ class Evaluation:
                 # Batches are small, and the number of threads changes no sum.
                 torch.set_num_threads(1)
                 stack.callback(torch.set_num_threads, n_threads)
-            if self._conditioned is None:
+            if not isinstance(self.loaded.policy, TaskConditionedPolicy):
                 # Policies that sample, such as diffusion policies, do so for a whole batch, seeded by its
                 # first episode.
                 stack.enter_context(seeded_context(batch[0].seed % 2**32))
@@ -221,7 +220,7 @@ def run_episodes(
     ]
     observations, infos = [list(parts) for parts in zip(*resets, strict=True)]
     policy.reset()
-    if isinstance(policy, TaskConditionedPolicy):
+    if hasattr(policy, "set_tasks"):
         policy.set_tasks(instructions, demonstrations)
     noise = [np.random.default_rng(episode.seed) for episode in episodes]
     for _ in range(envs[0].scene_config.n_steps):
@@ -392,18 +391,18 @@ def _batches(episodes: Sequence[Episode]) -> list[list[Episode]]:
     return [list(episodes[start : start + size]) for start in range(0, len(episodes), size)]
 
 
-def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | None:
-    """Returns the demonstrations that a policy receives; None if it takes none.
+def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | ExpertBank | None:
+    """Returns the demonstrations that a policy receives: its own, or the expert's; None if it takes none.
 
     Raises:
         ValueError: The plan asks for demonstrations that the policy does not take or have.
     """
-    is_conditioned = isinstance(policy, TaskConditionedPolicy) and policy.config.uses_demonstrations
-    if not is_conditioned:
+    if not hasattr(policy, "set_tasks") or not getattr(policy.config, "uses_demonstrations", True):
         if plan.counterfactual == "demonstration" or plan.without == "demonstration":
             raise ValueError("This policy takes no demonstrations: none can be replaced or left out.")
         return None
-    bank = policy.demonstrations
+    is_ours = isinstance(policy, TaskConditionedPolicy)
+    bank = policy.demonstrations if is_ours else ExpertBank(plan.task_ids, plan.scene)
     if bank is None:
         if plan.without == "demonstration":
             return None

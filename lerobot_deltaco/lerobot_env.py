@@ -7,16 +7,19 @@ import logging
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.utils.constants import ACTION, OBS_STATE
+from numpy.typing import NDArray
 
 from gym_deltaco import ENV_ID
 from gym_deltaco.control import control_of
@@ -25,6 +28,7 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import get_task, select_tasks
+from lerobot_deltaco.expert_demonstrations import expert_demonstration
 from lerobot_deltaco.paraphrases import choose_instructions
 
 logger = logging.getLogger(__name__)
@@ -53,6 +57,7 @@ class DeltacoEnv(EnvConfig):
         paraphrases_split: Split of the file's sentences: all; held_out, the last one of each task; or train,
             those that are not held out for any task.
         instruction: A sentence that replaces the instruction of every task.
+        demonstrations: Whether observations contain a demonstration of the task, as `EvaluationEnv` has it.
     """
 
     task: str = "scenario_a_test"
@@ -62,6 +67,7 @@ class DeltacoEnv(EnvConfig):
     paraphrases: str | None = None
     paraphrases_split: str = "all"
     instruction: str | None = None
+    demonstrations: bool = False
 
     def __post_init__(self) -> None:
         try:
@@ -112,6 +118,7 @@ class DeltacoEnv(EnvConfig):
             "instructions": choose_instructions(
                 select_tasks(self.task), self.paraphrases, self.paraphrases_split, self.instruction
             ),
+            "demonstrations": self.demonstrations,
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
@@ -140,9 +147,22 @@ class EvaluationEnv(PickPlaceEnv):
 
     The seed of a reset is mapped to one that also depends on the task, and that no training scene has. A
     closed environment passes its simulator on to the next one, since starting one takes 50 ms.
+
+    Args:
+        demonstrations: Whether every observation also has the key `demonstration`: the first and the last
+            image of the protocol's demonstration of the task, (2, 3, H, W) uint8.
+        arguments: Arguments of `PickPlaceEnv`.
     """
 
     _idle: list[Simulation] = []  # noqa: RUF012
+
+    def __init__(self, *, demonstrations: bool = False, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        self._has_demonstrations = demonstrations
+        if demonstrations:
+            size = self.scene_config.image_size
+            assert isinstance(self.observation_space, Dict)
+            self.observation_space.spaces["demonstration"] = Box(0, 255, (2, 3, size, size), np.uint8)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -155,12 +175,23 @@ class EvaluationEnv(PickPlaceEnv):
             seed = episode_seed(0, "evaluation", task_id, 0, seed)
         return super().reset(seed=seed, options=options)
 
+    def _observation(self) -> Observation:
+        observation = super()._observation()
+        if self._has_demonstrations:
+            observation["demonstration"] = _demonstration_ends(self.task.index, self.scene_config).copy()
+        return observation
+
     def close(self) -> None:
         """Passes the simulator on to the next environment."""
         if self._simulation is not None:
             self._idle.append(self._simulation)
             self._simulation = None
         super().close()
+
+
+@cache
+def _demonstration_ends(task_id: int, scene: SceneConfig) -> NDArray[np.uint8]:
+    return expert_demonstration(task_id, 0, scene).frames[[0, -1]].numpy()
 
 
 class _FrozenAfterEpisodeEnd(FreezeAfterEpisodeEnd):

@@ -18,6 +18,7 @@ from PIL import Image
 from gym_deltaco.layout import Layout
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import N_ROWS, TASKS, get_task
+from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
 from lerobot_deltaco.demonstrations import Demonstration
 from lerobot_deltaco.evaluate import Simulators
 from lerobot_deltaco.pictures import demonstration_ends, draw_found, write_video
@@ -82,12 +83,15 @@ class Run(NamedTuple):
         video: MP4 file.
         picture: Where the policy looked; None for policies that find no locations.
         verdict: Whether it did what was asked.
+        confidence: How sure the policy was of the object, and how it understood words; empty if it does not
+            say.
         footnote: Success by the benchmark's own criterion, for the scene's task.
     """
 
     video: Path
     picture: Image.Image | None
     verdict: Verdict
+    confidence: str
     footnote: str
 
 
@@ -208,9 +212,16 @@ class Player:
         verdict = judge(recording.layout, recording.placed, grasped, sentence, demonstrated)
         outcome = "done" if recording.info["is_success"] else "not done"
         task = get_task(choice.task_id)
-        return Run(
-            video, picture, verdict, f"The scene's task {task.index}, “{task.instruction}”: {outcome}."
-        )
+        footnote = f"The scene's task {task.index}, “{task.instruction}”: {outcome}."
+        return Run(video, picture, verdict, self._confidence(recording.found, sentence), footnote)
+
+    def _confidence(self, found: Found | None, sentence: str) -> str:
+        if found is None:
+            return ""
+        mapped = dict(self._loaded.policy.feature_matching.understood(sentence))
+        read = ", ".join(f"“{typed}” as “{word}”" for typed, word in mapped.items() if typed != word)
+        sure = f"The policy was {found.p_pick.item():.0%} sure of the object"
+        return f"{sure}, and understood {read}." if read else f"{sure}."
 
     def comparison(self, choice: Choice) -> list[Choice]:
         """Returns two demonstrations times two sentences in one scene, for `run`.
@@ -298,14 +309,15 @@ _CSS = """
 _REPLACE_ADDRESS = "(query) => { if (query) history.replaceState(null, '', query); }"
 
 
-def _verdict_html(verdict: Verdict, footnote: str = "") -> str:
+def _verdict_html(verdict: Verdict, confidence: str = "", footnote: str = "") -> str:
     kind, sign = {True: ("yes", "✓ "), False: ("no", "✗ "), None: ("", "")}[verdict.is_success]
-    moved, asked, small = map(html.escape, (verdict.moved, verdict.asked, footnote))
+    texts = (verdict.moved, verdict.asked, confidence, footnote)
+    moved, asked, sure, small = map(html.escape, texts)
     if not verdict.headline:
         return f'<div class="verdict {kind}"><p>{sign}{moved}</p></div>'
     return (
-        f'<div class="verdict {kind}"><h3>{sign}{verdict.headline}</h3><p>{moved}</p><p>{asked}</p>'
-        f"<p><small>{small}</small></p></div>"
+        f'<div class="verdict {kind}"><h3>{sign}{verdict.headline}</h3><p>{moved} {sure}</p>'
+        f"<p>{asked}</p><p><small>{small}</small></p></div>"
     )
 
 
@@ -467,7 +479,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
             except (ValueError, RuntimeError) as error:
                 return {verdict: _message_html("This cannot be run", str(error))}
             return {
-                verdict: _verdict_html(done.verdict, done.footnote),
+                verdict: _verdict_html(done.verdict, done.confidence, done.footnote),
                 single: gr.Row(visible=True),
                 comparison: gr.Column(visible=False),
                 video: str(done.video),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,22 +13,18 @@ from numpy.typing import NDArray
 
 from gym_deltaco.control import control_of
 from gym_deltaco.env import PickPlaceEnv
-from gym_deltaco.expert import expert_episode
 from gym_deltaco.layout import Layout
 from gym_deltaco.scene_config import SceneConfig
-from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import Task
 from lerobot_deltaco.base_config import TaskConditionedConfig
 from lerobot_deltaco.base_policy import TaskConditionedPolicy
 from lerobot_deltaco.checkpoints import LoadedPolicy, find_checkpoints, load_policy
-from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
 from lerobot_deltaco.demonstrations import Demonstration, kept_frames, resize_images
 from lerobot_deltaco.episodes import Episode
 from lerobot_deltaco.evaluate import Simulators, run_episodes
+from lerobot_deltaco.expert_demonstrations import expert_demonstration
 from lerobot_deltaco.lerobot_env import check_policy_fits
-
-_EXPERT_ATTEMPTS = 20
 
 
 class Recording(NamedTuple):
@@ -117,31 +114,17 @@ def record_demonstration(
     Raises:
         RuntimeError: The expert has failed too often.
     """
-    env = PickPlaceEnv(task.index, scene or benchmark_scene(config))
-    try:
-        for attempt in range(_EXPERT_ATTEMPTS):
-            seed = episode_seed(0, "validation", task.index, number, attempt)
-            steps = list(expert_episode(env, task.index, seed))
-            if steps[-1].info["is_success"]:
-                break
-        else:
-            raise RuntimeError(f"The expert failed {_EXPERT_ATTEMPTS} times at: {task.instruction}")
-    finally:
-        env.close()
-    images = np.stack([first_camera(step.observation, config) for step in steps])
-    frames = torch.from_numpy(images).permute(0, 3, 1, 2)
-    pick_state = None
-    if config.gripper_index is not None and config.state_dim:
-        states = torch.from_numpy(np.stack([step.observation["agent_pos"] for step in steps]))
-        gripper = config.gripper_opening(torch.from_numpy(np.stack([step.action for step in steps])))
-        pick_state = find_keyframes(states, gripper, [(0, len(steps) - 1)]).pick_states[0]
-    info = steps[-1].info
-    return Demonstration(
-        task.instruction,
-        resize_images(frames[kept_frames(0, len(frames) - 1, config.n_demo_frames)], config.image_size),
-        pick_state,
-        frames[0],
-        target_object=int(info["objects"][info["target_object"]]),
+    camera = config.cameras[0].rpartition(".")[-1]
+    whole = expert_demonstration(task.index, number, scene or benchmark_scene(config), camera)
+    kept = kept_frames(0, len(whole.frames) - 1, config.n_demo_frames)
+    has_grasp = config.gripper_index is not None and config.state_dim > 0
+    return replace(
+        whole,
+        frames=resize_images(whole.frames[kept], config.image_size),
+        pick_state=whole.pick_state if has_grasp else None,
+        first_image=whole.frames[0],
+        states=None,
+        actions=None,
     )
 
 

@@ -23,7 +23,7 @@ from lerobot_deltaco.hub import HubError, check_push, push
 
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
-CHECKPOINT, ENVIRONMENT = ROOT / "checkpoints" / "pick_place", ROOT / "envhub"
+CHECKPOINT = ROOT / "checkpoints" / "pick_place"
 CARD = "README.md"
 
 TRIAL = """
@@ -56,8 +56,8 @@ def release(user: str | None = None, datasets: tuple[Path, ...] = (), rehearse: 
     """Checks, and publishes if a user is named; stops at the first problem.
 
     Args:
-        user: User or organization on the Hub that gets the policy, the environment and the datasets. By
-            default, nothing is published.
+        user: User or organization on the Hub that gets the policy and the datasets. By default, nothing
+            is published.
         datasets: Folders of datasets, published as USER/deltaco_FOLDER.
         rehearse: Whether to skip the checks of version, change log and working tree.
     """
@@ -132,7 +132,6 @@ def check_publishing(user: str, datasets: Sequence[Path]) -> None:
     """
     if "UV_PUBLISH_TOKEN" not in os.environ:
         raise ReleaseError("Set UV_PUBLISH_TOKEN to a token of the package index.")
-    hub_files(ENVIRONMENT, {"USER/NAME": f"{user}/deltaco"})
     hub_files(CHECKPOINT, {"checkpoints/pick_place": f"{user}/deltaco_pick_place"})
     names = [dataset_id(user, root) for root in datasets]
     if len(set(names)) < len(names):
@@ -143,7 +142,7 @@ def check_publishing(user: str, datasets: Sequence[Path]) -> None:
         check_push(name)
         if not is_finished(root):
             raise ReleaseError(f"{root} holds no finished dataset of `deltaco collect`.")
-    check_push(f"{user}/deltaco")
+    check_push(f"{user}/deltaco_pick_place")
 
 
 def build_wheel(dist: Path) -> Path:
@@ -178,12 +177,11 @@ def try_wheel(wheel: Path) -> None:
 
 
 def publish(user: str, datasets: Sequence[Path]) -> None:
-    """Publishes the package, the trained policy, the environment and datasets, in this order."""
+    """Publishes the package, the trained policy and datasets, in this order."""
     _run([_uv(), "publish", *map(str, DIST.glob("lerobot_policy_deltaco-*"))], ROOT)
-    policy, environment = f"{user}/deltaco_pick_place", f"{user}/deltaco"
+    policy = f"{user}/deltaco_pick_place"
     addresses = [
         push_files(hub_files(CHECKPOINT, {"checkpoints/pick_place": policy}), policy),
-        push_files(hub_files(ENVIRONMENT, {"USER/NAME": environment}), environment),
         *(push(root, dataset_id(user, root)) for root in datasets),
     ]
     sys.stdout.writelines(f"Published {address}\n" for address in addresses)
@@ -213,7 +211,7 @@ def hub_files(folder: Path, names: Mapping[str, str]) -> dict[str, bytes]:
 
 
 def push_files(files: Mapping[str, bytes], repo_id: str) -> str:
-    """Uploads files to a repository of a policy or an environment, and returns its address."""
+    """Uploads files to the repository of a policy, and returns its address."""
     api = HfApi()
     url = api.create_repo(repo_id, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:

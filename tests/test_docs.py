@@ -25,7 +25,7 @@ DOCS = ROOT / "docs"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "results/README.md")),
-    *(ROOT / name for name in ("checkpoints/pick_place/README.md", "envhub/README.md")),
+    ROOT / "checkpoints/pick_place/README.md",
     *sorted(DOCS.glob("*.md")),
 ]
 
@@ -87,7 +87,8 @@ def parse_lerobot(command: str, arguments: list[str], monkeypatch: pytest.Monkey
     """Parses a command's configuration with draccus, as LeRobot does, but reads no checkpoint."""
     from lerobot.configs import PreTrainedConfig
 
-    for module in ("lerobot.policies", "lerobot.envs", "lerobot_policy_deltaco"):
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    for module in ("lerobot.policies", "lerobot.envs", "lerobot_policy_deltaco", "lerobot_policy_example"):
         importlib.import_module(module)
     module, name = LEROBOT_CONFIGURATIONS[command]
     configuration = getattr(importlib.import_module(module), name)

@@ -1,18 +1,12 @@
 """The benchmark as LeRobot sees it: configuration, lazy vector environments, evaluation."""
 
-import importlib.util
-import re
-from pathlib import Path
-
 import gymnasium as gym
 import numpy as np
 import pybullet
 import pytest
 import torch
-from huggingface_hub import ModelCard
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.envs import EnvConfig, close_envs, env_to_policy_features, make_env, make_env_config
-from lerobot.envs.utils import _call_make_env, _load_module_from_path, _normalize_hub_result
 from lerobot.policies import PreTrainedPolicy
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from torch import nn
@@ -24,7 +18,6 @@ from lerobot_deltaco.lerobot_env import DeltacoEnv, EvaluationEnv
 
 # One of each kind: a name, a color and a shape.
 ONE_OF_EACH_KIND = "4,32,90"
-ENV_HUB = Path(__file__).parents[1] / "envhub"
 
 
 def simulators():
@@ -209,47 +202,3 @@ def test_instructions_may_be_sentences_of_people(tmp_path):
     policy.instructions.clear()
     evaluate(policy, 2, task="4", instruction="putt it  in teh box")
     assert policy.instructions == {"putt it in teh box"}
-
-
-# The Hub
-
-
-def load_from_hub(tmp_path, **options):
-    """Returns the environments that LeRobot makes of the file, of which it has a copy elsewhere."""
-    copy = tmp_path / "env.py"
-    copy.write_bytes((ENV_HUB / "env.py").read_bytes())
-    module = _load_module_from_path(str(copy))
-    options = {"n_envs": 1, "use_async_envs": False, "cfg": None, **options}
-    return _normalize_hub_result(_call_make_env(module, **options))
-
-
-def test_an_environment_from_the_hub_runs(tmp_path):
-    envs = load_from_hub(tmp_path, n_envs=2)
-    made = {index for group in envs.values() for index in group}
-    assert made == set(select_tasks("scenario_a_test"))
-    env = envs["name"][24]
-    observation, _ = env.reset(seed=0)
-    assert observation["pixels"].shape == (2, 48, 48, 3)
-    assert env.call("task_description") == (TASKS[24].instruction,) * 2
-    _, _, _, _, info = env.step(env.action_space.sample())
-    assert not info["is_success"].any()
-    close_envs(envs)
-
-
-def test_a_configuration_takes_precedence_over_the_hubs_file(tmp_path):
-    envs = load_from_hub(tmp_path, cfg=DeltacoEnv(task="4", scene=SceneConfig(image_size=32)))
-    assert {kind: list(group) for kind, group in envs.items()} == {"name": [4]}
-    assert envs["name"][4].single_observation_space["pixels"].shape == (32, 32, 3)
-    close_envs(envs)
-
-
-def test_the_card_is_tagged_and_its_example_runs(tmp_path):
-    card = ModelCard.load(ENV_HUB / "README.md")
-    assert {"lerobot", "envhub", "robotics"} <= set(card.data.tags)
-    (example,) = re.findall(r"```python\n(.*?)```", card.text, re.DOTALL)
-    call = 'make_env("USER/NAME", n_envs=2, trust_remote_code=True)'
-    assert call in example
-    program = example.replace(call, "load(n_envs=2)")
-    exec(program, {"load": lambda **options: load_from_hub(tmp_path, **options)})
-    for name in re.findall(r"`(lerobot_\w+)\.?\w*`", card.text):
-        assert importlib.util.find_spec(name)

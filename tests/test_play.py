@@ -1,5 +1,6 @@
 """The verdict on typed sentences, and what the page of `deltaco play` does, without a browser."""
 
+import re
 from types import SimpleNamespace
 from urllib.parse import parse_qsl
 
@@ -148,6 +149,7 @@ def test_a_run_has_a_video_a_picture_and_a_verdict(player):
     assert run.video.stat().st_size > 1000
     assert run.picture.height >= 320
     assert "asks for the black and white smushed dumbbell in the green bin" in run.verdict.asked
+    assert re.fullmatch(r"The policy was \d+% sure of the object.*\.", run.confidence)
     assert run.footnote.startswith("The scene's task 4, ")
 
 

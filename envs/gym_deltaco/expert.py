@@ -13,6 +13,8 @@ from gym_deltaco import EXPERT_NOISE
 from gym_deltaco.arm import FINGER_OPEN, FINGER_THICKNESS, FINGERTIP_OFFSET, POSITION_HIGH, POSITION_LOW
 from gym_deltaco.env import ACTION_SCALE, Observation, PickPlaceEnv
 from gym_deltaco.kinematics import inverse
+from gym_deltaco.scene_config import DEFAULT_SCENE, SceneConfig
+from gym_deltaco.seeding import episode_seed
 from gym_deltaco.workspace import (
     CONTAINER_FLOOR,
     CONTAINER_HALF_EXTENTS,
@@ -37,6 +39,7 @@ class Stage(Enum):
 
 
 OPEN, CLOSED = 1.0, -1.0
+_MAX_ATTEMPTS = 20  # at a demonstration
 
 # Heights, distances and errors in m. Heights of the gripper are those of the end effector; the fingertips are
 # 0.05 m lower.
@@ -105,6 +108,31 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EX
         next_observation, reward, _, _, info = env.step(action)
         yield Step(observation, action, reward, info, expert.stage)
         observation = next_observation
+
+
+def record_demonstration(task_id: int, number: int = 0, scene: SceneConfig = DEFAULT_SCENE) -> list[Step]:
+    """Returns a successful episode of the expert, in a scene that no evaluation has.
+
+    Args:
+        task_id: Index of the task, as in `gym_deltaco.tasks`.
+        number: Number of the demonstration. 0 is the one that the protocol gives: the task's only episode in
+            the dataset `E102`.
+        scene: Settings of the scene.
+
+    Raises:
+        RuntimeError: The expert has failed too often.
+    """
+    env = PickPlaceEnv(task_id, scene)
+    try:
+        for attempt in range(_MAX_ATTEMPTS):
+            steps = list(
+                expert_episode(env, task_id, episode_seed(0, "validation", task_id, number, attempt))
+            )
+            if steps[-1].info["is_success"]:
+                return steps
+    finally:
+        env.close()
+    raise RuntimeError(f"The expert failed {_MAX_ATTEMPTS} times at: {env.task.instruction}")
 
 
 class Expert:

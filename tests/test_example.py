@@ -1,0 +1,110 @@
+"""The example of a policy that takes demonstrations from the benchmark: `examples/`."""
+
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from lerobot.datasets import LeRobotDataset
+from lerobot.scripts import lerobot_eval
+from tiny_runs import run_training
+
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.tasks import get_task
+from lerobot_deltaco.checkpoints import find_checkpoints, load_policy
+from lerobot_deltaco.collect import CollectionPlan, collect
+from lerobot_deltaco.demonstrations import as_uint8
+from lerobot_deltaco.evaluate import Evaluation, evaluate_checkpoints
+from lerobot_deltaco.lerobot_env import EvaluationEnv
+from lerobot_deltaco.records import EvaluationPlan, read_records
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+TASKS = "24,35"
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    """A checkpoint of the example after two steps of `lerobot-train`."""
+    folder = tmp_path_factory.mktemp("example")
+    collect(folder / "data", CollectionPlan("4,14", 1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(EXAMPLES)
+        __import__("lerobot_policy_example")
+        options = {"policy.type": "example", "policy.push_to_hub": False}
+        run_training(folder / "data", folder / "run", options, in_memory=False, steps=2)
+        yield find_checkpoints(folder / "run")[-1].folder
+
+
+@pytest.fixture
+def received(monkeypatch):
+    """What the network of the example receives: sentence, and ends of the demonstration."""
+    policy, found = sys.modules["lerobot_policy_example"].ExamplePolicy, set()
+    find = policy.find
+
+    def noted(self, scenes, sentences, ends):
+        pixels = (255 * ends).round().byte().contiguous().numpy()
+        found.update((text, own.tobytes()) for text, own in zip(sentences, pixels, strict=True))
+        return find(self, scenes, sentences, ends)
+
+    monkeypatch.setattr(policy, "find", noted)
+    return found
+
+
+def test_evaluations_give_the_demonstrations_of_the_protocol(checkpoint, received, tmp_path, monkeypatch):
+    plan = EvaluationPlan(TASKS, trials=2, scene=SceneConfig(episode_length=2))
+    evaluate_checkpoints(checkpoint, plan, "last", tmp_path, command="", device="cpu")
+    episodes = read_records(tmp_path)[0].episodes
+    assert episodes["demonstration_task"].tolist() == [24, 24, 35, 35]
+    for task_id, (shown,) in zip(episodes["task_id"], episodes["demonstrated_objects"], strict=True):
+        assert shown in get_task(task_id).targets
+    # The same as the task's only episode in E102.
+    collect(tmp_path / "e102", CollectionPlan(TASKS, 1, split="validation"))
+    dataset = LeRobotDataset("test/e102", root=tmp_path / "e102")
+    for episode in dataset.meta.episodes:
+        ends = [episode["dataset_from_index"], episode["dataset_to_index"] - 1]
+        images = torch.stack([dataset[index]["observation.image"] for index in ends])
+        assert (episode["tasks"][0], as_uint8(images).numpy().tobytes()) in received
+    by_set_tasks = set(received)
+    received.clear()
+    words = {
+        "policy.path": checkpoint,
+        "policy.device": "cpu",
+        "env.type": "deltaco",
+        "env.task": TASKS,
+        "env.demonstrations": "true",
+        "env.scene.episode_length": 2,
+        "env.render_size": 16,
+        "eval.n_episodes": 1,
+        "eval.batch_size": 1,
+        "output_dir": tmp_path / "eval",
+    }
+    monkeypatch.setattr(sys, "argv", ["eval", *(f"--{name}={value}" for name, value in words.items())])
+    lerobot_eval.main()
+    assert received == by_set_tasks
+
+
+def test_another_tasks_demonstration_can_be_given(checkpoint, received):
+    plan = EvaluationPlan(TASKS, 1, scene=SceneConfig(episode_length=1), counterfactual="demonstration")
+    evaluation = Evaluation(load_policy(checkpoint, ["--device=cpu"]), plan)
+    (first,), (second,) = (evaluation.run(number) for number in range(2))
+    assert [each.episode.demonstration_task for each in (first, second)] == [35, 24]
+    assert first.demonstrated_objects[0] in get_task(35).targets
+
+
+def test_an_observation_has_the_demonstration_on_request():
+    assert set(EvaluationEnv(task_id=24).observation_space) == {"pixels", "agent_pos"}
+    env = EvaluationEnv(task_id=24, demonstrations=True)
+    check_env(env, skip_render_check=True)
+    first, other = (env.reset(options={"task_id": task_id})[0] for task_id in (24, 35))
+    assert (first["demonstration"] != other["demonstration"]).any()
+    later = env.step(env.action_space.sample())[0]
+    assert (later["demonstration"] == other["demonstration"]).all()
+
+
+def test_lerobot_finds_the_example():
+    project = tomllib.loads((EXAMPLES / "pyproject.toml").read_text())
+    name = project["project"]["name"]
+    assert project["tool"]["hatch"]["build"]["targets"]["wheel"]["only-include"] == [f"{name}.py"]
+    assert (EXAMPLES / f"{name}.py").is_file()
