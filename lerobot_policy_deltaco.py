@@ -4,12 +4,10 @@ import atexit
 import sys
 
 try:
-    # These register `--env.type=deltaco`, both policies with the steps of their processors, and
-    # `--robot.type=toy_robot`.
+    # These register `--env.type=deltaco`, and both policies with the steps of their processors.
     import lerobot_deltaco.deltaco.configuration_deltaco
     import lerobot_deltaco.deltaco_match.configuration_deltaco_match
-    import lerobot_deltaco.lerobot_env
-    import lerobot_deltaco.toy_robot  # noqa: F401
+    import lerobot_deltaco.lerobot_env  # noqa: F401
 except Exception as error:
     problem = (
         "lerobot_policy_deltaco could not be imported, so LeRobot does not know its types "

@@ -47,7 +47,7 @@ from lerobot_deltaco.train import image_size_in_memory
 
 _PICTURE_HEIGHT = 180  # px
 # A camera stands still if at least this fraction of the edges in an episode's first image stay where they
-# are: of fixed cameras in the benchmark and of the toy robot 0.6 to 0.8, of its wrist's below 0.1.
+# are: of the benchmark's fixed cameras 0.6 to 0.8, of its wrist camera below 0.1.
 _MIN_STAYING, _COMPARED_SIZE, _EDGES, _SAME = 0.4, 48, 0.2, 0.5
 _PAUSE = 0.05  # of the usual highest speed (the 95th percentile), below which the arm hardly moves
 _TIMED_STEPS, _TIMED_FRAMES = 3, 64

@@ -18,7 +18,6 @@ from gym_deltaco.atomic_files import parse_json
 
 COMMANDS = {
     "collect": "Collect episodes of the scripted expert as a LeRobotDataset.",
-    "toy": "Write a dataset of a toy robot, to go through the tutorial without a robot.",
     "check": "Show what a policy would take from a dataset, before it is trained.",
     "train": "Train a policy: `lerobot-train` over frames in memory.",
     "evaluate": "Evaluate a policy on the benchmark, and record every episode.",
@@ -127,28 +126,6 @@ def _collect() -> Callable[..., Any]:
         return "\n".join(lines)
 
     return collect
-
-
-def _toy() -> Callable[..., Any]:
-    import tyro
-
-    def toy(
-        root: tyro.conf.Positional[Path], episodes_per_task: int = 6, new_object: bool = False, seed: int = 0
-    ) -> str:
-        """Writes a dataset of the toy robot, which can be trained on and controlled as a real one.
-
-        Args:
-            root: Folder of the dataset.
-            episodes_per_task: Number of episodes of each of its 8 tasks.
-            new_object: Write episodes of 2 tasks with an object that the other dataset does not have.
-            seed: Seed of the scenes.
-        """
-        from lerobot_deltaco.toy_robot.record import write_toy_dataset
-
-        n_frames = write_toy_dataset(root, episodes_per_task, new_object, seed)
-        return f"The dataset in {root} has {n_frames:,} frames."
-
-    return toy
 
 
 def _train(arguments: list[str]) -> None:

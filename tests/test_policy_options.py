@@ -52,7 +52,7 @@ def test_defaults_of_deltaco_are_those_of_the_paper():
         ({"normalization_mapping": {"VISUAL": NormalizationMode.MEAN_STD}}, "must be IDENTITY for VISUAL"),
         ({"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}}, "MIN_MAX or IDENTITY for ACTION"),
         ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
-        ({"film": "none", "concat": "none"}, "would get no task"),
+        ({"film": "none", "concat": "none"}, "no demonstration is used"),
         ({"method": "language_only", "encoder_loss": "contrastive"}, "no demonstration is used"),
         ({"method": "mcil", "film": "demo"}, "`film` cannot be changed"),
         ({"demo_encoder": "pretrained"}, "have 512 numbers, and the instructions' have 384"),

@@ -32,6 +32,7 @@ from lerobot_deltaco.networks import BACKBONES
 VARIANTS = [
     *(("deltaco", {"method": method}) for method in METHODS),
     ("deltaco", {"film": "demo+language", "concat": "none"}),
+    ("deltaco", {"film": "none", "concat": "none", "encoder_loss": "none"}),
     ("deltaco", {"film": "none", "concat": "demo+language"}),
     ("deltaco", {"film": "language", "concat": "demo"}),
     ("deltaco", {"encoder_loss": "cosine"}),

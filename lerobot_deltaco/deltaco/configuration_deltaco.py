@@ -66,6 +66,7 @@ class DeltacoConfig(TaskConditionedConfig):
             includes the first two.
         method: Method of the paper: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
         film: Ablation: input through FiLM, instead of the method's: none, demo, language or demo+language.
+            With `film`, `concat` and `encoder_loss` none, the policy sees the scene alone.
         concat: Ablation: input that is concatenated to the feature points, instead of the method's; same
             values as `film`.
         encoder_loss: Ablation: encoder loss, instead of the method's: contrastive, cosine or none.
@@ -191,8 +192,6 @@ class DeltacoConfig(TaskConditionedConfig):
         if overridden and self.method in ("one_hot", "mcil"):
             raise ValueError(f"`{overridden[0]}` cannot be changed in the method {self.method!r}.")
         film, concat, encoder_loss = self.conditioning
-        if film == concat == "none":
-            raise ValueError("`film` and `concat` are both 'none': the policy would get no task.")
         if encoder_loss != "none" and not self.uses_demonstrations:
             raise ValueError(
                 f"`encoder_loss` is {encoder_loss!r}, but no demonstration is used. Set it to 'none', or use "
