@@ -43,6 +43,8 @@ class TaskConditionedConfig(PreTrainedConfig):
             None, for about 30 predictions in an episode as long as those of the training dataset.
         temporal_ensemble_coeff: Coefficient of ACT's temporal ensembling, which predicts a chunk at every
             step and averages what the chunks say about it; None for none. It needs `n_action_steps=1`.
+        trim_pauses: Whether `deltaco train` leaves out frames in which the robot has stood still for more
+            than 0.1 s.
         num_mixture_components: Number of Gaussians of the action's distribution. One averages two actions
             that are equally good; of several, the policy takes the likeliest.
         gripper: Gripper's dimension of the action: an index, "auto" (of those whose name contains "gripper",
@@ -78,6 +80,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     chunk_size: int = 1
     n_action_steps: int | None = None
     temporal_ensemble_coeff: float | None = None
+    trim_pauses: bool = True
     num_mixture_components: int = 1
     gripper: str = "auto"
     gripper_closed: str = "low"

@@ -42,6 +42,7 @@ from lerobot_deltaco.demonstrations import (
 )
 from lerobot_deltaco.frames import memory_for_frames
 from lerobot_deltaco.pages import picture_uri, write_page
+from lerobot_deltaco.pauses import paused_frames
 from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.train import image_size_in_memory
 
@@ -49,7 +50,6 @@ _PICTURE_HEIGHT = 180  # px
 # A camera stands still if at least this fraction of the edges in an episode's first image stay where they
 # are: of the benchmark's fixed cameras 0.6 to 0.8, of its wrist camera below 0.1.
 _MIN_STAYING, _COMPARED_SIZE, _EDGES, _SAME = 0.4, 48, 0.2, 0.5
-_PAUSE = 0.05  # of the usual highest speed (the 95th percentile), below which the arm hardly moves
 _TIMED_STEPS, _TIMED_FRAMES = 3, 64
 
 
@@ -324,16 +324,11 @@ def _gripper_facts(start: TrainingStart) -> list[tuple[str, str]]:
 
 
 def _pause_facts(dataset: LeRobotDataset) -> list[tuple[str, str]]:
-    """Returns how often the arm hardly moves."""
+    """Returns how many frames training leaves out as pauses."""
     if OBS_STATE not in dataset.meta.features:
         return []
-    columns = dataset.hf_dataset.select_columns([OBS_STATE, "episode_index"]).with_format("numpy")[:]
-    states = np.stack(columns[OBS_STATE]).astype(np.float64).reshape(len(dataset), -1)
-    speeds = (np.abs(np.diff(states, axis=0)) / np.ptp(states, axis=0).clip(1e-9)).max(axis=1)
-    episodes = np.asarray(columns["episode_index"])
-    speeds = speeds[episodes[1:] == episodes[:-1]]
-    pauses = speeds < _PAUSE * np.quantile(speeds, 0.95)
-    return [("pauses", f"the arm hardly moves in {100 * pauses.mean():.0f} % of the frames")]
+    paused = paused_frames(read_robot_data(dataset, range(dataset.meta.total_episodes)), dataset.fps)
+    return [("pauses", f"the robot stands still in {100 * paused.mean():.0f} % of the frames")]
 
 
 def _dimensions(start: TrainingStart) -> dict[str, list[tuple[str, float, float]]]:

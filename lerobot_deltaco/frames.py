@@ -97,6 +97,17 @@ class FramesInMemory(torch.utils.data.Dataset):
         # For each feature with a window of frames: the frames' distances from the sample's frame.
         deltas = get_delta_indices(dataset.delta_timestamps or {}, dataset.fps)
         self._windows = {name: torch.tensor(delta) for name, delta in deltas.items()}
+        self.skip(np.zeros(len(self), dtype=bool))
+
+    def skip(self, frames: NDArray[np.bool_]) -> None:
+        """Leaves frames out of the windows of others, as if they had not been recorded.
+
+        Args:
+            frames: Which frames to leave out, (frames,); the ends of an episode must not be among them.
+        """
+        self._kept = torch.from_numpy(np.flatnonzero(~frames))  # rows
+        # Where a row, or the next one that is kept, is among those.
+        self._position = torch.from_numpy(np.cumsum(~frames) - ~frames)
 
     def __len__(self) -> int:
         return len(self.tasks)
@@ -127,9 +138,11 @@ class FramesInMemory(torch.utils.data.Dataset):
         for name, values in self.columns.items():
             chosen = rows
             if name in self._windows:
-                wanted = rows[:, None] + self._windows[name]  # (batch, window)
-                chosen = wanted.clamp(self._first[rows][:, None], self._last[rows][:, None])
-                found[f"{name}_is_pad"] = chosen != wanted
+                wanted = self._position[rows][:, None] + self._windows[name]  # (batch, window)
+                first, last = (self._position[ends[rows]][:, None] for ends in (self._first, self._last))
+                inside = wanted.clamp(first, last)
+                found[f"{name}_is_pad"] = inside != wanted
+                chosen = self._kept[inside]
                 if name in self._dataset.meta.video_keys:
                     chosen = chosen.squeeze(1)  # as LeRobot, if the window is one frame
             found[name] = values[chosen]

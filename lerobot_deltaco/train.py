@@ -27,6 +27,7 @@ from lerobot_deltaco.dataset_reading import check_dataset_folder, missing_files_
 from lerobot_deltaco.deltaco_match.keyframes import Grasp, find_grasps
 from lerobot_deltaco.frames import FramesInMemory
 from lerobot_deltaco.optimization import keep_freed_memory
+from lerobot_deltaco.pauses import paused_frames
 from lerobot_deltaco.task_batches import TaskBatchSampler
 
 
@@ -93,6 +94,11 @@ class _InMemoryTraining:
         use = np.zeros(len(tasks), dtype=bool)
         use[stock.indices] = True
         use &= _until_release(self._frames, policy)
+        data = self._frames.robot_data(policy.cameras[0]) if policy.trim_pauses else None
+        if data is not None:
+            paused = paused_frames(data, self._frames.fps)
+            self._frames.skip(paused)
+            use &= ~paused
         return TaskBatchSampler(
             tasks,
             self._config.batch_size,

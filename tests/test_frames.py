@@ -12,8 +12,9 @@ from PIL import Image
 from tiny_runs import batch_of, write_dataset
 
 from lerobot_deltaco import frames as frames_module
-from lerobot_deltaco.demonstrations import read_demonstrations, read_robot_data
+from lerobot_deltaco.demonstrations import RobotData, read_demonstrations, read_robot_data
 from lerobot_deltaco.frames import FramesInMemory
+from lerobot_deltaco.pauses import paused_frames
 
 TASKS = ["stack the cups", "pour the tea", "wave"] * 2
 LENGTH = 5
@@ -66,6 +67,32 @@ def test_windows_equal_those_of_lerobot(root, episodes):
     windows = {TOP: [-0.1, 0.0], "action": [0.0, 0.1, 0.2, 0.3], "observation.state": [0.0]}
     dataset = read(root, episodes=episodes, delta_timestamps=windows)
     assert_batches_are_equal(dataset, list(range(3 * LENGTH)))
+
+
+def test_frames_that_are_skipped_are_in_no_window(root):
+    frames = FramesInMemory(read(root, delta_timestamps={"action": [0.0, 0.1, 0.2]}))
+    plain = frames.batch(range(LENGTH))
+    skipped = np.zeros(len(frames), dtype=bool)
+    skipped[1:3] = True
+    frames.skip(skipped)
+    batch = frames.batch([0, 3, LENGTH - 1])
+    assert torch.equal(batch["action"][0], plain["action"][[0, 3, 4], 0])
+    assert torch.equal(batch["action"][1], plain["action"][3])
+    assert batch["action_is_pad"].tolist() == [[False] * 3, [False, False, True], [False, True, True]]
+    assert torch.equal(batch["observation.state"], plain["observation.state"][[0, 3, LENGTH - 1]])
+
+
+@pytest.mark.parametrize("fps", [5, 30])
+def test_pauses_are_stretches_in_which_the_robot_stands_still(fps):
+    moving = torch.tensor([1, 1, 0, 0, 0, 0, 0, 0, 0, 1, 1, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 1.0])
+    states = (moving.cumsum(0) - moving)[:, None] * torch.tensor([0.1, 0.0])
+    data = RobotData(states, states, [(0, 12), (13, 21)])
+    n_kept = max(1, fps // 10)
+    paused = np.flatnonzero(paused_frames(data, fps)).tolist()
+    assert paused == [*range(2 + n_kept, 9), *range(14 + n_kept, 21)]
+    # A gripper that is told to close is no pause.
+    actions = states + torch.arange(22)[:, None].eq(5) * torch.tensor([0.0, 9.0])
+    assert not paused_frames(data._replace(actions=actions), fps)[[4, 5]].any()
 
 
 @pytest.mark.parametrize("seconds", [[-0.1, 0.0], [0.0], None], ids=["two frames", "one frame", "no window"])
