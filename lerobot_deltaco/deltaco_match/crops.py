@@ -1,7 +1,7 @@
-"""Crops of images around locations, and their features by EfficientNet-Lite0.
+"""Crops of images around locations, and their features: by EfficientNet-Lite0, and colors.
 
 A network that learns from a few hundred objects compares them by color. The features of a network that was
-trained on photographs tell shapes apart, too, if the object fills its view.
+trained on photographs tell shapes apart, too, if the object fills its view; but colors less exactly.
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ _COARSE_BLOCK, _COARSE_CHANNELS = 16, 320
 # and width by which images blur an object (px).
 _CHANGE, _REACH, _BLUR = 0.1, 1 / 3, 1.0
 _MIN_SEEN, _MAX_SLOPE = 24, 1.5
-FEATURE_DIM = _FINE_CHANNELS * _FINE_CELLS**2 + _COARSE_CHANNELS + HEAD_CHANNELS
+_COLOR_CELLS = 8  # of a row and of a column, whose mean colors are features
+COLOR_DIM = 3 * _COLOR_CELLS**2
+FEATURE_DIM = _FINE_CHANNELS * _FINE_CELLS**2 + _COARSE_CHANNELS + HEAD_CHANNELS + COLOR_DIM
 
 
 def crop_features(images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
-    """Returns features of crops, (batch, n, FEATURE_DIM).
+    """Returns features of crops, (batch, n, FEATURE_DIM), the colors last.
 
     Args:
         images: Images (batch, 3, H, W), uint8 or in 0..1, at their own resolution.
@@ -47,6 +49,7 @@ def crop_features(images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
         F.adaptive_avg_pool2d(fine, _FINE_CELLS).flatten(1),
         coarse.mean(dim=(2, 3)),
         last.mean(dim=(2, 3)),
+        F.adaptive_avg_pool2d(crops, _COLOR_CELLS).flatten(1),
     ]
     return torch.cat([part.float() for part in parts], dim=1).unflatten(0, locations.shape[:2])
 

@@ -5,12 +5,15 @@ r"""Feature matching: finds the object that a task asks for among the things tha
     proposals                       where it grasped                     words, weighed
       |                                    |                                |
     crops -> EfficientNet-Lite0       crop -> EfficientNet-Lite0            |
-      |               (frozen)             |                                |
-    descriptors -------- cosine ------- descriptor                          |
+      |      (frozen), colors              |                                |
+    descriptors -------- cosines ------ descriptors                         |
       |                    |                                                |
     log probability of each word of the vocabulary ------------------- those said
                            |                                                |
                            +------------ sum: score of a proposal ----------+
+
+There are two descriptors. One tells whether a proposal is the very object that was demonstrated. The other
+tells whether it is like it, as tasks by color or shape need, and counts as far as the first finds none.
 
 The small networks behind the frozen encoder are fitted before the policy is trained, to the first images of
 the training episodes.
@@ -28,18 +31,20 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from lerobot_deltaco.deltaco_match import proposals
-from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, crop_features, fit_perspective
+from lerobot_deltaco.deltaco_match.crops import COLOR_DIM, FEATURE_DIM, crop_features, fit_perspective
 from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.deltaco_match.proposals import ProposalNetwork
 from lerobot_deltaco.deltaco_match.words import UNKNOWN_WORD, WordWeights, encode_words, understand, words_of
 from lerobot_deltaco.networks import gaussian_maps
 
 _DESCRIPTOR_DIM, _HIDDEN_DIM, _DROPOUT = 64, 256, 0.5
-_MIN_STD, _MAX_FEATURE = 1e-3, 6.0
+_MIN_STD, _MAX_FEATURE, _MIN_PROBABILITY = 1e-3, 6.0, 1e-9
 # Probability that a demonstration shows another object than the one that the words describe, if all of them
-# are known; and how much more its similarity counts than in the fit, where dropout disturbs it. Chosen on
-# folds of the training objects, as are the settings of the fit.
+# are known and no proposal is the very object; and how much more similarities count than in the fit, where
+# dropout disturbs them. Chosen on folds of the training objects, as are the settings of the fit.
 _P_OTHER_OBJECT, _SHARPNESS = 0.5, 1.5
+_COLOR_WEIGHT = 2.0  # of colors among the features
+_INITIAL_GATE = (8.0, -5.0)  # slope and offset of the logit that a proposal is the very object, by its cosine
 # Of the fit.
 FIT_STEPS = 1500
 _MAX_EPISODES = 10_000
@@ -144,14 +149,13 @@ class FeatureMatching(nn.Module):
                 similarity = torch.zeros_like(scores)
                 demonstrated = torch.full_like(scores[:, 0], torch.nan)
             else:
-                # How well known words describe the object: not at all if one that describes it is unknown.
+                # How well known words describe the object. A new noun leaves the demonstration in charge.
                 unknown = (weights * (said == UNKNOWN_WORD)).amax(dim=1)
-                known = (weights * (said > UNKNOWN_WORD)).amax(dim=1)
-                # A new noun leaves the demonstration in charge.
-                p_other = (_P_OTHER_OBJECT * (1 - unknown) * known)[:, None]
-                similarity = self.compare.similarity(crops.descriptors, described)
-                matches = (_SHARPNESS * self.compare.log_scale.exp() * similarity).softmax(dim=1)
-                scores = scores + torch.log((1 - p_other) * matches + p_other / scores.shape[1])
+                known = (1 - unknown) * (weights * (said > UNKNOWN_WORD)).amax(dim=1)
+                matches, similarity = self.compare.match(
+                    crops, described, _SHARPNESS, _P_OTHER_OBJECT * known
+                )
+                scores = (1 - unknown)[:, None] * scores + matches
             heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
             return Candidates(locations, scores.log_softmax(dim=1), heights)
 
@@ -172,7 +176,7 @@ class FeatureMatching(nn.Module):
 
     @torch.no_grad()
     def describe(self, images: Tensor, native: Tensor, locations: Tensor) -> Tensor:
-        """Returns unit descriptors of what was grasped in demonstrations, (batch, descriptor).
+        """Returns descriptors of what was grasped in demonstrations, (batch, descriptor).
 
         Args:
             images: First images, (batch, 3, H, W) in 0..1, as small as the policy's.
@@ -308,8 +312,8 @@ class FeatureMatching(nn.Module):
             scenes, others = (rows.to(device) for rows in pairs.draw(_SCENES_PER_STEP, generator))
             crops = torch.cat([features[scenes], features[others, target[others]][:, None]], dim=1)
             described = self.compare(crops, generator)
-            similar = self.compare.similarity(described.descriptors[:, :-1], described.descriptors[:, -1])
-            loss = F.cross_entropy(self.compare.log_scale.exp() * similar, target[scenes])
+            matches, _ = self.compare.match(described.among(slice(-1)), described.descriptors[:, -1])
+            loss = F.nll_loss(matches, target[scenes])
             draws = torch.rand(len(scenes), generator=generator)
             drawn = (first[scenes.cpu(), 0] + draws * first[scenes.cpu(), 1]).long()
             dropped = torch.rand(len(scenes), said.shape[1], generator=generator) < _P_DROP_WORD
@@ -318,14 +322,15 @@ class FeatureMatching(nn.Module):
             loss = loss + self._word_losses(described.words[:, :-1], left, sentence, target[scenes])
             rows = torch.arange(len(scenes), device=device)
             with torch.no_grad():  # as similar as they are without dropout
-                grasped = self.compare(crops[rows[:, None], _beside(target[scenes])]).descriptors
-                similarity = self.compare.similarity(grasped[:, :1], grasped[:, 1])[:, 0]
-            loss = (
-                loss
-                + self.grasp_height.losses(
-                    described.hidden[rows, target[scenes]], similarity, heights[others], heights[scenes]
-                ).mean()
+                plain = self.compare(crops)
+                _, similarity = self.compare.match(plain.among(slice(-1)), plain.descriptors[:, -1])
+            height_losses = self.grasp_height.losses(
+                described.hidden[rows, target[scenes]],
+                similarity[rows, target[scenes]],
+                heights[others],
+                heights[scenes],
             )
+            loss = loss + height_losses.mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -368,7 +373,8 @@ class Crops(NamedTuple):
     """Descriptions of crops.
 
     Attributes:
-        descriptors: Unit vectors, (batch, n, descriptor).
+        descriptors: Two unit vectors one after the other: which object it is, and what it is like,
+            (batch, n, 2 descriptor).
         words: Log probabilities of the words of the vocabulary, (batch, n, words).
         hidden: Features of a crop's appearance, (batch, n, hidden).
     """
@@ -376,6 +382,10 @@ class Crops(NamedTuple):
     descriptors: Tensor
     words: Tensor
     hidden: Tensor
+
+    def among(self, chosen: slice) -> Crops:
+        """Returns some of the crops of each sample."""
+        return Crops(*(part[:, chosen] for part in self))
 
 
 class Comparison(nn.Module):
@@ -393,10 +403,11 @@ class Comparison(nn.Module):
         self.register_buffer("mean", torch.zeros(FEATURE_DIM))
         self.register_buffer("std", torch.ones(FEATURE_DIM))
         self.hidden = nn.Linear(FEATURE_DIM, _HIDDEN_DIM)
-        self.linear = nn.Linear(FEATURE_DIM, _DESCRIPTOR_DIM)
-        self.from_hidden = nn.Linear(_HIDDEN_DIM, _DESCRIPTOR_DIM)
+        self.linear = nn.Linear(FEATURE_DIM, 2 * _DESCRIPTOR_DIM)
+        self.from_hidden = nn.Linear(_HIDDEN_DIM, 2 * _DESCRIPTOR_DIM)
         self.words = nn.Linear(_HIDDEN_DIM, n_words)
-        self.log_scale = nn.Parameter(torch.tensor(math.log(10.0)))
+        self.log_scale = nn.Parameter(torch.full((2,), math.log(10.0)))
+        self.gate = nn.Parameter(torch.tensor(_INITIAL_GATE))
 
     def set_statistics(self, features: Tensor) -> None:
         """Sets the mean and the standard deviation of features (scenes, n, FEATURE_DIM)."""
@@ -412,14 +423,46 @@ class Comparison(nn.Module):
             generator: Source of dropout's draws, on the CPU; None for no dropout.
         """
         inputs = ((features.float() - self.mean) / self.std).clamp(-_MAX_FEATURE, _MAX_FEATURE)
+        inputs = torch.cat([inputs[..., :-COLOR_DIM], _COLOR_WEIGHT * inputs[..., -COLOR_DIM:]], dim=-1)
         inputs = _dropout(inputs, generator)
         hidden = _dropout(F.relu(self.hidden(inputs)), generator)
-        descriptors = F.normalize(self.linear(inputs) + self.from_hidden(hidden), dim=-1)
-        return Crops(descriptors, self.words(hidden).log_softmax(dim=-1), hidden)
+        descriptors = self.linear(inputs) + self.from_hidden(hidden)
+        return Crops(_unit(descriptors), self.words(hidden).log_softmax(dim=-1), hidden)
 
-    def similarity(self, descriptors: Tensor, demonstrated: Tensor) -> Tensor:
-        """Returns cosines, (batch, n), of descriptors (batch, n, d) with one of each (batch, d)."""
-        return torch.einsum("bnd,bd->bn", descriptors, F.normalize(demonstrated, dim=1))
+    def match(
+        self,
+        crops: Crops,
+        described: Tensor,
+        sharpness: float = 1.0,
+        p_other: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Compares crops with what was demonstrated.
+
+        Args:
+            crops: The proposals.
+            described: Descriptors of the demonstrated objects, (batch, 2 descriptor).
+            sharpness: Factor of the similarities.
+            p_other: Probability that a demonstration shows another object, if none is the very one, (batch,).
+
+        Returns:
+            Log probabilities that the proposals are meant, and cosines of the first descriptors, (batch, n).
+        """
+        each, wanted = crops.descriptors.unflatten(-1, (2, -1)), _unit(described).unflatten(-1, (2, -1))
+        cosines = torch.einsum("bnkd,bkd->kbn", each, wanted)
+        is_same, is_alike = (
+            (sharpness * self.log_scale.exp()[:, None, None] * cosines).softmax(dim=2).unbind()
+        )
+        if p_other is not None:
+            is_alike = (1 - p_other)[:, None] * is_alike + p_other[:, None] / is_alike.shape[1]
+        # Whether any proposal is the very object.
+        p_same = torch.sigmoid(self.gate[0] * cosines[0].amax(dim=1, keepdim=True) + self.gate[1])
+        probabilities = p_same * is_same + (1 - p_same) * is_alike
+        return probabilities.clamp_min(_MIN_PROBABILITY).log(), cosines[0]
+
+
+def _unit(descriptors: Tensor) -> Tensor:
+    """Scales both descriptors (..., 2 descriptor) to unit length."""
+    return F.normalize(descriptors.unflatten(-1, (2, -1)), dim=-1).flatten(-2)
 
 
 def _word_scores(words: Tensor, said: Tensor, weights: Tensor) -> Tensor:
@@ -439,11 +482,6 @@ def _nearest(proposed: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
     """Returns which proposal is nearest to locations (batch, 2), and whether it is near, (batch,) each."""
     distance, nearest = (proposed - locations[:, None]).norm(dim=2).min(dim=1)
     return nearest, distance < _MAX_DISTANCE
-
-
-def _beside(target: Tensor) -> Tensor:
-    """Returns the indices (batch, 2) of right proposals (batch,), and of the last crop."""
-    return torch.stack([target, torch.full_like(target, -1)], dim=1)
 
 
 def _dropout(values: Tensor, generator: torch.Generator | None) -> Tensor:
