@@ -17,11 +17,15 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
-from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_deltaco.base_config import TaskConditionedConfig
-from lerobot_deltaco.dataset_reading import check_episode_numbers, open_dataset, training_argument
+from lerobot_deltaco.dataset_reading import (
+    check_episode_numbers,
+    compare_robots,
+    open_dataset,
+    training_argument,
+)
 from lerobot_deltaco.demonstrations import (
     Demonstration,
     DemonstrationBank,
@@ -292,7 +296,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             )
         dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
         if self._meta is not None:
-            _compare_robots(self._meta, dataset.meta)
+            compare_robots(self._meta, dataset.meta)
         return self._read_bank(dataset, None)
 
     def _step_generator(self) -> torch.Generator:
@@ -413,53 +417,6 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
         demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
         return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
-
-
-def warn_of_equal_instructions(tasks: Sequence[str], encoded: Tensor) -> None:
-    """Warns if a policy cannot tell two instructions apart.
-
-    Args:
-        tasks: Task strings.
-        encoded: What the policy makes of them, (tasks, ...).
-    """
-    _, group, sizes = encoded.unique(dim=0, return_inverse=True, return_counts=True)
-    alike = (sizes[group] > 1).nonzero().flatten().tolist()
-    if alike:
-        first, other = [n for n in alike if group[n] == group[alike[0]]][:2]
-        logger.warning(
-            "The policy cannot tell %d of %d tasks from others by their instructions, such as %r and %r. "
-            "Word them differently, with English words.",
-            len(alike),
-            len(tasks),
-            tasks[first],
-            tasks[other],
-        )
-
-
-def _compare_robots(training: LeRobotDatasetMetadata, shown: LeRobotDatasetMetadata) -> None:
-    """Warns if demonstrations are of another robot than the training's, or in other units."""
-    for name in {ACTION, OBS_STATE} & training.features.keys() & shown.features.keys():
-        names = [meta.features[name].get("names") for meta in (training, shown)]
-        least, most, means = (
-            np.asarray(meta.stats[name][key]).reshape(-1)
-            for meta, key in ((training, "min"), (training, "max"), (shown, "mean"))
-        )
-        ours, theirs = f"{training.repo_id}, which is trained on,", f"the demonstrations in {shown.repo_id}"
-        if names[0] != names[1]:
-            logger.warning("`%s` is %s in %s but %s in %s.", name, names[0], ours, names[1], theirs)
-        elif len(least) == len(means) and (abs(means - (least + most) / 2) > most - least + 1e-6).any():
-            worst = int(np.argmax(abs(means - (least + most) / 2) - (most - least)))
-            logger.warning(
-                "`%s` does not fit: its dimension %d is between %g and %g in %s but %g on average in %s. Are "
-                "the units the same?",
-                name,
-                worst,
-                least[worst],
-                most[worst],
-                ours,
-                means[worst],
-                theirs,
-            )
 
 
 def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadata) -> Paraphrases | None:

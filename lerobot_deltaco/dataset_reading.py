@@ -6,6 +6,7 @@ have a table of episodes, statistics or tasks that do not belong to the frames.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,9 @@ from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from numpy.typing import NDArray
+from torch import Tensor
+
+logger = logging.getLogger(__name__)
 
 _TOLERANCE = 1e-3  # of numbers beyond the range of the statistics, as a fraction of it
 
@@ -341,3 +345,50 @@ def _check_numbers(dataset: LeRobotDataset, name: str, stats: dict[str, Any]) ->
             f"{frame_name(dataset, int(row))}. {int(wrong.any(axis=1).sum())} frames are such. Leave out "
             "damaged episodes with --dataset.episodes; compute wrong statistics again."
         )
+
+
+def warn_of_equal_instructions(tasks: Sequence[str], encoded: Tensor) -> None:
+    """Warns if a policy cannot tell two instructions apart.
+
+    Args:
+        tasks: Task strings.
+        encoded: What the policy makes of them, (tasks, ...).
+    """
+    _, group, sizes = encoded.unique(dim=0, return_inverse=True, return_counts=True)
+    alike = (sizes[group] > 1).nonzero().flatten().tolist()
+    if alike:
+        first, other = [n for n in alike if group[n] == group[alike[0]]][:2]
+        logger.warning(
+            "The policy cannot tell %d of %d tasks from others by their instructions, such as %r and %r. "
+            "Word them differently, with English words.",
+            len(alike),
+            len(tasks),
+            tasks[first],
+            tasks[other],
+        )
+
+
+def compare_robots(training: LeRobotDatasetMetadata, shown: LeRobotDatasetMetadata) -> None:
+    """Warns if demonstrations are of another robot than the training's, or in other units."""
+    for name in {ACTION, OBS_STATE} & training.features.keys() & shown.features.keys():
+        names = [meta.features[name].get("names") for meta in (training, shown)]
+        least, most, means = (
+            np.asarray(meta.stats[name][key]).reshape(-1)
+            for meta, key in ((training, "min"), (training, "max"), (shown, "mean"))
+        )
+        ours, theirs = f"{training.repo_id}, which is trained on,", f"the demonstrations in {shown.repo_id}"
+        if names[0] != names[1]:
+            logger.warning("`%s` is %s in %s but %s in %s.", name, names[0], ours, names[1], theirs)
+        elif len(least) == len(means) and (abs(means - (least + most) / 2) > most - least + 1e-6).any():
+            worst = int(np.argmax(abs(means - (least + most) / 2) - (most - least)))
+            logger.warning(
+                "`%s` does not fit: its dimension %d is between %g and %g in %s but %g on average in %s. Are "
+                "the units the same?",
+                name,
+                worst,
+                least[worst],
+                most[worst],
+                ours,
+                means[worst],
+                theirs,
+            )

@@ -20,11 +20,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.base_policy import (
-    DemonstrationsOfTasks,
-    TaskConditionedPolicy,
-    warn_of_equal_instructions,
-)
+from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
+from lerobot_deltaco.dataset_reading import warn_of_equal_instructions
 from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.deltaco.demo_encoders import (
     AttentionEncoder,

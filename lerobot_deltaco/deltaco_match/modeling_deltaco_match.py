@@ -31,12 +31,8 @@ from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_tra
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.base_policy import (
-    DemonstrationsOfTasks,
-    TaskConditionedPolicy,
-    warn_of_equal_instructions,
-)
-from lerobot_deltaco.dataset_reading import open_dataset
+from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
+from lerobot_deltaco.dataset_reading import open_dataset, warn_of_equal_instructions
 from lerobot_deltaco.deltaco_match.calibration import MIN_EPISODES
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
