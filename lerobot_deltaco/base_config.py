@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.datasets import LeRobotDatasetMetadata
 
 from gym_deltaco.env import ACTION_NAMES
 from lerobot_deltaco.optimization import CosineSchedulerConfig, FusedAdamWConfig
@@ -20,7 +21,8 @@ from lerobot_deltaco.paraphrases import GRAMMAR
 logger = logging.getLogger(__name__)
 
 PARAPHRASE_SPLITS = ("all", "train", "held_out")
-_PREDICTIONS_PER_EPISODE = 30
+# Choice of `chunk_size`: its duration, the least length of the episodes, in frames, and its maximum.
+_CHUNK_SECONDS, _MIN_CHUNKED_FRAMES, _MAX_CHUNK = 2 / 3, 60, 50
 # Options that name files and datasets of the training machine, whose contents are in the checkpoint.
 SOURCES = ("paraphrases", "demo_repo_id", "demo_root")
 
@@ -38,9 +40,10 @@ class TaskConditionedConfig(PreTrainedConfig):
         p_paraphrase: Probability that a training sample's instruction is such a sentence; otherwise, it is
             the task string.
         image_size: Height and width to which images are scaled, px.
-        chunk_size: Number of steps that the policy predicts at once.
-        n_action_steps: Number of steps of a chunk that are carried out before the next one is predicted.
-            None, for about 30 predictions in an episode as long as those of the training dataset.
+        chunk_size: Number of steps that the policy predicts at once. With None, training chooses two thirds
+            of a second, or one step if episodes have fewer than 60.
+        n_action_steps: Number of steps of a chunk that are carried out before the next one is predicted;
+            None for all.
         temporal_ensemble_coeff: Coefficient of ACT's temporal ensembling, which predicts a chunk at every
             step and averages what the chunks say about it; None for none. It needs `n_action_steps=1`.
         trim_pauses: Whether `deltaco train` leaves out frames in which the robot has stood still for more
@@ -77,7 +80,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     paraphrases_split: str = "train"
     p_paraphrase: float = 1.0
     image_size: int = 48
-    chunk_size: int = 1
+    chunk_size: int | None = 1
     n_action_steps: int | None = None
     temporal_ensemble_coeff: float | None = None
     trim_pauses: bool = True
@@ -135,7 +138,6 @@ class TaskConditionedConfig(PreTrainedConfig):
         self.check_ranges(
             p_paraphrase=(0, 1),
             image_size=(16, 1024),
-            chunk_size=(1, 1000),
             num_mixture_components=(1, 1000),
             tasks_per_batch=(0, 1_000_000),
             upsampled_fraction=(0, 1),
@@ -145,10 +147,12 @@ class TaskConditionedConfig(PreTrainedConfig):
             scheduler_warmup_steps=(0, 1_000_000_000),
             grad_clip_norm=(0, 1e6),
         )
-        if self.n_action_steps is not None and not 1 <= self.n_action_steps <= self.chunk_size:
+        if self.chunk_size is not None:
+            self.check_ranges(chunk_size=(1, 1000))
+        longest = self.chunk_size or _MAX_CHUNK
+        if self.n_action_steps is not None and not 1 <= self.n_action_steps <= longest:
             raise ValueError(
-                f"`n_action_steps` must be from 1 to `chunk_size`, {self.chunk_size}. Got "
-                f"{self.n_action_steps}."
+                f"`n_action_steps` must be from 1 to `chunk_size`, {longest}. Got {self.n_action_steps}."
             )
         if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
             raise ValueError(
@@ -231,11 +235,11 @@ class TaskConditionedConfig(PreTrainedConfig):
         name = dimension_names(features["action"])[int(self.gripper)] if names else "without a name"
         return f"dimension {self.gripper} of the action ({name})"
 
-    def set_dataset_size(self, n_frames: int, n_episodes: int) -> None:
-        """Chooses `n_action_steps` by the length of the episodes, if it is not given."""
-        if self.n_action_steps is None:
-            wanted = round(n_frames / max(n_episodes, 1) / _PREDICTIONS_PER_EPISODE)
-            self.n_action_steps = min(max(wanted, 1), self.chunk_size)
+    def set_dataset_length(self, meta: LeRobotDatasetMetadata) -> None:
+        """Chooses `chunk_size` by the length of the training episodes, if it is not given."""
+        if self.chunk_size is None:
+            is_short = meta.total_frames < _MIN_CHUNKED_FRAMES * meta.total_episodes
+            self.chunk_size = 1 if is_short else min(max(1, round(_CHUNK_SECONDS * meta.fps)), _MAX_CHUNK)
 
     def validate_features(self) -> None:
         """Checks the inputs and outputs that LeRobot found in the dataset.
@@ -341,7 +345,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     @property
     def action_delta_indices(self) -> list[int] | None:
         """Steps of a chunk; None for only the next action."""
-        return None if self.chunk_size == 1 else list(range(self.chunk_size))
+        return None if self.chunk_size == 1 else list(range(self.chunk_size or _MAX_CHUNK))
 
     @property
     def reward_delta_indices(self) -> None:

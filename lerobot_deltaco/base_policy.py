@@ -90,7 +90,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self._processors_digest: str | None = None  # of the checkpoint that was loaded
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features, dataset_stats or dataset_meta.stats)
-            config.set_dataset_size(dataset_meta.total_frames, dataset_meta.total_episodes)
+            config.set_dataset_length(dataset_meta)
         config.validate_features()
         self.state_limits = StateLimits(config.state_dim, dataset_stats)
         self.instructions: InstructionEmbeddings | None = None
@@ -156,10 +156,10 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             if config.temporal_ensemble_coeff is not None:
                 chunk = self.predict_action_chunk(batch)
                 if self._ensemble is None:
-                    self._ensemble = ACTTemporalEnsembler(config.temporal_ensemble_coeff, config.chunk_size)
+                    self._ensemble = ACTTemporalEnsembler(config.temporal_ensemble_coeff, chunk.shape[1])
                 return self._ensemble.update(chunk)
             if self._begins_episode(batch) or not self._actions:
-                chunk = self.predict_action_chunk(batch)[:, : config.n_action_steps or config.chunk_size]
+                chunk = self.predict_action_chunk(batch)[:, : config.n_action_steps]
                 self._actions = deque(chunk.unbind(dim=1))
             return self._actions.popleft()
 

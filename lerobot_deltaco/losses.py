@@ -140,7 +140,8 @@ def imitation_loss(
         predicted: Distributions of the samples' actions.
         gripper: Logits of the grippers, (batch, steps); None without a gripper.
         log_std: (components, steps, dims), the same for all samples.
-        action: Actions of the expert, (batch, steps, action) in -1..1, or (batch, action) for one step.
+        action: Actions of the expert, (batch, steps, action) in -1..1, or (batch, action) for one step. Steps
+            beyond those that are predicted do not count.
         is_pad: Steps beyond the end of the episode, which do not count, (batch, steps) bool; None for none.
         gripper_index: The gripper's dimension of the action; None without a gripper.
         gripper_weight: Weight of the gripper's loss.
@@ -149,8 +150,11 @@ def imitation_loss(
     Returns:
         Loss of each sample, (batch,), and its parts to log, each of shape ().
     """
-    action = action.float() if action.ndim == 3 else action.float()[:, None]
-    valid = torch.ones_like(action[..., 0]) if is_pad is None else 1.0 - is_pad.float()  # (batch, steps)
+    n_predicted = predicted.means.shape[2]
+    action = action.float()[:, :n_predicted] if action.ndim == 3 else action.float()[:, None]
+    valid = torch.ones_like(action[..., 0])  # (batch, steps)
+    if is_pad is not None:
+        valid = 1.0 - is_pad[:, :n_predicted].float()
     n_steps = valid.sum(dim=1)  # at least the current one
     motion, target = split_action(action, gripper_index)
     likelihood = mixture_negative_log_likelihood(

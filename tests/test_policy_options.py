@@ -1,5 +1,7 @@
 """Options of the policies: defaults, errors, optimizer and schedule."""
 
+from types import SimpleNamespace
+
 import draccus
 import pytest
 import torch
@@ -202,3 +204,17 @@ def test_cosine_schedule_warms_up_and_ends_at_zero():
     assert max(rates) == rates[4]
     assert rates[10] == pytest.approx(0.5e-3)
     assert rates[20] == pytest.approx(0)
+
+
+@pytest.mark.parametrize(
+    ("n_frames", "fps", "expected"), [(30, 24, 1), (150, 30, 20), (400, 50, 33), (90, 1, 1), (900, 200, 50)]
+)
+def test_a_chunk_lasts_two_thirds_of_a_second_where_steps_are_small(n_frames, fps, expected):
+    meta = SimpleNamespace(total_frames=7 * n_frames, total_episodes=7, fps=fps)
+    config = DeltacoMatchConfig(device="cpu")
+    config.set_dataset_length(meta)
+    assert config.chunk_size == expected
+    assert config.action_delta_indices == (None if expected == 1 else list(range(expected)))
+    fixed = DeltacoMatchConfig(device="cpu", chunk_size=3)
+    fixed.set_dataset_length(meta)
+    assert fixed.chunk_size == 3

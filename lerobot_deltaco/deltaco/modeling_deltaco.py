@@ -396,7 +396,7 @@ def _make_network(config: DeltacoConfig) -> PolicyNetwork:
         channels=backbone.channels,
         stem_stride=backbone.stem_stride,
         num_components=config.num_mixture_components,
-        chunk_size=config.chunk_size,
+        chunk_size=config.chunk_size or 1,
     )
 
 

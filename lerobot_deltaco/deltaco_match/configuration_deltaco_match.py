@@ -31,6 +31,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             all.
     """
 
+    chunk_size: int | None = None
     crop_size: float = 0.17
     n_demonstrations: int = 1
     num_mixture_components: int = 5

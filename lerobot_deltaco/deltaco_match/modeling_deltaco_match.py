@@ -156,7 +156,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             channels=backbone.channels,
             stem_stride=backbone.stem_stride,
             num_components=config.num_mixture_components,
-            chunk_size=config.chunk_size,
+            chunk_size=config.chunk_size or 1,
             n_locations=N_LOCATIONS,
         )
         self.robot_states = RobotStates(config.state_dim)
