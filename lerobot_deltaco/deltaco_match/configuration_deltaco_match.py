@@ -35,7 +35,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     crop_size: float = 0.17
     n_demonstrations: int = 1
     num_mixture_components: int = 5
-    grasp_height_bias: float = 0.75
+    grasp_height_bias: float = 0.5
     p_hue_augmentation: float = 0.7
     frames_after_release: int | None = 2
     paraphrases: str | None = "grammar"
