@@ -84,15 +84,22 @@ def test_frames_that_are_skipped_are_in_no_window(root):
 
 @pytest.mark.parametrize("fps", [5, 30])
 def test_pauses_are_stretches_in_which_the_robot_stands_still(fps):
-    moving = torch.tensor([1, 1, 0, 0, 0, 0, 0, 0, 0, 1, 1, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 1.0])
-    states = (moving.cumsum(0) - moving)[:, None] * torch.tensor([0.1, 0.0])
-    data = RobotData(states, states, [(0, 12), (13, 21)])
-    n_kept = max(1, fps // 10)
+    # It moves in ten frames, stands still in 20, and so on; the second dimension only trembles.
+    moving = (torch.arange(80) // 10 % 3 == 0).double()
+    states = torch.stack([moving.cumsum(0) - moving, 0.001 * (torch.arange(80) % 2)], dim=1)
+    data = RobotData(states, states, [(0, 49), (50, 79)])
+    reach = n_kept = max(1, round(fps / 10))
     paused = np.flatnonzero(paused_frames(data, fps)).tolist()
-    assert paused == [*range(2 + n_kept, 9), *range(14 + n_kept, 21)]
+    begin = reach + n_kept
+    assert paused == [
+        *range(10 + begin, 31 - reach),
+        *range(40 + begin, 49),
+        *range(50 + n_kept, 61 - reach),
+        *range(70 + begin, 79),
+    ]
     # A gripper that is told to close is no pause.
-    actions = states + torch.arange(22)[:, None].eq(5) * torch.tensor([0.0, 9.0])
-    assert not paused_frames(data._replace(actions=actions), fps)[[4, 5]].any()
+    actions = torch.stack([states[:, 0], (torch.arange(80) > 20).double()], dim=1)
+    assert not paused_frames(data._replace(actions=actions), fps)[[20, 21]].any()
 
 
 @pytest.mark.parametrize("seconds", [[-0.1, 0.0], [0.0], None], ids=["two frames", "one frame", "no window"])

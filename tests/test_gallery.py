@@ -3,12 +3,14 @@
 import sys
 from pathlib import Path
 
+import pytest
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import gallery
 
 
+@pytest.mark.slow
 def test_gallery_draws_every_image(tmp_path):
     gallery.main([str(tmp_path)])
     names = {

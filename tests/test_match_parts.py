@@ -329,9 +329,10 @@ def test_the_demonstration_or_the_instruction_says_where():
     target, nothing = network.target(last, attention), torch.zeros(2, TARGET_DIM)
     assert target.shape == nothing.shape
     instruction = torch.randn(2, 5)
-    maps = [
-        network(scenes, words, to) for words in (instruction, 0 * instruction) for to in (target, nothing)
-    ]
+    with torch.no_grad():
+        maps = [
+            network(scenes, words, to) for words in (instruction, 0 * instruction) for to in (target, nothing)
+        ]
     assert maps[0].shape == (2, 8, 8)
     assert len({float(each.sum()) for each in maps}) == 4
 
