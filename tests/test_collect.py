@@ -246,7 +246,14 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("victim", ["main process", "terminal", "worker"])
+@pytest.mark.parametrize(
+    "victim",
+    [
+        "main process",
+        pytest.param("terminal", marks=pytest.mark.slow),
+        pytest.param("worker", marks=pytest.mark.slow),
+    ],
+)
 def test_killed_collection_continues_with_the_missing_shards(finished, tmp_path, collected, victim):
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(tmp_path)],

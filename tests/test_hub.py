@@ -201,6 +201,7 @@ for fetched, kept in zip(dataset, local, strict=True):
     assert TASKS[4].instruction in result.stdout
 
 
+@pytest.mark.slow
 def test_private_repository_and_branch(copy, tmp_path):
     with FakeHub() as hub:
         result = run_push(hub, tmp_path, copy, "private", "draft")
@@ -212,6 +213,7 @@ def test_private_repository_and_branch(copy, tmp_path):
     assert {CARD_FILE, INFO_FILE} <= set(repo.files("draft"))
 
 
+@pytest.mark.slow
 def test_push_that_the_hub_refuses_is_one_line(copy, tmp_path):
     with FakeHub() as hub:
         hub.refused = "POST /api/datasets/.*/commit/"
