@@ -251,14 +251,15 @@ class PolicyOptions:
             "gripper".
         gripper_closed: Whether low or high values of the gripper's dimension mean closed.
         image_size: Height and width to which images are scaled, px.
-        chunk_size: Number of steps that the policy predicts at once, on which the time depends.
+        chunk_size: Number of steps that the policy predicts at once, on which the time depends; None, as in
+            training, chooses it by the length of the episodes.
     """
 
     demo_camera: str | None = None
     gripper: str = "auto"
     gripper_closed: str = "low"
     image_size: int = 48
-    chunk_size: int = 1
+    chunk_size: int | None = None
 
 
 def _check() -> Callable[..., Any]:
