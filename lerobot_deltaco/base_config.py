@@ -160,6 +160,11 @@ class TaskConditionedConfig(PreTrainedConfig):
                 f"Got {self.n_action_steps}."
             )
         check_pattern("upsampled_tasks", self.upsampled_tasks)
+        if self.demo_repo_id is not None and not self.demo_repo_id.strip():
+            raise ValueError(
+                "`demo_repo_id` is empty. Name a dataset, such as USER/NAME, or leave it out. With "
+                "--policy.demo_root, any name will do."
+            )
         # Images must stay in 0..1, and actions in -1..1: the networks are made for these.
         valid = {"VISUAL": ("IDENTITY",), "ACTION": ("MIN_MAX", "IDENTITY")}
         for kind, names in valid.items():

@@ -289,11 +289,6 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Reads the demonstrations for evaluation that the configuration names."""
         if self.config.demo_repo_id is None or not self.config.uses_demonstrations:
             return None
-        if not self.config.demo_repo_id.strip():
-            raise ValueError(
-                "`demo_repo_id` is empty. Name a dataset, such as USER/NAME, or leave it out. With "
-                "--policy.demo_root, any name will do."
-            )
         dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
         if self._meta is not None:
             compare_robots(self._meta, dataset.meta)
@@ -378,6 +373,8 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         if policy._stats is not None:  # It is trained, maybe on other data than the checkpoint.
             digests = {name: digests[name] for name in ("image_size", "n_demo_frames")}
         bank, saved_with = read_task_bank(path, policy.instructions, digests)
+        if policy._stats is not None and training_argument("resume"):
+            _check_resumed_data(policy, saved_with.get(PROCESSORS))
         policy._processors_digest = saved_with.get(PROCESSORS)
         # Demonstrations named on the command line replace those of the checkpoint.
         if policy.demonstrations is None and bank is not None:
@@ -417,6 +414,22 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
         demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
         return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
+
+
+def _check_resumed_data(policy: TaskConditionedPolicy, saved_with: str | None) -> None:
+    """Checks that a training resumes on the data that it began with.
+
+    LeRobot keeps the checkpoint's processors, which would normalize other data by the old statistics.
+
+    Raises:
+        ValueError: The statistics of the dataset differ.
+    """
+    assert policy._stats is not None
+    if saved_with is not None and saved_with != made_processors_digest(policy.config, policy._stats):
+        raise ValueError(
+            "The dataset is not the one that the training began with: its statistics differ. Resume on the "
+            "same data, or begin a new training from the checkpoint with --policy.path."
+        )
 
 
 def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadata) -> Paraphrases | None:

@@ -425,7 +425,7 @@ def _seconds_of_fit(bank: DemonstrationBank, policy: DeltacoMatchPolicy) -> floa
     compare = _seconds(lambda: sum(part.sum() for part in matching.compare(crops, generator)).backward())
     some = slice(0, 16)
     small = images[some].float() / 255
-    describe = _seconds(lambda: matching.describe(small, native[some], picks[some])) / len(small)
+    describe = _seconds(lambda: matching.describe(small, native[some], picks[some], picks[some])) / len(small)
     n_scenes = min(len(rows), feature_matching._MAX_EPISODES)
     return (
         proposals.FIT_STEPS * propose

@@ -49,6 +49,7 @@ def test_defaults_of_deltaco_are_those_of_the_paper():
         ({"optimizer_lr": float("nan")}, "`optimizer_lr` must be from"),
         ({"optimizer_lr": float("inf")}, "`optimizer_lr` must be from"),
         ({"seed": -1}, "`seed` must be from 0"),
+        ({"demo_repo_id": " "}, "`demo_repo_id` is empty. Name a dataset"),
         ({"upsampled_tasks": "("}, "`upsampled_tasks` must be a regular expression"),
         ({"language_head": [0]}, "`language_head` must be sizes of layers"),
         ({"normalization_mapping": {"VISUAL": NormalizationMode.MEAN_STD}}, "must be IDENTITY for VISUAL"),

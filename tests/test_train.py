@@ -123,6 +123,17 @@ def test_a_resumed_run_equals_an_uninterrupted_one(train, tmp_path, seen, name):
             assert len(set(sum(epoch, []))) == 60
 
 
+def test_a_run_does_not_resume_on_other_data(train, root, tmp_path):
+    saved = train(DELTACO, steps=2) / "000002" / "pretrained_model" / "train_config.json"
+    other = shutil.copytree(root, tmp_path / "other")
+    statistics = json.loads((other / "meta" / "stats.json").read_text())
+    statistics["observation.state"]["mean"][0] += 0.5
+    (other / "meta" / "stats.json").write_text(json.dumps(statistics))
+    with pytest.raises(ValueError, match=r"statistics differ.*--policy\.path"):
+        train({}, config_path=saved, resume=True, steps=4, **{"dataset.root": other})
+    train({}, config_path=saved, resume=True, steps=4)
+
+
 @pytest.mark.parametrize(("policy", "in_memory"), [("deltaco", False), ("deltaco_match", True)])
 def test_a_training_evaluates_itself(train, policy, in_memory, capfd):
     options = {**POLICIES[policy], "env.type": "deltaco", "env.task": "4", "env.scene.episode_length": 2}

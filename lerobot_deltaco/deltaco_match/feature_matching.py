@@ -175,20 +175,26 @@ class FeatureMatching(nn.Module):
         ]
 
     @torch.no_grad()
-    def describe(self, images: Tensor, native: Tensor, locations: Tensor) -> Tensor:
+    def describe(self, images: Tensor, native: Tensor, grasps: Tensor, attended: Tensor) -> Tensor:
         """Returns descriptors of what was grasped in demonstrations, (batch, descriptor).
+
+        An object that was pushed before it was grasped, as by an attempt that failed, is no longer where it
+        was in the first image: no proposal is near the grasp. The attention then tells where it was.
 
         Args:
             images: First images, (batch, 3, H, W) in 0..1, as small as the policy's.
             native: The same at the camera's own resolution, (batch, 3, H', W').
-            locations: Locations of the grasps, (batch, 2) in -1..1.
+            grasps: Locations of the grasps, (batch, 2) in -1..1; NaN where they are not known.
+            attended: Locations of what moved, by the attention, (batch, 2) in -1..1.
         """
         with torch.autocast(images.device.type, enabled=False):
-            # A gripper is not always above the middle of an object, but a proposal is.
             proposed = self.propose(images)
-            nearest, is_near = _nearest(proposed, locations)
+            by_grasp, is_near = _nearest(proposed, grasps)
+            by_attention, is_attended = _nearest(proposed, attended)
+            nearest = torch.where(is_near, by_grasp, by_attention)
+            # A gripper is not always above the middle of an object, but a proposal is.
             near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
-            locations = torch.where(is_near[:, None], near, locations)
+            locations = torch.where((is_near | is_attended)[:, None], near, attended)
             return self.compare(self._features(native, locations[:, None])).descriptors[:, 0]
 
     def _features(self, native: Tensor, locations: Tensor) -> Tensor:

@@ -386,11 +386,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             n_each = stacked.ends.shape[1]
             ends, states = stacked.ends.flatten(0, 1), stacked.pick_states.flatten(0, 1)
             every = self.attention(ends)
-            # Where the robot's state at a grasp is not known, the attention tells where it was.
             attended = peak_locations(every.clamp_min(_MIN_ATTENTION).log())[:, 0]
-            by_state = self.robot_states.pick_locations(states)
-            picks = torch.where(by_state.isnan(), attended, by_state)
-            described = self.feature_matching.describe(ends[:, 0], stacked.first_images.flatten(0, 1), picks)
+            picks, native = self.robot_states.pick_locations(states), stacked.first_images.flatten(0, 1)
+            described = self.feature_matching.describe(ends[:, 0], native, picks, attended)
             described = described.unflatten(0, (-1, n_each)).mean(dim=1)
             heights = self.robot_states.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
             attention, last = every[::n_each], ends[::n_each, 1]

@@ -22,9 +22,14 @@ _N_NEIGHBORS = 2  # words on either side that tell what a word is about
 _MIN_SIMILARITY, _MIN_LENGTH = 0.8, 4
 
 
+# Chinese, Japanese and Korean have no spaces between words: each character is one.
+_CHARACTER = "[\u3040-\u30ff\u3400-\u9fff\uac00-\ud7af]"
+_WORD = re.compile(rf"{_CHARACTER}|(?:(?!{_CHARACTER})[^\W\d_])+|\d+")
+
+
 def words_of(sentence: str) -> list[str]:
-    """Returns the words of a sentence in their order, in lower case, without digits and punctuation."""
-    return re.findall(r"[^\W\d_]+", sentence.lower())
+    """Returns the words and numbers of a sentence in their order, in lower case, without punctuation."""
+    return _WORD.findall(sentence.lower())
 
 
 def vocabulary_of(sentences: Iterable[str]) -> list[str]:
