@@ -379,7 +379,7 @@ def matching(shapes):
 def fraction_found(matching, shapes, by_demonstration=False, words=lambda task: "", grasp=None):
     """Fraction of the other 12 episodes in which the object is found, by other episodes or by words.
 
-    With `grasp`, the gripper closes there in the demonstrations, and only the attention tells where the object was.
+    With `grasp`, the gripper closes there, and only the attention tells where the object was.
     """
     images, locations, tasks = (part[24:] for part in shapes)
     scenes = images.float() / 255
