@@ -51,13 +51,13 @@ def test_a_folder_is_searched(tmp_path):
 
 
 CONTRADICTIONS = {
-    "a demonstrated task of the plan, or -1": {"demonstration_task": 777},
-    "tasks and trials of the plan": {"trial": 0},
+    "demonstrated tasks of the plan, or -1": {"demonstration_task": 777},
+    "each task and trial of the plan once": {"trial": 0},
     "containers -1, 0 or 1 of three objects": {"object_containers": [[2, -1, -1]] * 12},
-    "a grasped object from -1 to 2": {"grasped_object": 3},
+    "grasped objects from -1 to 2": {"grasped_object": 3},
     "a grasped object where it is the right one": {"grasped_object": -1},
-    "an object in a container where": {"object_containers": [[-1, -1, -1]] * 12},
-    "a success if the right object alone": {"right_container": False},
+    "objects in one container where": {"object_containers": [[-1, -1, -1]] * 12},
+    "successes where the right object alone": {"right_container": False},
 }
 
 
@@ -146,7 +146,7 @@ def test_the_page_documents_the_schema(monkeypatch, capsys):
     page = (ROOT / "docs" / "records.md").read_text(encoding="utf-8")
     columns = [line for line in records.__doc__.splitlines() if line.startswith("    ")]
     assert "\n".join(columns) in page
-    assert [line.split()[0] for line in columns if line[4] != " "] == records._schema().names
+    assert [line.split()[0] for line in columns if line[4] != " "] == records.SCHEMA.names
     example = page.split("```python\n")[1].split("```")[0]
     output = page.split("```text\n")[1].split("```")[0]
     monkeypatch.chdir(ROOT)
