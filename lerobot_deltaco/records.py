@@ -1,23 +1,8 @@
 """Records of evaluations in Parquet: the plan, and the outcome of every episode.
 
-One file holds any number of evaluations. A row is an episode:
-
-    evaluation              int32    index of the evaluation in the file
-    task_id                 int32    the scene's task
-    trial                   int32    number of the episode among those of its task, from 0
-    success                 bool     whether the scene's task succeeded, at any step
-    instruction             string   instruction that the policy received; null for the task's template, and
-                                     empty for none
-    demonstration_task      int32    task whose demonstrations the policy received; -1 for none
-    demonstration_episodes  list     episodes of the demonstrations in their dataset
-    demonstrated_objects    list     indices of the objects that they move
-    grasped_object          int8     number of the object that the gripper held last, 0..2; -1 for none
-    object_containers       list     container of each of the three objects at the end: 0 green, 1 red, or -1
-    right_object            bool     whether the grasped object is the target
-    right_container         bool     whether an object lies in the target container, and none in the other one
-
-The schema's metadata contain the fields that describe the whole evaluation, as JSON under the key `deltaco`:
-those of `EvaluationRecord`. Values that follow from the plan are not stored: `scene_columns` computes them.
+One file holds any number of evaluations. A row is an episode; docs/records.md describes the columns. Values
+that follow from the plan are not stored: `scene_columns` computes them. The schema's metadata contain the
+fields that describe the whole evaluation, as JSON under the key `deltaco`: those of `EvaluationRecord`.
 """
 
 from __future__ import annotations
@@ -172,7 +157,7 @@ class EvaluationRecord:
         weights: SHA-256 of the checkpoint's weights; None if it was not recorded.
         demonstrations: Name of the dataset of demonstrations; None for those of the checkpoint.
         demonstrations_digest: SHA-256 of that dataset's metadata.
-        episodes: A row for each episode, with the columns of the module's table but `evaluation`.
+        episodes: A row for each episode, with the columns of `SCHEMA` but `evaluation`.
     """
 
     experiment: str

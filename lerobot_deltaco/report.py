@@ -19,6 +19,7 @@ from lerobot_deltaco.statistics import Estimate, followed, paired_difference, pa
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+RowsOf = Callable[[Result, Sequence[Result]], Iterator[dict[str, Any]]]
 PAGE, FIGURE = "report.md", "success.png"
 KINDS = ("name", "color", "shape", "color_shape", "foreign")
 # Options of a policy that may differ between the training runs of an experiment.
@@ -40,7 +41,7 @@ def write_report(paths: Sequence[Path], out: Path) -> Path:
         ReportError: The records cannot be reported on together.
     """
     results = collect_results(read_records(*paths))
-    tables = {name: make(results) for name, (make, _) in TABLES.items()}
+    tables = {name: make_table(results, rows_of) for name, (rows_of, _) in TABLES.items()}
     out.mkdir(parents=True, exist_ok=True)
     for name, table in tables.items():
         if table.empty:
@@ -62,7 +63,7 @@ def _page(results: Sequence[Result], tables: dict[str, pd.DataFrame]) -> Iterato
     yield f"![Success with intervals, beside the paper's]({FIGURE})\n"
     for name, (_, text) in TABLES.items():
         if not tables[name].empty:
-            yield f"## {name.replace('_', ' ').capitalize()}\n\n{text} [CSV]({name}.csv)\n"
+            yield f"## {name.capitalize()}\n\n{text} [CSV]({name}.csv)\n"
             yield markdown_table(tables[name].map(escape))
     if warnings := list(_warnings(results)):
         yield "## Warnings\n\n" + "".join(f"- {warning}\n" for warning in warnings)
@@ -78,126 +79,97 @@ def _warnings(results: Sequence[Result]) -> Iterator[str]:
             yield f"The trainings of {escape(result.name)} differ in `{'`, `'.join(sorted(differing))}`."
 
 
-# Tables: a row for each result, rates as fractions
+# Tables
 
 
-def success_table(results: Sequence[Result]) -> pd.DataFrame:
-    """Tabulates the success at the last step, next to the paper's."""
-    rows = []
-    for result in results:
-        best_sets, best_sets_sd = paper_rate(result.rates) if len(result.rates) > 1 else (np.nan, np.nan)
-        seeds, rates = result.rates.columns, result.rates.iloc[-1]
-        rows.append(
-            {
-                "experiment": result.experiment,
-                "variant": result.variant,
-                "training_seeds": " ".join(map(str, seeds)),
-                "step": result.rates.index[-1],
-                "scenes": result.scenes,
-                "episodes": len(result.episodes),
-                "success": result.success,
-                "each_seed": ", ".join(f"{100 * rate:.1f}" for rate in rates) if len(seeds) > 1 else None,
-                "best_sets": best_sets,
-                "best_sets_sd": best_sets_sd,
-                "paper": result.paper.rate,
-                "paper_sd": result.paper.sd,
-            }
-        )
+def make_table(results: Sequence[Result], rows_of: RowsOf) -> pd.DataFrame:
+    """Returns the rows that a function makes of each result; rates are fractions."""
+    rows = [
+        {"experiment": result.experiment, "variant": result.variant, **row}
+        for result in results
+        for row in rows_of(result, results)
+    ]
     return pd.DataFrame(rows).dropna(axis=1, how="all")
 
 
-def outcomes_table(results: Sequence[Result]) -> pd.DataFrame:
-    """Tabulates the success by kind of task, and which of the steps to success episodes reach."""
-    rows = []
-    for result in results:
-        episodes = result.episodes
-        kinds = episodes["task_id"].map(lambda task_id: get_task(task_id).kind)
-        has_grasped = episodes["grasped_object"] >= 0
-        has_placed = episodes["object_containers"].map(max) >= 0
-        rows.append(
-            {
-                "experiment": result.experiment,
-                "variant": result.variant,
-                **episodes["success"].groupby(kinds).mean().reindex(KINDS),
-                "grasped_anything": has_grasped.mean(),
-                "right_object_of_grasped": episodes["right_object"][has_grasped].mean(),
-                "right_container_of_placed": episodes["right_container"][has_placed].mean(),
-            }
-        )
-    return pd.DataFrame(rows).dropna(axis=1, how="all")
+def success_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
+    """Yields the success at the last step, next to the paper's."""
+    best_sets, best_sets_sd = paper_rate(result.rates) if len(result.rates) > 1 else (np.nan, np.nan)
+    seeds, rates = result.rates.columns, result.rates.iloc[-1]
+    yield {
+        "training_seeds": " ".join(map(str, seeds)),
+        "step": result.rates.index[-1],
+        "scenes": result.scenes,
+        "episodes": len(result.episodes),
+        "success": result.success,
+        "each_seed": ", ".join(f"{100 * rate:.1f}" for rate in rates) if len(seeds) > 1 else None,
+        "best_sets": best_sets,
+        "best_sets_sd": best_sets_sd,
+        "paper": result.paper.rate,
+        "paper_sd": result.paper.sd,
+    }
 
 
-def differences_table(results: Sequence[Result]) -> pd.DataFrame:
-    """Tabulates differences of success, paired by task.
+def outcome_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
+    """Yields the success by kind of task, and which of the steps to success episodes reach."""
+    episodes = result.episodes
+    kinds = episodes["task_id"].map(lambda task_id: get_task(task_id).kind)
+    has_grasped = episodes["grasped_object"] >= 0
+    has_placed = episodes["object_containers"].map(max) >= 0
+    yield {
+        **episodes["success"].groupby(kinds).mean().reindex(KINDS),
+        "grasped_anything": has_grasped.mean(),
+        "right_object_of_grasped": episodes["right_object"][has_grasped].mean(),
+        "right_container_of_placed": episodes["right_container"][has_placed].mean(),
+    }
 
-    A result with other settings is compared with that of the same training runs in the main settings, or in
-    those nearest to them; all others with the first experiment of their group in the same settings.
+
+def difference_rows(result: Result, results: Sequence[Result]) -> Iterator[dict[str, Any]]:
+    """Yields the difference of success to another result, paired by task.
+
+    A variant is compared with the same training runs in the main settings, or in those nearest to them; all
+    others with the first experiment of their group in the same settings.
     """
-    rows = []
-    for result in results:
-        reference = _reference(result, results)
-        if reference is None:
-            continue
-        last = reference.last
-        if reference.experiment == result.experiment:
-            last = last[last.index.intersection(result.last.index)]
-        difference = paired_difference(result.episodes, pd.concat([record.episodes for record in last]))
-        if difference is not None:
-            names = {"experiment": result.experiment, "variant": result.variant}
-            rows.append({**names, "compared_with": reference.name, "difference": difference})
-    return pd.DataFrame(rows)
-
-
-def _reference(result: Result, results: Sequence[Result]) -> Result | None:
+    group = [item for item in results if item.group == result.group]
     same_training = [
         item
-        for item in results
+        for item in group
         if item.experiment == result.experiment
         and item.departures.items() < result.departures.items()
         and item.settings["tasks"] == result.settings["tasks"]
-        and not item.last.index.intersection(result.last.index).empty
+        and set(item.last.index) & set(result.last.index)
     ]
     if same_training:
-        return max(same_training, key=lambda item: len(item.departures))
-    first = next(item for item in results if (item.group, item.settings) == (result.group, result.settings))
-    return None if first is result else first
+        reference = max(same_training, key=lambda item: len(item.departures))
+        records = reference.last[reference.last.index.intersection(result.last.index)]
+    else:
+        reference = next(item for item in group if item.settings == result.settings)
+        records = reference.last
+    if reference is not result:
+        difference = paired_difference(result.episodes, pd.concat([record.episodes for record in records]))
+        yield {"compared_with": reference.name, "difference": difference}
 
 
-def counterfactuals_table(results: Sequence[Result]) -> pd.DataFrame:
-    """Tabulates which input the policy follows where demonstration and instruction disagree."""
-    counts = {
-        (result.experiment, result.variant): followed(result.last)
-        for result in results
-        if result.settings["counterfactual"] != "none"
-    }
-    if not counts:
-        return pd.DataFrame()
-    table = pd.concat(counts, names=["experiment", "variant"]).reset_index(level=[0, 1])
-    sources = ["demonstration", "instruction", "neither"]
-    table[sources] = table[sources].div(table["episodes"], axis=0)
-    return table
+def counterfactual_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
+    """Yields which input the policy follows where demonstration and instruction disagree."""
+    if result.settings["counterfactual"] != "none":
+        table = followed(result.last)
+        sources = ["demonstration", "instruction", "neither"]
+        table[sources] = table[sources].div(table["episodes"], axis=0)
+        yield from table.to_dict("records")
 
 
-def evaluations_table(results: Sequence[Result]) -> pd.DataFrame:
-    """Tabulates the success of every evaluation, by training seed and step."""
-    return pd.DataFrame(
-        {
-            "experiment": result.experiment,
-            "variant": result.variant,
-            "training_seed": seed,
-            "step": step,
-            "episodes": len(record.episodes),
-            "success": success_interval(record.episodes),
-        }
-        for result in results
-        for (seed, step), record in result.records.unstack().items()
-    )
+def evaluation_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
+    """Yields the success of every evaluation, by training seed and step."""
+    for (seed, step), record in result.records.unstack().items():
+        success = success_interval(record.episodes)
+        yield {"training_seed": seed, "step": step, "episodes": len(record.episodes), "success": success}
 
 
-# Function and explanation of each table, by the name of its CSV file
-TABLES: dict[str, tuple[Callable[[Sequence[Result]], pd.DataFrame], str]] = {
+# Rows and explanation of each table, by the name of its CSV file
+TABLES: dict[str, tuple[RowsOf, str]] = {
     "success": (
-        success_table,
+        success_rows,
         "Success at the last step that was evaluated for all training seeds. The interval is by bootstrap "
         "over tasks, or Wilson's where fewer than 5 episodes succeed. It covers the choice of tasks; other "
         "training seeds may differ by more. A policy that picks at random succeeds in "
@@ -207,23 +179,23 @@ TABLES: dict[str, tuple[Callable[[Sequence[Result]], pd.DataFrame], str]] = {
         "other objects: compare the order, not the values.",
     ),
     "outcomes": (
-        outcomes_table,
+        outcome_rows,
         "Success by how the task describes its object; then the fraction of the episodes in which something "
         "was grasped, of these in which it was the right object, and of the episodes in which something was "
         "placed, in the right container alone.",
     ),
     "differences": (
-        differences_table,
+        difference_rows,
         "Differences of success in points, paired by task. A variant is compared with the same training runs "
         "in the settings above, another experiment with the first one in the same settings.",
     ),
     "counterfactuals": (
-        counterfactuals_table,
+        counterfactual_rows,
         "The demonstration or the instruction is another task's. Counted are the episodes in which both ask "
         "for different objects or containers: whether the object held last, and the only container in which "
         "something lies, are the demonstration's, the instruction's or neither's.",
     ),
-    "evaluations": (evaluations_table, "Every evaluation."),
+    "evaluations": (evaluation_rows, "Every evaluation."),
 }
 
 
@@ -248,20 +220,14 @@ def _cell(value: Any) -> str:
 
 
 def csv_table(table: pd.DataFrame) -> str:
-    """Returns a table as CSV, an estimate with its interval in three columns."""
-    columns = {}
+    """Returns a table as CSV, estimates in three columns, and no text that a spreadsheet would compute."""
+    columns: dict[str, pd.Series] = {}
     for name, values in table.items():
         if isinstance(values.iloc[0], Estimate):
             columns |= {name: values.str[0], f"{name}_low": values.str[1], f"{name}_high": values.str[2]}
         else:
-            columns[name] = values.map(_without_formula)
+            columns[name] = values.replace(r"^(?=[=+\-@\t\r])", "'", regex=True)
     return pd.DataFrame(columns).round(6).to_csv(index=False, lineterminator="\n")
-
-
-def _without_formula(value: Any) -> Any:
-    """Returns a value, a text that a spreadsheet would compute with an apostrophe before it."""
-    starts = ("=", "+", "-", "@", "\t", "\r")
-    return f"'{value}" if isinstance(value, str) and value.startswith(starts) else value
 
 
 def escape(value: Any) -> Any:
