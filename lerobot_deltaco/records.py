@@ -256,10 +256,7 @@ def _check(record: EvaluationRecord, path: Path) -> None:
     is_grasped = rows["grasped_object"].to_numpy()[:, None] == containers.columns.to_numpy()
     # After a success, the object may have been taken out again.
     is_decided = rows["right_object"] & fills_one & (is_placed & is_grasped).any(axis=1)
-    conditions: dict[str, Any] = {
-        "a step of at least 0": record.step >= 0,
-        "a duration of at least 0 s": record.seconds >= 0,
-        "a version of the benchmark": "benchmark" in record.versions,
+    conditions = {
         f"{len(task_ids) * trials} episodes": len(rows) == len(task_ids) * trials,
         "each task and trial of the plan once": (
             rows["task_id"].isin(task_ids)
