@@ -59,7 +59,8 @@ def _page(results: Sequence[Result], tables: dict[str, pd.DataFrame]) -> Iterato
     for group in dict.fromkeys(result.group for result in results):
         members = [result for result in results if result.group == group]
         settings = min(members, key=lambda result: len(result.departures)).settings
-        yield f"**{escape(group)}**, unless a row says otherwise: {escape(settings_text(settings))}.\n"
+        name = f"**{escape(group)}**: " if group else ""
+        yield f"{name}{escape(settings_text(settings))}. Variants differ in what they name.\n"
     yield f"![Success with intervals, beside the paper's]({FIGURE})\n"
     for name, (_, text) in TABLES.items():
         if not tables[name].empty:
@@ -160,10 +161,16 @@ def counterfactual_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[st
 
 
 def evaluation_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
-    """Yields the success of every evaluation, by training seed and step."""
+    """Yields the success of every evaluation, by training seed and step, if there are several."""
     for (seed, step), record in result.records.unstack().items():
-        success = success_interval(record.episodes)
-        yield {"training_seed": seed, "step": step, "episodes": len(record.episodes), "success": success}
+        if result.records.size > 1:
+            success = success_interval(record.episodes)
+            yield {
+                "training_seed": str(seed),
+                "step": step,
+                "episodes": len(record.episodes),
+                "success": success,
+            }
 
 
 # Rows and explanation of each table, by the name of its CSV file
@@ -195,7 +202,7 @@ TABLES: dict[str, tuple[RowsOf, str]] = {
         "for different objects or containers: whether the object held last, and the only container in which "
         "something lies, are the demonstration's, the instruction's or neither's.",
     ),
-    "evaluations": (evaluation_rows, "Every evaluation."),
+    "evaluations": (evaluation_rows, "Every evaluation, where there are several of training seeds or steps."),
 }
 
 

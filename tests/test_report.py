@@ -171,6 +171,7 @@ def test_other_settings_are_results_of_their_own():
     assert [list(result.last.index) for result in results] == [[0, 1]] * 7 + [[0]]
     assert len(make_table(results, counterfactual_rows)) == 2
     assert len(make_table(results, evaluation_rows)) == 7 * 2 + 2
+    assert make_table(collect_results(records[:1]), evaluation_rows).empty
 
 
 def test_only_steps_of_all_seeds_count():
@@ -284,7 +285,7 @@ def test_a_report_has_the_tables_of_its_records(tmp_path):
     # A later report leaves no tables of the earlier one.
     write_records(tmp_path / "records.parquet", records[:1])
     write_report([tmp_path / "records.parquet"], tmp_path / "out")
-    assert links(page) == {"success.png", "success.csv", "outcomes.csv", "evaluations.csv"}
+    assert links(page) == {"success.png", "success.csv", "outcomes.csv"}
     assert links(page) == {path.name for path in page.parent.iterdir()} - {"report.md"}
 
 
