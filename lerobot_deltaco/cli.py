@@ -21,7 +21,7 @@ COMMANDS = {
     "check": "Show what a policy would take from a dataset, before it is trained.",
     "train": "Train a policy: `lerobot-train` over frames in memory.",
     "evaluate": "Evaluate a policy on the benchmark, and record every episode.",
-    "report": "Write tables and figures from the records of evaluations.",
+    "report": "Write tables and a figure from the records of evaluations.",
     "experiment": "Run experiments: collect, train, evaluate and report.",
     "look": "Draw what a policy sees: what was moved, where it would pick and place.",
     "play": "Play with a policy in the browser.",
@@ -190,7 +190,7 @@ def _report() -> Callable[..., Any]:
     import tyro
 
     def report(paths: tyro.conf.Positional[tuple[Path, ...]], out: Path = Path("outputs/report")) -> str:
-        """Writes tables and figures from records.
+        """Writes tables and a figure from records.
 
         Args:
             paths: Files of records, or folders that contain some, such as those of training runs.

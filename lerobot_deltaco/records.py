@@ -1,23 +1,8 @@
 """Records of evaluations in Parquet: the plan, and the outcome of every episode.
 
-One file holds any number of evaluations. A row is an episode:
-
-    evaluation              int32    index of the evaluation in the file
-    task_id                 int32    the scene's task
-    trial                   int32    number of the episode among those of its task, from 0
-    success                 bool     whether the scene's task succeeded, at any step
-    instruction             string   instruction that the policy received; null for the task's template, and
-                                     empty for none
-    demonstration_task      int32    task whose demonstrations the policy received; -1 for none
-    demonstration_episodes  list     episodes of the demonstrations in their dataset
-    demonstrated_objects    list     indices of the objects that they move
-    grasped_object          int8     number of the object that the gripper held last, 0..2; -1 for none
-    object_containers       list     container of each of the three objects at the end: 0 green, 1 red, or -1
-    right_object            bool     whether the grasped object is the target
-    right_container         bool     whether an object lies in the target container, and none in the other one
-
-The schema's metadata contain the fields that describe the whole evaluation, as JSON under the key `deltaco`:
-those of `EvaluationRecord`. Values that follow from the plan are not stored: `scene_columns` computes them.
+One file holds any number of evaluations. A row is an episode; docs/records.md describes the columns. Values
+that follow from the plan are not stored: `scene_columns` computes them. The schema's metadata contain the
+fields that describe the whole evaluation, as JSON under the key `deltaco`: those of `EvaluationRecord`.
 """
 
 from __future__ import annotations
@@ -28,19 +13,38 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from gymnasium.utils import seeding
 
 from gym_deltaco.atomic_files import atomic_write
+from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.paraphrases import GRAMMAR
 
-if TYPE_CHECKING:
-    import pandas as pd
-
+SCHEMA = pa.schema(
+    {
+        "evaluation": pa.int32(),
+        "task_id": pa.int32(),
+        "trial": pa.int32(),
+        "success": pa.bool_(),
+        "instruction": pa.string(),
+        "demonstration_task": pa.int32(),
+        "demonstration_episodes": pa.list_(pa.int32()),
+        "demonstrated_objects": pa.list_(pa.int32()),
+        "grasped_object": pa.int8(),
+        "object_containers": pa.list_(pa.int8()),
+        "right_object": pa.bool_(),
+        "right_container": pa.bool_(),
+    }
+)
 TEMPLATES = "templates"
-MAX_TRIALS = 1_000_000
 _KEY = b"deltaco"
 _MAX_JOINT_NOISE = 180.0  # degrees
 _N_OBJECTS = 3
@@ -94,19 +98,17 @@ class EvaluationPlan:
     def __post_init__(self) -> None:
         object.__setattr__(self, "scene", self.scene.for_tasks(self.tasks))
         self.scene.check_tasks(self.task_ids)
-        least = {"trials": 1, "seed": 0, "scene_set": 0, "n_demonstrations": 1}
-        for name, smallest in least.items():
+        for name, least in {"trials": 1, "seed": 0, "scene_set": 0, "n_demonstrations": 1}.items():
             number = getattr(self, name)
-            if number is not None and not smallest <= number < 2**63:
-                raise ValueError(f"`{name}` must be at least {smallest}. Got {number}.")
+            if number is not None and number < least:
+                raise ValueError(f"`{name}` must be at least {least}. Got {number}.")
         if not 0 <= self.joint_noise <= _MAX_JOINT_NOISE:
             raise ValueError(f"`joint_noise` must be from 0 to {_MAX_JOINT_NOISE}. Got {self.joint_noise}.")
+        valid = get_args(Counterfactual)
         for name in ("counterfactual", "without"):
-            if getattr(self, name) not in get_args(Counterfactual):
-                valid = ", ".join(get_args(Counterfactual))
-                raise ValueError(f"`{name}` must be one of {valid}. Got {getattr(self, name)!r}.")
-        changed = [self.counterfactual, self.without]
-        if self.wording != TEMPLATES and "instruction" in changed:
+            if getattr(self, name) not in valid:
+                raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
+        if self.wording != TEMPLATES and "instruction" in (self.counterfactual, self.without):
             raise ValueError(
                 "An instruction that is replaced or left out is not a paraphrase: leave out `paraphrases` "
                 "and `instruction`."
@@ -155,7 +157,7 @@ class EvaluationRecord:
         weights: SHA-256 of the checkpoint's weights; None if it was not recorded.
         demonstrations: Name of the dataset of demonstrations; None for those of the checkpoint.
         demonstrations_digest: SHA-256 of that dataset's metadata.
-        episodes: A row for each episode, with the columns of the module's table but `evaluation`.
+        episodes: A row for each episode, with the columns of `SCHEMA` but `evaluation`.
     """
 
     experiment: str
@@ -185,23 +187,14 @@ def write_records(path: Path, records: Sequence[EvaluationRecord]) -> None:
     Raises:
         RecordError: The rows of an evaluation contradict each other.
     """
-    import pandas as pd
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     for record in records:
-        _check(record, str(path))
+        _check(record, path)
+    names = [item.name for item in fields(EvaluationRecord) if item.name != "episodes"]
     headers = [
-        {
-            item.name: asdict(record.plan) if item.name == "plan" else getattr(record, item.name)
-            for item in fields(EvaluationRecord)
-            if item.name != "episodes"
-        }
-        for record in records
+        {name: getattr(record, name) for name in names} | {"plan": asdict(record.plan)} for record in records
     ]
     rows = pd.concat([record.episodes.assign(evaluation=n) for n, record in enumerate(records)])
-    schema = _schema()
-    table = pa.Table.from_pandas(rows, schema, preserve_index=False)
+    table = pa.Table.from_pandas(rows, SCHEMA, preserve_index=False)
     table = table.replace_schema_metadata({_KEY: json.dumps(headers).encode()})
     with atomic_write(path) as temporary:
         pq.write_table(table, temporary, compression="zstd", compression_level=9)
@@ -219,13 +212,13 @@ def read_records(*paths: Path) -> list[EvaluationRecord]:
     records = []
     for path in paths:
         files = sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
-        # Datasets are Parquet, too; only what is below the given folder tells.
-        files = [
-            file
+        # Datasets are Parquet, too, in folders with these names.
+        found = [
+            record
             for file in files
-            if path.is_file() or not {"data", "meta"} & set(file.relative_to(path).parts)
+            if not {"data", "meta"} & set(file.relative_to(path).parts)
+            for record in _read(file)
         ]
-        found = [record for file in files for record in _read(file)]
         if not found:
             raise RecordError(f"{path} has no records of evaluations. `deltaco evaluate` writes them.")
         records += found
@@ -233,101 +226,57 @@ def read_records(*paths: Path) -> list[EvaluationRecord]:
 
 
 def _read(path: Path) -> list[EvaluationRecord]:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     try:
         table = pq.read_table(path)
         headers = json.loads((table.schema.metadata or {})[_KEY])
-        rows = table.select(_schema().names).to_pandas()
+        rows = table.select(SCHEMA.names).to_pandas()
         records = []
         for n, header in enumerate(headers):
-            plan = dict(header.pop("plan"))
+            plan = header.pop("plan")
             plan["scene"] = SceneConfig(**plan["scene"])
             episodes = rows[rows["evaluation"] == n].drop(columns="evaluation").reset_index(drop=True)
             records.append(EvaluationRecord(plan=EvaluationPlan(**plan), episodes=episodes, **header))
     except (OSError, KeyError, TypeError, ValueError, RecursionError, pa.ArrowException) as error:
         raise RecordError(f"{path} is not a file of evaluation records: {error}") from error
     for record in records:
-        _check(record, str(path))
+        _check(record, path)
     return records
 
 
-def _schema() -> Any:
-    import pyarrow as pa
-
-    return pa.schema(
-        [
-            ("evaluation", pa.int32()),
-            ("task_id", pa.int32()),
-            ("trial", pa.int32()),
-            ("success", pa.bool_()),
-            ("instruction", pa.string()),
-            ("demonstration_task", pa.int32()),
-            ("demonstration_episodes", pa.list_(pa.int32())),
-            ("demonstrated_objects", pa.list_(pa.int32())),
-            ("grasped_object", pa.int8()),
-            ("object_containers", pa.list_(pa.int8())),
-            ("right_object", pa.bool_()),
-            ("right_container", pa.bool_()),
-        ]
-    )
-
-
-def _check(record: EvaluationRecord, source: str) -> None:
-    """Checks that the rows of an evaluation do not contradict each other or its plan.
+def _check(record: EvaluationRecord, path: Path) -> None:
+    """Checks that the rows of an evaluation contradict neither each other nor its plan.
 
     Raises:
         RecordError: They contradict each other.
     """
-    import pandas as pd
-
-    rows = record.episodes
-    containers = rows["object_containers"].map(list)
-
-    def is_plausible(row: Any) -> bool:
-        # After a success, the object may have been taken out again.
-        filled, held = set(row.object_containers) - {-1}, row.object_containers[row.grasped_object :][:1]
-        return not row.right_object or len(filled) != 1 or -1 in held or row.success == row.right_container
-
-    is_valid = {
-        "tasks and trials of the plan, each once": (
-            rows["task_id"].isin(record.plan.task_ids)
-            & rows["trial"].between(0, record.plan.trials - 1)
+    rows, task_ids, trials = record.episodes, record.plan.task_ids, record.plan.trials
+    containers = pd.DataFrame(rows["object_containers"].tolist(), index=rows.index)
+    is_placed = containers >= 0
+    fills_one = containers[is_placed].min(axis=1) == containers.max(axis=1)
+    is_grasped = rows["grasped_object"].to_numpy()[:, None] == containers.columns.to_numpy()
+    # After a success, the object may have been taken out again.
+    is_decided = rows["right_object"] & fills_one & (is_placed & is_grasped).any(axis=1)
+    conditions = {
+        f"{len(task_ids) * trials} episodes": len(rows) == len(task_ids) * trials,
+        "each task and trial of the plan once": (
+            rows["task_id"].isin(task_ids)
+            & rows["trial"].between(0, trials - 1)
             & ~rows.duplicated(["task_id", "trial"])
         ),
-        "a demonstrated task of the plan, or -1": rows["demonstration_task"].isin(
-            {-1, *record.plan.task_ids}
+        "demonstrated tasks of the plan, or -1": rows["demonstration_task"].isin([-1, *task_ids]),
+        "containers -1, 0 or 1 of three objects": (
+            containers.isin([-1, 0, 1]).all(axis=1) & (len(containers.columns) == _N_OBJECTS)
         ),
-        "containers -1, 0 or 1 of three objects": containers.map(
-            lambda found: len(found) == _N_OBJECTS and set(found) <= {-1, 0, 1}
-        ),
-        "a grasped object from -1 to 2": rows["grasped_object"].between(-1, _N_OBJECTS - 1),
+        "grasped objects from -1 to 2": rows["grasped_object"].between(-1, _N_OBJECTS - 1),
         "a grasped object where it is the right one": ~rows["right_object"] | (rows["grasped_object"] >= 0),
-        "an object in a container where that is the right one": (
-            ~rows["right_container"] | containers.map(lambda found: len(set(found) - {-1}) == 1)
-        ),
-        "a success if the right object alone lies in the right container, and none in the other": pd.Series(
-            map(is_plausible, rows.itertuples()), rows.index
+        "objects in one container where it is the right one": ~rows["right_container"] | fills_one,
+        "successes where the right object alone lies in the right container": (
+            ~is_decided | (rows["success"] == rows["right_container"])
         ),
     }
-    n_episodes = len(record.plan.task_ids) * record.plan.trials
-    required = {
-        f"{n_episodes} episodes": len(rows) == n_episodes,
-        "a step of at least 0": record.step >= 0,
-        "a duration of at least 0 s": record.seconds >= 0,
-        "a version of the benchmark": "benchmark" in record.versions,
-    }
-    for name, holds in required.items():
-        if not holds:
-            raise RecordError(f"{source} contradicts itself: {record.experiment!r} must have {name}.")
-    for name, valid in is_valid.items():
-        if not valid.all():
-            row = rows[~valid.astype(bool)].iloc[0]
-            raise RecordError(
-                f"{source} contradicts itself: every episode of {record.experiment!r} must have {name}. Task "
-                f"{row['task_id']}, trial {row['trial']} does not."
-            )
+    for name, holds in conditions.items():
+        if not np.all(holds):
+            raise RecordError(f"{path} contradicts itself: {record.experiment!r} must have {name}.")
 
 
 def scene_columns(record: EvaluationRecord) -> pd.DataFrame:
@@ -338,21 +287,14 @@ def scene_columns(record: EvaluationRecord) -> pd.DataFrame:
         objects; `container_quadrants`, (i, j) of the green and the red container; `target_object` and
         `target_container`, their numbers in the scene.
     """
-    import pandas as pd
-
-    rows = [
-        _scene(int(task_id), record.plan.scene_seed(int(task_id), int(trial)), record.plan.scene)
-        for task_id, trial in zip(record.episodes["task_id"], record.episodes["trial"], strict=True)
-    ]
+    tasks_and_trials = record.episodes[["task_id", "trial"]].itertuples(index=False)
+    seeds = [(task_id, record.plan.scene_seed(task_id, trial)) for task_id, trial in tasks_and_trials]
+    rows = [_scene(task_id, seed, record.plan.scene) for task_id, seed in seeds]
     return pd.DataFrame(rows, index=record.episodes.index)
 
 
 @cache  # Many evaluations have the same scenes, of which each takes a millisecond.
 def _scene(task_id: int, seed: int, scene: SceneConfig) -> dict[str, Any]:
-    from gymnasium.utils import seeding
-
-    from gym_deltaco.layout import sample_layout
-
     task = get_task(task_id)
     layout = sample_layout(task, scene, seeding.np_random(seed)[0])
     return {

@@ -65,7 +65,7 @@ def test_imports_go_one_way(files, forbidden):
             assert parents.isdisjoint(forbidden), f"{path} imports {name}"
 
 
-@pytest.mark.parametrize("name", ["records", "collect", "paraphrases", "report", "leaderboard"])
+@pytest.mark.parametrize("name", ["records", "collect", "paraphrases", "report"])
 def test_what_needs_no_policy_imports_neither_torch_nor_lerobot(name):
     seen, todo = set(), [f"lerobot_deltaco.{name}"]
     files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in LEROBOT_FILES}
