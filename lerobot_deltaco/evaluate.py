@@ -67,12 +67,14 @@ class Outcome(NamedTuple):
         info: Info of the environment after the last step.
         demonstration_episodes: Episodes of the demonstrations that the policy received, in their dataset.
         demonstrated_objects: Indices of the objects that they move.
+        p_pick: The policy's probability of what it picks; NaN if it gives none.
     """
 
     episode: Episode
     info: Mapping[str, Any]
     demonstration_episodes: list[int]
     demonstrated_objects: list[int]
+    p_pick: float
 
 
 # Called after the reset and after each step with the environments of a batch and their observations.
@@ -149,6 +151,8 @@ class Evaluation:
             infos = run_episodes(
                 self.loaded, self.simulators, batch, demonstrations, callback, self.plan.joint_noise
             )
+        found = getattr(self.loaded.policy, "found", None)
+        p_picks = [math.nan] * len(batch) if found is None else found.p_pick.tolist()
         # Without the demonstrations' tensors, which should not be sent between processes.
         return [
             Outcome(
@@ -156,8 +160,9 @@ class Evaluation:
                 info,
                 [each.episode for each in given if each.episode is not None],
                 [each.target_object for each in given if each.target_object is not None],
+                p_pick,
             )
-            for episode, info, given in zip(batch, infos, demonstrations, strict=True)
+            for episode, info, given, p_pick in zip(batch, infos, demonstrations, p_picks, strict=True)
         ]
 
     def _demonstrations(self, episode: Episode) -> list[Demonstration]:
@@ -382,6 +387,7 @@ def _row(outcome: Outcome) -> dict[str, Any]:
         "object_containers": info["object_containers"].tolist(),
         "right_object": bool(info["right_object"]),
         "right_container": bool(info["right_container"]),
+        "p_pick": outcome.p_pick,
     }
 
 

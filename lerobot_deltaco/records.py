@@ -42,6 +42,7 @@ SCHEMA = pa.schema(
         "object_containers": pa.list_(pa.int8()),
         "right_object": pa.bool_(),
         "right_container": pa.bool_(),
+        "p_pick": pa.float32(),
     }
 )
 TEMPLATES = "templates"
@@ -257,6 +258,7 @@ def _check(record: EvaluationRecord, path: Path) -> None:
     # After a success, the object may have been taken out again.
     is_decided = rows["right_object"] & fills_one & (is_placed & is_grasped).any(axis=1)
     conditions = {
+        "a training step and a duration of at least 0": min(record.step, record.seconds) >= 0,
         f"{len(task_ids) * trials} episodes": len(rows) == len(task_ids) * trials,
         "each task and trial of the plan once": (
             rows["task_id"].isin(task_ids)
@@ -270,6 +272,7 @@ def _check(record: EvaluationRecord, path: Path) -> None:
         "grasped objects from -1 to 2": rows["grasped_object"].between(-1, _N_OBJECTS - 1),
         "a grasped object where it is the right one": ~rows["right_object"] | (rows["grasped_object"] >= 0),
         "objects in one container where it is the right one": ~rows["right_container"] | fills_one,
+        "probabilities from 0 to 1": rows["p_pick"].isna() | rows["p_pick"].between(0, 1),
         "successes where the right object alone lies in the right container": (
             ~is_decided | (rows["success"] == rows["right_container"])
         ),

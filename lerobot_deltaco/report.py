@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 RowsOf = Callable[[Result, Sequence[Result]], Iterator[dict[str, Any]]]
 PAGE, FIGURE = "report.md", "success.png"
+_SURE = (0, 0.5, 0.7, 0.9, 0.97, 1)  # bounds of a policy's probability of what it picks
 KINDS = ("name", "color", "shape", "color_shape", "foreign")
 # Options of a policy that may differ between the training runs of an experiment.
 _OPTIONS_OF_A_RUN = {"seed", "device", "pretrained_path", "demo_root", "repo_id", "push_to_hub"}
@@ -160,6 +161,18 @@ def counterfactual_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[st
         yield from table.to_dict("records")
 
 
+def calibration_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
+    """Yields how often grasps are of the right object, by how sure the policy was."""
+    grasps = result.episodes[result.episodes["grasped_object"] >= 0]
+    for sure, some in grasps.groupby(pd.cut(grasps["p_pick"], _SURE, include_lowest=True), observed=True):
+        yield {
+            "sure": f"{100 * max(sure.left, 0):.0f} to {100 * sure.right:.0f} %",
+            "grasps": len(some),
+            "mean_probability": some["p_pick"].mean(),
+            "right_object": some["right_object"].mean(),
+        }
+
+
 def evaluation_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
     """Yields the success of every evaluation, by training seed and step, if there are several."""
     for (seed, step), record in result.records.unstack().items():
@@ -201,6 +214,10 @@ TABLES: dict[str, tuple[RowsOf, str]] = {
         "The demonstration or the instruction is another task's. Counted are the episodes in which both ask "
         "for different objects or containers: whether the object held last, and the only container in which "
         "something lies, are the demonstration's, the instruction's or neither's.",
+    ),
+    "calibration": (
+        calibration_rows,
+        "How often the right object is grasped, by the probability that the policy gave its choice.",
     ),
     "evaluations": (evaluation_rows, "Every evaluation, where there are several of training seeds or steps."),
 }

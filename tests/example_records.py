@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from gym_deltaco import ENV_ID
@@ -41,6 +42,7 @@ def make_record(
     episodes["object_containers"] = [[1, -1, -1] if item else [-1, -1, -1] for item in success]
     episodes["right_object"] = success
     episodes["right_container"] = success
+    episodes["p_pick"] = np.nan
     for name, values in (columns or {}).items():
         episodes[name] = values
     other = {

@@ -59,6 +59,7 @@ CONTRADICTIONS = {
     "grasped objects from -1 to 2": {"grasped_object": 3},
     "a grasped object where it is the right one": {"grasped_object": -1},
     "objects in one container where": {"object_containers": [[-1, -1, -1]] * 12},
+    "probabilities from 0 to 1": {"p_pick": 1.5},
     "successes where the right object alone": {"right_container": False},
 }
 
@@ -75,6 +76,12 @@ def test_contradictions_are_refused(tmp_path, monkeypatch, message):
         write_records(tmp_path / "some.parquet", found)
     with pytest.raises(RecordError, match=f"must have {message}"):
         read_records(tmp_path / "some.parquet")
+
+
+@pytest.mark.parametrize("wrong", [{"step": -1}, {"seconds": -0.5}])
+def test_negative_steps_and_durations_are_refused(tmp_path, wrong):
+    with pytest.raises(RecordError, match="must have a training step and a duration of at least 0"):
+        write_records(tmp_path / "some.parquet", [make_record(**wrong)])
 
 
 def test_an_incomplete_evaluation_is_refused(tmp_path):

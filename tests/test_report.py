@@ -14,6 +14,7 @@ from gym_deltaco.tasks import TASKS, get_task
 from lerobot_deltaco.recipes import experiment_names
 from lerobot_deltaco.records import scene_columns, write_records
 from lerobot_deltaco.report import (
+    calibration_rows,
     counterfactual_rows,
     difference_rows,
     escape,
@@ -250,6 +251,15 @@ def test_outcomes():
     assert row["grasped_anything"] == 0.75
     assert row["right_object_of_grasped"] == pytest.approx(1 / 3)
     assert row["right_container_of_placed"] == 0.5
+
+
+def test_calibration_counts_grasps_by_the_policys_probability():
+    columns = {"p_pick": [0.6] * 4 + [0.99] * 8, "grasped_object": [0] * 11 + [-1]}
+    record = make_record(succeeds=lambda task_id, trial: trial == 0, columns=columns)
+    table = make_table(collect_results([record]), calibration_rows)
+    assert table["sure"].tolist() == ["50 to 70 %", "97 to 100 %"]
+    assert table["grasps"].tolist() == [4, 7]
+    assert table["right_object"].tolist() == [0.5, 4 / 7]
 
 
 def test_success_stands_beside_the_papers():
