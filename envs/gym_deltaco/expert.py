@@ -116,8 +116,8 @@ def record_demonstration(task_id: int, number: int = 0, scene: SceneConfig = DEF
 
     Args:
         task_id: Index of the task, as in `gym_deltaco.tasks`.
-        number: Number of the demonstration. 0 is the one that the protocol gives: the task's first episode for
-            validation.
+        number: Number of the demonstration. 0 is the one that the protocol gives: the task's first episode
+            for validation.
         scene: Settings of the scene.
 
     Raises:
