@@ -181,7 +181,6 @@ def _training_rate(root: Path, in_memory: bool, options: dict[str, Any]) -> floa
     import torch
     from lerobot.scripts import lerobot_train
 
-    from lerobot_deltaco import language
     from lerobot_deltaco.train import train as train_in_memory
 
     words = {
@@ -204,20 +203,10 @@ def _training_rate(root: Path, in_memory: bool, options: dict[str, Any]) -> floa
     with (
         patch.object(sys, "argv", ["train", *(f"--{name}={value}" for name, value in words.items())]),
         patch.object(lerobot_train, "update_policy", noted),
-        patch.object(language, "load_language_encoder", lambda name: _random_embeddings(name)),
     ):
         train_in_memory() if in_memory else lerobot_train.main()
     first = len(ends) // 3
     return options["batch_size"] * (len(ends) - 1 - first) / (ends[-1] - ends[first])
-
-
-def _random_embeddings(name: str) -> Callable[[Any], Any]:
-    import torch
-
-    from lerobot_deltaco.language import LANGUAGE_ENCODERS
-
-    dim = LANGUAGE_ENCODERS[name].embedding_dim
-    return lambda sentences: torch.nn.functional.normalize(torch.randn(len(sentences), dim), dim=1)
 
 
 # The policies
@@ -268,7 +257,6 @@ def _policy_actions(
     from torch.utils.data import default_collate
 
     import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
-    from lerobot_deltaco import language
 
     dataset = LeRobotDataset("benchmark/noise", root=root)
     config = make_policy_config(options.pop("type"), **options)
@@ -276,9 +264,8 @@ def _policy_actions(
     before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
     samples = default_collate([dataset[7 * n % len(dataset)] for n in range(batch_size)])
     optimizer = config.get_optimizer_preset().build(made.get_optim_params())
-    with patch.object(language, "load_language_encoder", _random_embeddings):
-        batch = before(samples)
-        made.train()(batch)  # reads the demonstrations
+    batch = before(samples)
+    made.train()(batch)  # reads the demonstrations
 
     def step() -> None:
         made.train()

@@ -36,7 +36,7 @@ from lerobot_deltaco.demonstrations import (
 )
 from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.losses import imitation_loss, join_action
-from lerobot_deltaco.networks import ActionDistribution
+from lerobot_deltaco.networks import ActionDistribution, PolicyNetwork
 from lerobot_deltaco.normalization import StateLimits
 from lerobot_deltaco.task_bank import (
     PROCESSORS,
@@ -74,10 +74,12 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset_meta: Metadata of the training dataset; None in evaluation.
 
     Attributes:
+        model: Network that predicts actions.
         instructions: Embeddings of instructions; None if the policy uses no sentence encoder.
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
     """
 
+    model: PolicyNetwork
     config_class: ClassVar[type] = TaskConditionedConfig
     name = "task_conditioned"
 

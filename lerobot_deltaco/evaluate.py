@@ -439,7 +439,9 @@ def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
         ValueError: There is no such checkpoint, a record is of another policy, or the plan does not fit.
     """
     path, plan = arguments.checkpoint, arguments.plan
-    rename_map = arguments.rename_map and parse_json(arguments.rename_map, "--rename-map")
+    rename_map = None
+    if arguments.rename_map is not None:
+        rename_map = parse_json(arguments.rename_map, "--rename-map")
     found = find_checkpoints(path)
     is_run = (path / "checkpoints").is_dir()
     folder = arguments.out or (path if is_run else Path("outputs/evaluate") / path.resolve().name)

@@ -248,7 +248,7 @@ def run_experiments(
     runs = [Run(recipe, each, out) for recipe in recipes for each in dict.fromkeys(seed)]
     for run in runs:
         run.check_settings()
-        if run.recipe.start_from not in (None, *names):
+        if run.recipe.start_from not in (None, *names) and last_step(run.folder) == 0:
             run.best_start()  # or an error, before anything is collected
     report = ["report", *(str(run.folder) for run in runs), "--out", str(out / "report")]
     if dry_run:

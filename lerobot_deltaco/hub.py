@@ -84,10 +84,12 @@ def push(root: Path, repo_id: str) -> str:
         HubError: The Hub refuses, or cannot be reached.
     """
     write_dataset_card(root, repo_id)
-    api, repository = HfApi(), {"repo_id": repo_id, "repo_type": "dataset"}
+    api = HfApi()
     with _publishing(repo_id):
-        api.upload_folder(folder_path=root, delete_patterns=["data/*", "meta/*"], **repository)
+        api.upload_folder(
+            repo_id=repo_id, folder_path=root, repo_type="dataset", delete_patterns=["data/*", "meta/*"]
+        )
         with suppress(RevisionNotFoundError):
-            api.delete_tag(tag=CODEBASE_VERSION, **repository)
-        api.create_tag(tag=CODEBASE_VERSION, **repository)
+            api.delete_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset")
+        api.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset")
     return f"{api.endpoint}/datasets/{repo_id}"

@@ -59,7 +59,6 @@ class DeltacoPolicy(TaskConditionedPolicy):
     """The paper's policy. See `TaskConditionedPolicy` for its arguments.
 
     Attributes:
-        model: Network that predicts actions.
         demo_encoder: Encoder of demonstrations, or the layers after a frozen one; None without them.
         language_head: Layers after the language encoder; None without them.
     """

@@ -120,7 +120,6 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     """The project's own policy. See `TaskConditionedPolicy` for its arguments.
 
     Attributes:
-        model: Network that predicts actions.
         robot_states: The robot's states at locations.
         feature_matching: Finds what to pick, and how high.
         attention: Finds what a demonstration moved, and where it was put.
