@@ -50,9 +50,9 @@ def _publishing(repo_id: str) -> Iterator[None]:
     try:
         yield
     except (httpx.HTTPError, HFValidationError, OSError) as error:
-        reason = " ".join(str(error).split())
+        reason = " ".join(str(error).split()).rstrip(".")
         raise HubError(
-            f"Cannot push to {repo_id!r}: {reason} The repository id is USER/NAME, and HF_TOKEN a token with "
+            f"Cannot push to {repo_id!r}: {reason}. The repository id is USER/NAME, and HF_TOKEN a token with "
             "write access. A push can be repeated."
         ) from None
 
