@@ -52,8 +52,8 @@ def _publishing(repo_id: str) -> Iterator[None]:
     except (httpx.HTTPError, HFValidationError, OSError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise HubError(
-            f"Cannot push to {repo_id!r}: {reason}. The repository id is USER/NAME, and HF_TOKEN a token with "
-            "write access. A push can be repeated."
+            f"Cannot push to {repo_id!r}: {reason}. The repository id is USER/NAME, and HF_TOKEN a token "
+            "with write access. A push can be repeated."
         ) from None
 
 
