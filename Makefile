@@ -9,9 +9,6 @@ PYTHON ?=
 ARGS ?=
 # Minutes of the demo: 8, or 25 for the whole recipe
 MINUTES ?= 8
-# User or organization on the Hub that a release is published under, and its datasets: DATASETS="data/train data/test"
-HUB_USER ?=
-DATASETS ?=
 
 export UV_PYTHON_DOWNLOADS := never
 
@@ -48,14 +45,14 @@ lint: $(INSTALLED) ## Check style, types, and the files that GitHub reads
 docs: $(INSTALLED) ## Build the documentation, warnings being errors: docs/_build/html/index.html
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs docs/_build/html
 
-benchmark: $(INSTALLED) ## Measure speed: make benchmark ARGS=env, collect, train or policy
+benchmark: $(INSTALLED) ## Measure speed: make benchmark ARGS=env, train or policy
 	$(BIN)/python benchmarks/benchmark.py $(or $(ARGS),env)
 
 coverage: $(INSTALLED) ## Run the default tests and report which lines they reach: htmlcov/index.html
 	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered --cov-report=html $(ARGS)
 
-release: $(INSTALLED) ## Check what a release needs; publish it with HUB_USER=you DATASETS="data/train"
-	$(BIN)/python scripts/release.py $(if $(HUB_USER),--user $(HUB_USER) --datasets $(DATASETS)) $(ARGS)
+release: $(INSTALLED) ## Check what a release needs, and print the commands that publish it
+	$(BIN)/python scripts/release.py $(ARGS)
 
 # Candidates are run, not only looked up: a shim may be on the path and still fail. Building PyBullet also needs
 # Python's headers.

@@ -1,6 +1,6 @@
-"""Speed of the environment, of data collection, of training and of the policies.
+"""Speed of the environment, of training and of the policies. `deltaco collect` prints its own.
 
-    python benchmarks/benchmark.py env|collect|train|policy
+    python benchmarks/benchmark.py env|train|policy
 
 Times are of one machine: compare figures of one run, made while nothing else uses the processor.
 """
@@ -8,13 +8,11 @@ Times are of one machine: compare figures of one run, made while nothing else us
 from __future__ import annotations
 
 import itertools
-import os
 import statistics
 import sys
 import tempfile
 import time
 from collections.abc import Callable
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -28,12 +26,7 @@ def main() -> None:
     """Runs the benchmark that the command line names, and prints its table."""
     import tyro
 
-    commands: dict[str, Callable[..., dict[str, float]]] = {
-        "env": env,
-        "collect": collect,
-        "train": train,
-        "policy": policy,
-    }
+    commands: dict[str, Callable[..., dict[str, float]]] = {"env": env, "train": train, "policy": policy}
     results = tyro.extras.subcommand_cli_from_dict(commands, description=(__doc__ or "").partition("\n")[0])
     width = max(map(len, results))
     sys.stdout.writelines(f"{name:{width}}  {value:12.3f}\n" for name, value in results.items())
@@ -53,20 +46,18 @@ def seconds_of(action: Callable[[], object], seconds: float = 1.0) -> float:
 # The environment
 
 
-def env(
-    episodes: int = 300, workers: int = len(os.sched_getaffinity(0)), seconds: float = 1.0
-) -> dict[str, float]:
-    """Measures the parts of an episode, and episodes of the expert.
+def env(episodes: int = 100, seconds: float = 1.0) -> dict[str, float]:
+    """Measures the parts of an episode, and episodes of the expert, on one core.
 
     Args:
-        episodes: Number of episodes for each of two runs: in one process, and in several.
-        workers: Number of processes of the second run.
+        episodes: Number of episodes of the expert.
         seconds: Duration of the measurement of each part.
     """
     import psutil
 
     from gym_deltaco import kinematics
     from gym_deltaco.env import PickPlaceEnv
+    from gym_deltaco.expert import expert_episode
 
     before = psutil.Process().memory_info().rss
     pick_place = PickPlaceEnv()
@@ -90,63 +81,13 @@ def env(
         "reset": lambda: pick_place.reset(seed=next(seeds)),
     }
     results = {f"{name}, ms": 1e3 * seconds_of(action, seconds) for name, action in parts.items()}
-    pick_place.close()
     results["memory of an environment, MB"] = memory
-    results["expert, 1 process, episodes/s"], success = _expert_rate(episodes, 1)
-    results[f"expert, {workers} processes, episodes/s"], _ = _expert_rate(episodes, workers)
-    return {**results, "expert, success, %": 100 * success}
-
-
-def _expert_rate(n_episodes: int, n_workers: int) -> tuple[float, float]:
-    """Returns episodes per second, one a task, and the fraction of successes."""
-    with get_context("spawn").Pool(n_workers) as pool:
-        pool.map(_run_expert, range(4 * n_workers), chunksize=1)  # starts the simulators
-        start = time.perf_counter()
-        successes = pool.map(
-            _run_expert, range(n_episodes), chunksize=max(1, min(5, n_episodes // n_workers))
-        )
-        return n_episodes / (time.perf_counter() - start), float(np.mean(successes))
-
-
-_env: Any = None  # of a worker
-
-
-def _run_expert(number: int) -> bool:
-    global _env
-    from gym_deltaco.env import PickPlaceEnv
-    from gym_deltaco.expert import expert_episode
-    from gym_deltaco.seeding import episode_seed
-
-    _env = _env or PickPlaceEnv()
-    # 7 and 300 have no common divisor, so 300 episodes meet every task once.
-    task_id = 7 * number % 300
-    steps = list(expert_episode(_env, task_id, episode_seed(0, "evaluation", task_id, 0, number)))
-    return bool(steps[-1].info["is_success"])
-
-
-# Collection
-
-
-def collect(episodes_per_task: int = 16, workers: int = len(os.sched_getaffinity(0))) -> dict[str, float]:
-    """Measures `deltaco collect`, from the simulation to the finished dataset, on tasks of all kinds.
-
-    Args:
-        episodes_per_task: Number of episodes of each of 20 tasks.
-        workers: Number of processes of the second run; the first has one.
-    """
-    from lerobot_deltaco.collect import CollectionPlan
-    from lerobot_deltaco.collect import collect as collect_dataset
-
-    plan = CollectionPlan(",".join(map(str, range(0, 300, 15))), episodes_per_task)
-    results = {}
-    for n_workers in sorted({1, workers}):
-        with tempfile.TemporaryDirectory() as folder:
-            start = time.perf_counter()
-            summary = collect_dataset(Path(folder), plan, n_workers)
-            results[f"{n_workers} processes, episodes/s"] = summary.episodes_per_s or 0.0
-            results[f"{n_workers} processes, all, s"] = time.perf_counter() - start
-    rate = results["1 processes, episodes/s"]
-    results[f"ratio of {workers} processes to 1"] = results[f"{workers} processes, episodes/s"] / rate
+    start = time.perf_counter()
+    # 7 and 300 have no common divisor, so that 300 episodes meet every task once.
+    ends = [list(expert_episode(pick_place, 7 * number % 300, number))[-1] for number in range(episodes)]
+    results["expert, episodes/s"] = episodes / (time.perf_counter() - start)
+    results["expert, success, %"] = 100 * float(np.mean([end.info["is_success"] for end in ends]))
+    pick_place.close()
     return results
 
 
@@ -240,7 +181,6 @@ def _training_rate(root: Path, in_memory: bool, options: dict[str, Any]) -> floa
     import torch
     from lerobot.scripts import lerobot_train
 
-    from lerobot_deltaco import language
     from lerobot_deltaco.train import train as train_in_memory
 
     words = {
@@ -263,20 +203,10 @@ def _training_rate(root: Path, in_memory: bool, options: dict[str, Any]) -> floa
     with (
         patch.object(sys, "argv", ["train", *(f"--{name}={value}" for name, value in words.items())]),
         patch.object(lerobot_train, "update_policy", noted),
-        patch.object(language, "load_language_encoder", lambda name: _random_embeddings(name)),
     ):
         train_in_memory() if in_memory else lerobot_train.main()
     first = len(ends) // 3
     return options["batch_size"] * (len(ends) - 1 - first) / (ends[-1] - ends[first])
-
-
-def _random_embeddings(name: str) -> Callable[[Any], Any]:
-    import torch
-
-    from lerobot_deltaco.language import LANGUAGE_ENCODERS
-
-    dim = LANGUAGE_ENCODERS[name].embedding_dim
-    return lambda sentences: torch.nn.functional.normalize(torch.randn(len(sentences), dim), dim=1)
 
 
 # The policies
@@ -327,7 +257,6 @@ def _policy_actions(
     from torch.utils.data import default_collate
 
     import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
-    from lerobot_deltaco import language
 
     dataset = LeRobotDataset("benchmark/noise", root=root)
     config = make_policy_config(options.pop("type"), **options)
@@ -335,9 +264,8 @@ def _policy_actions(
     before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
     samples = default_collate([dataset[7 * n % len(dataset)] for n in range(batch_size)])
     optimizer = config.get_optimizer_preset().build(made.get_optim_params())
-    with patch.object(language, "load_language_encoder", _random_embeddings):
-        batch = before(samples)
-        made.train()(batch)  # reads the demonstrations
+    batch = before(samples)
+    made.train()(batch)  # reads the demonstrations
 
     def step() -> None:
         made.train()

@@ -17,6 +17,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
+from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
 from lerobot_deltaco.base_config import TaskConditionedConfig
@@ -34,6 +35,8 @@ from lerobot_deltaco.demonstrations import (
     read_robot_data,
 )
 from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
+from lerobot_deltaco.losses import imitation_loss, join_action
+from lerobot_deltaco.networks import ActionDistribution, PolicyNetwork
 from lerobot_deltaco.normalization import StateLimits
 from lerobot_deltaco.task_bank import (
     PROCESSORS,
@@ -71,10 +74,12 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset_meta: Metadata of the training dataset; None in evaluation.
 
     Attributes:
+        model: Network that predicts actions.
         instructions: Embeddings of instructions; None if the policy uses no sentence encoder.
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
     """
 
+    model: PolicyNetwork
     config_class: ClassVar[type] = TaskConditionedConfig
     name = "task_conditioned"
 
@@ -239,6 +244,25 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         if image.shape[-2:] == (size, size):
             return image
         return F.interpolate(image, (size, size), mode="bilinear", antialias=True)
+
+    # Actions
+
+    def _imitation_loss(
+        self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None, gripper_kind: str
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the imitation loss of each sample, (batch,), and its parts to log. See `imitation_loss`."""
+        log_std, is_pad = self.model.log_std, batch.get(f"{ACTION}_is_pad")
+        return imitation_loss(
+            predicted, gripper, log_std, batch[ACTION], is_pad, self.config.gripper_index, gripper_kind
+        )
+
+    def _likeliest(
+        self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None
+    ) -> Tensor:
+        """Returns the likeliest actions of a chunk, (batch, steps, action), unless they are absurd."""
+        opening = None if gripper is None else torch.sigmoid(gripper.float())
+        action = join_action(predicted.mode.float(), opening, self.config.gripper_index)
+        return self._checked_action(action, batch)
 
     # Training
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any, NamedTuple
+from dataclasses import asdict
+from typing import NamedTuple
 
 import numpy as np
 import psutil
@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.utils.data import default_collate
 from tqdm import tqdm
 
+from lerobot_deltaco.arguments import CheckArguments
 from lerobot_deltaco.base_config import dimension_names
 from lerobot_deltaco.dataset_reading import open_folder_or_hub
 from lerobot_deltaco.deltaco_match import feature_matching, proposals
@@ -122,23 +123,8 @@ class TrainingStart:
         return None if known is None else known.locations.cpu()
 
 
-def check(
-    dataset: str,
-    options: Mapping[str, Any],
-    batch_size: int = 64,
-    steps: int = 8000,
-    episodes: int = 48,
-    out: Path = Path("outputs/check"),
-) -> str:
+def check(arguments: CheckArguments) -> str:
     """Shows what a policy would take from a dataset, on one self-contained page.
-
-    Args:
-        dataset: Folder of a LeRobotDataset, or its id on the Hugging Face Hub.
-        options: Options of the policy, as for `deltaco train`.
-        batch_size: Batch size that the time of training is estimated for.
-        steps: Number of training steps that it is estimated for.
-        episodes: Number of episodes to show; those that are left out come first.
-        out: Folder for the page.
 
     Returns:
         The report.
@@ -146,12 +132,12 @@ def check(
     Raises:
         ValueError: Training would refuse the dataset; the message has the reason, and the report.
     """
-    opened = open_folder_or_hub(dataset)
-    config = DeltacoMatchConfig(**options)
+    opened = open_folder_or_hub(arguments.dataset)
+    config = DeltacoMatchConfig(**asdict(arguments.policy))
     start = TrainingStart(opened, config)
     meta = opened.meta
     tasks = [names[0] for names in meta.episodes["tasks"]]
-    views, staying = _read_episodes(start, tasks, episodes)
+    views, staying = _read_episodes(start, tasks, arguments.episodes)
     facts = [
         ("dataset", f"{meta.total_episodes} episodes, {meta.total_frames:,} frames, {meta.fps} per second"),
         *_camera_facts(config, staying),
@@ -160,7 +146,7 @@ def check(
         *_pause_facts(opened),
     ]
     if start.refusal is None:
-        facts += _estimates(start, batch_size, steps)
+        facts += _estimates(start, arguments.batch_size, arguments.steps)
     warnings = [
         *start.warnings,
         *_task_warnings(meta.episodes["tasks"]),
@@ -170,11 +156,11 @@ def check(
         task for task, grasp in zip(tasks, start.grasps, strict=False) if isinstance(grasp, Grasp)
     )
     counts = [(task, n, found[task]) for task, n in Counter(tasks).items()]
-    page = out / "index.html"
+    page = arguments.out / "index.html"
     write_page(
         "check.html",
         page,
-        source=dataset,
+        source=arguments.dataset,
         refusal=start.refusal,
         warnings=warnings,
         facts=facts,

@@ -15,15 +15,15 @@ import os
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import asdict, dataclass
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -33,9 +33,10 @@ from tqdm import tqdm
 from gym_deltaco import ENV_ID, EXPERT_NOISE, pybullet_import
 from gym_deltaco.atomic_files import read_json, write_json
 from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.expert import expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import SCENARIOS, TASK_SETS, TASKS, VALIDATION, get_task, select_tasks
+from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco import dataset_writer
 
 Split = Literal["train", "validation"]
@@ -45,19 +46,8 @@ DESCRIPTION_FILE = "meta/deltaco.json"
 MAX_ATTEMPTS = 100
 # Outside `observation.`, so that no policy takes them as an input.
 PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_container", "benchmark.seed")
-
-_NOVEL_OBJECTS = tuple(task for task in SCENARIOS["a"].test_tasks if TASKS[task].kind == "name")
-# Datasets by name, with the purpose of their episodes. All but T150 and V48 are the authors'.
-DATA_SETS: dict[str, tuple[tuple[int, ...], Split]] = {
-    "T198": (SCENARIOS["a"].train_tasks, "train"),
-    "T48": (_NOVEL_OBJECTS, "train"),
-    "T54": (SCENARIOS["b"].test_tasks, "train"),
-    "E48": (_NOVEL_OBJECTS, "validation"),
-    "E54": (SCENARIOS["b"].test_tasks, "validation"),
-    "E102": (SCENARIOS["a"].test_tasks, "validation"),
-    "T150": (VALIDATION.train_tasks, "train"),
-    "V48": (VALIDATION.test_tasks, "validation"),
-}
+# Held-out tasks, whose episodes are for validation.
+HELD_OUT = ("scenario_a_test", "scenario_a_clean_test", "scenario_a_validation", "scenario_b_test", "foreign")
 
 
 class CollectionError(RuntimeError):
@@ -69,12 +59,11 @@ class CollectionPlan:
     """Everything that a dataset depends on; equal plans give equal datasets.
 
     Args:
-        tasks: A task set (scenario_a_train, ...), a dataset of the authors (T198, T48, T54, E48, E54, E102)
-            or for choosing settings (T150, V48), or indices and ranges such as "4,50-73".
+        tasks: Tasks: a task set, or indices and ranges, such as 4,50-73.
         episodes_per_task: Number of successful episodes of each task.
         seed: Seed of the whole dataset.
-        split: Purpose of the episodes; scenes of different splits never coincide. By default, the split of
-            the dataset, "validation" for test and validation tasks, and "train" otherwise.
+        split: Purpose of the episodes; scenes of different splits never coincide. By default, "validation"
+            for the scenarios' test and validation tasks, and "train" otherwise.
         noise: Standard deviation of the Gaussian noise on the first three numbers of the expert's actions;
             with joint control, that on the joints in units of 0.04 rad.
         scene: Settings of the scenes.
@@ -98,30 +87,12 @@ class CollectionPlan:
         object.__setattr__(self, "scene", self.scene.for_tasks(self.tasks))
         self.scene.check_tasks(self.task_ids)
         if self.split is None:
-            object.__setattr__(self, "split", self._default_split())
-        if self.split not in get_args(Split):
-            raise ValueError(f"`split` must be one of {', '.join(get_args(Split))}. Got {self.split!r}.")
-
-    def _default_split(self) -> Split:
-        if self.tasks in DATA_SETS:
-            return DATA_SETS[self.tasks][1]
-        if self.tasks.strip() == "foreign":
-            return "validation"
-        for kind in ("_test", "_validation"):
-            held_out = TASK_SETS[f"scenario_a{kind}"]
-            if self.tasks.endswith(kind) and set(self.task_ids) <= set(held_out):
-                return "validation"
-        return "train"
+            object.__setattr__(self, "split", "validation" if self.tasks in HELD_OUT else "train")
 
     @property
     def task_ids(self) -> tuple[int, ...]:
         """Indices of the tasks, in the order of the dataset."""
-        if self.tasks in DATA_SETS:
-            return DATA_SETS[self.tasks][0]
-        try:
-            return select_tasks(self.tasks)
-        except ValueError as error:
-            raise ValueError(f"{error} Also valid are the datasets {', '.join(DATA_SETS)}.") from None
+        return select_tasks(self.tasks)
 
     @property
     def instructions(self) -> list[str]:
@@ -143,36 +114,19 @@ class CollectionPlan:
         size = min(100, max(10, self.n_episodes // 32))
         return [range(first, min(first + size, self.n_episodes)) for first in range(0, self.n_episodes, size)]
 
+    def episode(self, index: int) -> tuple[int, int]:
+        """Returns the task of an episode, and its number among the episodes of that task."""
+        position, number = divmod(index, self.episodes_per_task)
+        return self.task_ids[position], number
 
-@dataclass(frozen=True)
-class Summary:
-    """Result of a collection.
-
-    Attributes:
-        root: Folder of the dataset.
-        episodes: Number of successful episodes of each kind of task.
-        attempts: Number of episodes that the expert needed for them.
-        episodes_per_s: Speed of this run; None if there was nothing to do.
-    """
-
-    root: Path
-    episodes: dict[str, int]
-    attempts: dict[str, int]
-    episodes_per_s: float | None
-
-    def __str__(self) -> str:
-        speed = "nothing to do" if self.episodes_per_s is None else f"{self.episodes_per_s:.1f} episodes/s"
-        rates = ", ".join(
-            f"{kind} {n_episodes / self.attempts[kind]:.1%}" for kind, n_episodes in self.episodes.items()
-        )
-        n_episodes, n_attempts = sum(self.episodes.values()), sum(self.attempts.values())
-        return (
-            f"{self.root}: {n_episodes} episodes; {speed}.\n"
-            f"The expert succeeded in {n_episodes} of {n_attempts} attempts ({rates})."
-        )
+    def seeds(self, task_id: int, number: int) -> Iterator[int]:
+        """Yields the seed of each attempt at an episode."""
+        assert self.split is not None
+        for attempt in range(MAX_ATTEMPTS):
+            yield episode_seed(self.seed, self.split, task_id, number, attempt)
 
 
-def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
+def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> str:
     """Collects a dataset, or continues an interrupted collection of the same plan.
 
     Args:
@@ -181,7 +135,8 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
         workers: Number of processes; the dataset is the same with any number.
 
     Returns:
-        Counts and speed. If the dataset is finished, there is nothing to do.
+        A summary: the number of episodes, the speed, and how often the expert succeeded. If the dataset is
+        finished, there is nothing to do.
 
     Raises:
         CollectionError: The folder holds something else, or cannot be written to; the expert cannot do a
@@ -189,20 +144,17 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
         ImportError: PyBullet is not installed.
     """
     pybullet_import.load()  # fails here, before anything is written, if there is no simulator
-    if workers < 1:
-        raise CollectionError(f"`workers` must be at least 1. Got {workers}.")
+    speed = "nothing to do"
     try:
         _check_folder(root, plan)
-        if is_finished(root):
-            return _summary(root, None)
-        if not (root / DESCRIPTION_FILE).exists():
+        if not is_finished(root):
             write_json(root / DESCRIPTION_FILE, _description(plan))
-        speed = _collect_shards(root, plan, workers)
-        write_json(root / DESCRIPTION_FILE, {**_description(plan), **_outcome(root, plan)})
-        dataset_writer.number_frames(root, len(plan.shards))
-        dataset_writer.write_metadata(
-            root, dataset_features(plan.scene), plan.scene.interface.fps, ROBOT_TYPE, plan.instructions
-        )
+            speed = f"{_collect_shards(root, plan, workers):.1f} episodes/s"
+            write_json(root / DESCRIPTION_FILE, {**_description(plan), **_outcome(root, plan)})
+            dataset_writer.number_frames(root, len(plan.shards))
+            dataset_writer.write_metadata(
+                root, dataset_features(plan.scene), plan.scene.interface.fps, ROBOT_TYPE, plan.instructions
+            )
     except BrokenProcessPool:
         raise CollectionError(
             "A worker process was killed; the memory may be full. Finished shards are kept: run the same "
@@ -213,7 +165,12 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> Summary:
             f"Cannot write to {root}: {error.strerror or error}. Finished shards are kept: run the same "
             "command again when there is space and the folder can be written to."
         ) from None
-    return _summary(root, speed)
+    outcome = read_description(root)
+    rates = [f"{kind} {n / outcome['attempts'][kind]:.1%}" for kind, n in outcome["episodes"].items()]
+    return (
+        f"{root}: {plan.n_episodes} episodes; {speed}.\nThe expert succeeded in {plan.n_episodes} of "
+        f"{sum(outcome['attempts'].values())} attempts ({', '.join(rates)})."
+    )
 
 
 # The folder
@@ -249,24 +206,12 @@ def dataset_features(scene: SceneConfig) -> dict[str, dict[str, Any]]:
     """Returns the features of a dataset, as in LeRobot's info.json."""
     control = scene.interface
     number = {"dtype": "int64", "shape": [1], "names": None}
-    defaults = asdict(SceneConfig())
-    changed = {
-        name: value
-        for name, value in asdict(scene).items()
-        if name in ("objects", "adversarial_probability", "adversarial_draw", "control")
-        and value != defaults[name]
-    }
     image = {
         "dtype": "image",
         "shape": [scene.image_size, scene.image_size, 3],
         "names": ["height", "width", "channels"],
         # Policies do not transfer from one renderer's images to another's.
-        "info": {
-            "renderer": renderer(),
-            "benchmark": ENV_ID,
-            "ambiguity": scene.ambiguity,
-            **changed,
-        },
+        "info": {"renderer": renderer(), "benchmark": ENV_ID, **asdict(scene)},
     }
     vectors = {"observation.state": control.state_names, "action": control.action_names}
     return {
@@ -292,20 +237,15 @@ def _outcome(root: Path, plan: CollectionPlan) -> dict[str, Any]:
     rows = pq.read_table(
         root / "data", columns=["episode_index", "benchmark.seed"], filters=[("frame_index", "==", 0)]
     )
-    episodes: dict[str, int] = {}
-    attempts: dict[str, int] = {}
+    episodes: Counter[str] = Counter()
+    attempts: Counter[str] = Counter()
     for index, seed in zip(*(column.to_pylist() for column in rows.columns), strict=True):
-        task_id, number = _task_and_number(plan, index)
+        task_id, number = plan.episode(index)
         kind = get_task(task_id).kind
-        episodes[kind] = episodes.get(kind, 0) + 1
-        attempts[kind] = attempts.get(kind, 0) + 1 + list(_seeds(plan, task_id, number)).index(seed)
+        episodes[kind] += 1
+        attempts[kind] += next(n for n, tried in enumerate(plan.seeds(task_id, number), 1) if tried == seed)
     versions = {name: version(name) for name in ("lerobot_policy_deltaco", "pybullet", "numpy")}
     return {"versions": versions, "episodes": episodes, "attempts": attempts}
-
-
-def _summary(root: Path, episodes_per_s: float | None) -> Summary:
-    description = read_description(root)
-    return Summary(root, description["episodes"], description["attempts"], episodes_per_s)
 
 
 def _check_folder(root: Path, plan: CollectionPlan) -> None:
@@ -314,10 +254,12 @@ def _check_folder(root: Path, plan: CollectionPlan) -> None:
         if found is not None:
             raise CollectionError(f"{root} is not empty: it holds {found.name}. Name a new folder.")
         return
-    begun = _flat({**read_description(root), "plan": asdict(read_plan(root))})
-    wanted = _flat(_description(plan))
+    begun, wanted = (
+        {**each, **each["plan"], **each["plan"]["scene"]}
+        for each in (read_description(root), _description(plan))
+    )
     # A finished dataset remains valid when packages are updated.
-    ignored = ("benchmark", "renderer") if is_finished(root) else ()
+    ignored = {"plan", "scene", *(("benchmark", "renderer") if is_finished(root) else ())}
     differences = [
         f"{name}: {begun.get(name)} there, {value} now"
         for name, value in wanted.items()
@@ -330,16 +272,10 @@ def _check_folder(root: Path, plan: CollectionPlan) -> None:
         )
 
 
-def _flat(description: dict[str, Any]) -> dict[str, Any]:
-    plan = {**description["plan"], **description["plan"]["scene"]}
-    del plan["scene"]
-    return {**plan, "benchmark": description["benchmark"], "renderer": description["renderer"]}
-
-
 # Workers
 
 
-def _collect_shards(root: Path, plan: CollectionPlan, workers: int) -> float | None:
+def _collect_shards(root: Path, plan: CollectionPlan, workers: int) -> float:
     """Collects the missing shards. Returns the number of episodes per second."""
     missing = [shard for shard in range(len(plan.shards)) if not dataset_writer.is_written(root, shard)]
     n_missing = sum(len(plan.shards[shard]) for shard in missing)
@@ -348,19 +284,18 @@ def _collect_shards(root: Path, plan: CollectionPlan, workers: int) -> float | N
     with tqdm(total=plan.n_episodes, initial=n_finished, desc="Collecting", unit="episode") as progress:
         for shard in _run(root, plan, missing, min(workers, len(missing))):
             progress.update(len(plan.shards[shard]))
-    return n_missing / (time.perf_counter() - start) if n_missing else None
+    return n_missing / (time.perf_counter() - start)
 
 
 def _run(root: Path, plan: CollectionPlan, shards: Sequence[int], workers: int) -> Iterator[int]:
     """Collects shards, in this process if one is enough, and yields each once it is written."""
     if workers <= 1:
-        with closing(PickPlaceEnv(plan.task_ids[0], plan.scene)) as env:
-            for shard in shards:
-                yield _collect_shard(env, root, plan, shard)
+        for shard in shards:
+            yield _collect_shard(root, plan, shard)
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, _start_worker) as executor:
-        futures = [executor.submit(_collect_in_worker, root, plan, shard) for shard in shards]
+        futures = [executor.submit(_collect_shard, root, plan, shard) for shard in shards]
         try:
             for future in as_completed(futures):
                 yield future.result()
@@ -383,50 +318,26 @@ def _exit_with_parent() -> None:
     os._exit(1)
 
 
-def _collect_in_worker(root: Path, plan: CollectionPlan, shard: int) -> int:
-    return _collect_shard(_worker_env(plan), root, plan, shard)
+def _collect_shard(root: Path, plan: CollectionPlan, shard: int) -> int:
+    instructions, indices = plan.instructions, plan.shards[shard]
 
-
-@cache
-def _worker_env(plan: CollectionPlan) -> PickPlaceEnv:
-    # Not made in the initializer, whose errors end the pool without saying why.
-    return PickPlaceEnv(plan.task_ids[0], plan.scene)
-
-
-def _collect_shard(env: PickPlaceEnv, root: Path, plan: CollectionPlan, shard: int) -> int:
-    instructions = plan.instructions
-
-    def episodes() -> Iterator[dataset_writer.Episode]:
-        for index in plan.shards[shard]:
-            task_id, number = _task_and_number(plan, index)
-            frames = collect_episode(env, plan, task_id, number)
+    def episodes(env: PickPlaceEnv) -> Iterator[dataset_writer.Episode]:
+        for task_id, number in map(plan.episode, indices):
             instruction = get_task(task_id).instruction
+            frames = collect_episode(env, plan, task_id, number)
             yield dataset_writer.Episode(frames, instruction, instructions.index(instruction))
 
-    first = plan.shards[shard].start
-    dataset_writer.write_shard(
-        root,
-        shard,
-        episodes(),
-        dataset_features(plan.scene),
-        plan.scene.interface.fps,
-        first_episode=first,
-        first_frame=first * plan.scene.n_steps,  # unless episodes end before that
-    )
+    with closing(PickPlaceEnv(plan.task_ids[0], plan.scene)) as env:
+        dataset_writer.write_shard(
+            root,
+            shard,
+            episodes(env),
+            dataset_features(plan.scene),
+            plan.scene.interface.fps,
+            first_episode=indices.start,
+            first_frame=indices.start * plan.scene.n_steps,  # unless episodes end before that
+        )
     return shard
-
-
-def _task_and_number(plan: CollectionPlan, index: int) -> tuple[int, int]:
-    """Returns the task of an episode, and its number among the episodes of that task."""
-    position, number = divmod(index, plan.episodes_per_task)
-    return plan.task_ids[position], number
-
-
-def _seeds(plan: CollectionPlan, task_id: int, number: int) -> Iterator[int]:
-    """Yields the seed of each attempt at an episode."""
-    assert plan.split is not None
-    for attempt in range(MAX_ATTEMPTS):
-        yield episode_seed(plan.seed, plan.split, task_id, number, attempt)
 
 
 def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, number: int) -> dict[str, NDArray]:
@@ -444,9 +355,7 @@ def collect_episode(env: PickPlaceEnv, plan: CollectionPlan, task_id: int, numbe
     Raises:
         CollectionError: The expert never succeeded.
     """
-    from gym_deltaco.expert import expert_episode
-
-    for seed in _seeds(plan, task_id, number):
+    for seed in plan.seeds(task_id, number):
         steps = list(expert_episode(env, task_id, seed, plan.noise))
         info = steps[-1].info
         if not info["is_success"]:

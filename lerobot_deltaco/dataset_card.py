@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import textwrap
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,7 @@ def dataset_card(root: Path, repo_id: str | None = None) -> str:
     return render(
         "benchmark_dataset.md",
         info=read_json(root / INFO_FILE),
-        origin={**read_description(root), "plan": asdict(plan)},
+        origin=read_description(root),
         tasks=[get_task(task_id) for task_id in plan.task_ids],
         scenarios=list(SCENARIOS.values()),
         repo_id=repo_id,

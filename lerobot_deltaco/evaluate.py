@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import math
 import multiprocessing
+import shlex
 import signal
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,9 +31,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gym_deltaco import ENV_ID
+from gym_deltaco.atomic_files import parse_json
 from gym_deltaco.env import N_JOINTS, PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import get_task
+from lerobot_deltaco.arguments import EvaluateArguments
 from lerobot_deltaco.base_config import SOURCES
 from lerobot_deltaco.base_policy import TaskConditionedPolicy
 from lerobot_deltaco.checkpoints import Checkpoint, LoadedPolicy, find_checkpoints, load_policy
@@ -431,34 +435,8 @@ def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | ExpertBa
     return bank
 
 
-def evaluate_checkpoints(
-    path: Path,
-    plan: EvaluationPlan,
-    steps: str = "all",
-    out: Path | None = None,
-    *,
-    command: str,
-    processes: int = 1,
-    device: str | None = None,
-    demo_repo_id: str | None = None,
-    demo_root: Path | None = None,
-    experiment: str | None = None,
-    rename_map: Mapping[str, str] | None = None,
-) -> str:
+def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
     """Evaluates a policy, or the checkpoints of a training run, that have no record of the plan yet.
-
-    Args:
-        path: Output folder of a training run, or folder of a policy.
-        plan: Episodes to run.
-        steps: "all", "last", or steps such as "4000,8000".
-        out: Folder of the records; None for that of the training run, or outputs/evaluate/NAME.
-        command: Command line, for the records.
-        processes: Number of processes that share the episodes.
-        device: Device of the policy; None for the checkpoint's.
-        demo_repo_id: Dataset of demonstrations; None for the checkpoint's own.
-        demo_root: Folder of that dataset.
-        experiment: Name for the records; None for the job name of the training run.
-        rename_map: Names under which the policy knows the environment's observations.
 
     Returns:
         A line for each checkpoint, with its success rate.
@@ -466,16 +444,21 @@ def evaluate_checkpoints(
     Raises:
         ValueError: There is no such checkpoint, a record is of another policy, or the plan does not fit.
     """
+    path, plan = arguments.checkpoint, arguments.plan
+    rename_map = None
+    if arguments.rename_map is not None:
+        rename_map = parse_json(arguments.rename_map, "--rename-map")
     found = find_checkpoints(path)
     is_run = (path / "checkpoints").is_dir()
-    folder = out or (path if is_run else Path("outputs/evaluate") / path.resolve().name)
-    given = {"device": device, "demo_repo_id": demo_repo_id, "demo_root": demo_root}
+    folder = arguments.out or (path if is_run else Path("outputs/evaluate") / path.resolve().name)
+    given = {name: getattr(arguments, name) for name in ("device", "demo_repo_id", "demo_root")}
     overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
     demonstrations = None
-    if demo_repo_id is not None:
-        demonstrations = (demo_repo_id, metadata_digest(demo_repo_id, demo_root))
+    if arguments.demo_repo_id is not None:
+        digest = metadata_digest(arguments.demo_repo_id, arguments.demo_root)
+        demonstrations = (arguments.demo_repo_id, digest)
     lines = []
-    for checkpoint in _chosen(found, steps):
+    for checkpoint in _chosen(found, arguments.steps):
         fitted = replace(plan, scene=_fitted(plan.scene, checkpoint))
         file = folder / "evaluations" / _record_name(checkpoint, fitted, demonstrations)
         if file.exists():
@@ -491,9 +474,9 @@ def evaluate_checkpoints(
                 loaded,
                 fitted,
                 checkpoint,
-                command=command,
-                processes=processes if str(loaded.policy.config.device) == "cpu" else 1,
-                experiment=experiment,
+                command=shlex.join(["deltaco", *sys.argv[1:]]),
+                processes=arguments.processes if str(loaded.policy.config.device) == "cpu" else 1,
+                experiment=arguments.experiment,
                 demonstrations=demonstrations,
             )
             write_records(file, [record])

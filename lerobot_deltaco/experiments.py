@@ -9,28 +9,23 @@ continues after an interruption.
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import nullcontext
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
-from tqdm import tqdm
+import tyro
 
 from gym_deltaco.atomic_files import read_json, write_json
 from lerobot_deltaco.checkpoints import find_checkpoints
 from lerobot_deltaco.collect import CollectionPlan, is_finished
-from lerobot_deltaco.recipes import ExperimentError, Recipe, Scale, read_recipe
+from lerobot_deltaco.recipes import ExperimentError, Recipe, Scale, experiment_names, read_recipe
 from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord, read_records
-
-Step = Literal["collect", "train", "evaluate", "report"]
 
 
 class Run:
@@ -47,7 +42,6 @@ class Run:
         self.seed = seed
         self.out = out
         self.folder = out / recipe.scale / recipe.name / f"seed_{seed}"
-        self.log = self.folder.with_name(f"seed_{seed}.log")
         self.settings_file = self.folder.with_name(f"seed_{seed}.json")
 
     def __str__(self) -> str:
@@ -58,34 +52,31 @@ class Run:
         name = "_".join(f"{key.rpartition('.')[2]}-{value}" for key, value in plan_options(plan))
         return self.out / "data" / re.sub(r"[^\w.,-]", "-", name)
 
-    def collect_commands(self) -> list[list[str]]:
-        """Returns the commands that collect the missing datasets."""
-        plans = dict.fromkeys((self.recipe.data, self.recipe.demonstrations))
-        return [
-            ["collect", *_flags(plan), "--root", str(self.dataset(plan))]
-            for plan in plans
-            if not is_finished(self.dataset(plan))
-        ]
-
-    def train_command(self) -> list[str] | None:
-        """Returns the command that starts or resumes training; None if it is finished.
+    def commands(self) -> Iterator[list[str]]:
+        """Yields the commands that are still to be run, as arguments of `deltaco`.
 
         Raises:
             ExperimentError: The experiment that this one starts from was not trained and evaluated.
         """
+        for plan in dict.fromkeys((self.recipe.data, self.recipe.demonstrations)):
+            if not is_finished(self.dataset(plan)):
+                yield ["collect", *_flags(plan), "--root", str(self.dataset(plan))]
         step = last_step(self.folder)
-        if step >= self.recipe.training.steps:
-            return None
-        if step > 0:
-            return [
-                "train",
-                f"--config_path={last_checkpoint(self.folder) / 'train_config.json'}",
-                "--resume=true",
-            ]
+        trains = step < self.recipe.training.steps
+        if trains:
+            yield self._resume_command() if step else self._train_command()
+        if trains or self.unevaluated_steps():
+            yield self.evaluate_command()
+
+    def _resume_command(self) -> list[str]:
+        config = last_checkpoint(self.folder) / "train_config.json"
+        return ["train", f"--config_path={config}", "--resume=true"]
+
+    def _train_command(self) -> list[str]:
         policy = dict(self.recipe.policy)
         start = {"policy.type": policy.pop("type")}
         if self.recipe.start_from is not None:
-            start = {"policy.path": last_checkpoint(self._best_start())}
+            start = {"policy.path": last_checkpoint(self.best_start())}
         options = {
             **start,
             **{f"policy.{name}": value for name, value in policy.items()},
@@ -113,6 +104,18 @@ class Run:
         done = {record.step for record in read_run_records(self.folder) if record.plan == plan}
         return [found.step for found in find_checkpoints(self.folder) if found.step not in done]
 
+    def execute(self, command: Sequence[str]) -> None:
+        """Runs one of the commands.
+
+        Raises:
+            ExperimentError: It failed.
+        """
+        if command[0] == "train" and last_step(self.folder) == 0:
+            # A run that stopped before its first checkpoint has left a folder.
+            shutil.rmtree(self.folder, ignore_errors=True)
+            write_json(self.settings_file, self._settings())
+        call(command)
+
     def check_settings(self) -> None:
         """Checks that the run, if it has a checkpoint, began with the same settings.
 
@@ -129,58 +132,17 @@ class Run:
                     f"it is {settings}. Use the same settings or another --out, or move the run away."
                 )
 
-    def train(self, log: Path | None = None, n_threads: int | None = None) -> None:
-        """Trains unless training is finished.
-
-        Args:
-            log: File for the output; None for this terminal.
-            n_threads: Number of threads; None for PyTorch's choice.
-        """
-        command = self.train_command()
-        if command is None:
-            return
-        if last_step(self.folder) == 0:
-            # A run that stopped before its first checkpoint has left a folder.
-            shutil.rmtree(self.folder, ignore_errors=True)
-            write_json(self.settings_file, self._settings())
-        call(command, log, n_threads)
-
-    def evaluate(self, log: Path | None = None, n_threads: int | None = None) -> None:
-        """Evaluates the checkpoints that have no record; the arguments are those of `train`."""
-        if self.unevaluated_steps():
-            call(self.evaluate_command(), log, n_threads)
-
-    def check_step(self, only: Step | None) -> None:
-        """Checks that the steps before one that is run alone are finished.
-
-        Raises:
-            ExperimentError: They are not.
-        """
-        missing, step, steps = self.collect_commands(), last_step(self.folder), self.recipe.training.steps
-        if only == "train" and missing:
-            raise ExperimentError(f"{self} needs the dataset {missing[0][-1]}. Run --only collect first.")
-        if only == "evaluate" and step < steps:
-            raise ExperimentError(f"{self} is at step {step} of {steps}. Run --only train first.")
-        if only == "report" and not read_run_records(self.folder):
-            raise ExperimentError(f"{self} has no evaluated checkpoint. Run --only evaluate first.")
-
-    def commands(self, only: Step | None = None) -> list[list[str]]:
-        """Returns the commands that are still to be run, without the report."""
-        train = self.train_command() if only in (None, "train") else None
-        evaluates = only in (None, "evaluate") and (train is not None or self.unevaluated_steps())
-        return [
-            *(self.collect_commands() if only in (None, "collect") else []),
-            *([train] if train else []),
-            *([self.evaluate_command()] if evaluates else []),
-        ]
-
     def _settings(self) -> dict[str, Any]:
         settings = asdict(self.recipe)
         del settings["evaluation"]
         return json.loads(json.dumps(settings))
 
-    def _best_start(self) -> Path:
-        """Returns the run of `start_from` with the highest success rate at its last step."""
+    def best_start(self) -> Path:
+        """Returns the run of `start_from` with the highest success rate at its last step.
+
+        Raises:
+            ExperimentError: None was trained and evaluated.
+        """
         assert self.recipe.start_from is not None
         rates = {}
         folders = self.out / self.recipe.scale / self.recipe.start_from
@@ -233,36 +195,22 @@ def _text(value: Any) -> str:
     return json.dumps(value) if isinstance(value, (bool, list, tuple)) else str(value)
 
 
-# Execution
-
-
-def call(arguments: Sequence[str], log: Path | None = None, n_threads: int | None = None) -> None:
+def call(arguments: Sequence[str]) -> None:
     """Runs a `deltaco` command in a process of its own.
 
     Args:
         arguments: Subcommand and its arguments.
-        log: File that the output is appended to; None for this terminal.
-        n_threads: Number of threads; None for the command's choice.
 
     Raises:
         ExperimentError: The command failed.
     """
-    environment = dict(os.environ)
-    if n_threads is not None:
-        environment["OMP_NUM_THREADS"] = str(n_threads)
-    if log is not None:
-        log.parent.mkdir(parents=True, exist_ok=True)
-        environment["TQDM_MININTERVAL"] = "10"  # s; a log keeps every state of a progress bar
-    with log.open("a", encoding="utf-8") if log else nullcontext(sys.stdout) as output:
-        output.write(f"\n{command_line(arguments)}\n")
-        output.flush()
-        streams: dict[str, Any] = {"stdout": output, "stderr": subprocess.STDOUT} if log else {}
-        words = [sys.executable, "-m", "lerobot_deltaco.cli", *arguments]
-        status = subprocess.run(words, env=environment, check=False, **streams).returncode
+    sys.stdout.write(f"\n{command_line(arguments)}\n")
+    sys.stdout.flush()
+    status = subprocess.run([sys.executable, "-m", "lerobot_deltaco.cli", *arguments], check=False).returncode
     if status != 0:
         raise ExperimentError(
-            f"`deltaco {arguments[0]}` failed (exit status {status}); see {log or 'above'} for the reason. "
-            "The same command continues."
+            f"`deltaco {arguments[0]}` failed (exit status {status}); see above for the reason. The same "
+            "command continues."
         )
 
 
@@ -272,109 +220,47 @@ def command_line(arguments: Sequence[str]) -> str:
 
 
 def run_experiments(
-    names: Sequence[str],
+    names: tyro.conf.Positional[Sequence[str]] = (),
     scale: Scale = "small",
-    seeds: Sequence[int] = (0,),
+    seed: Sequence[int] = (0,),
     out: Path = Path("outputs/experiments"),
-    settings: Sequence[str] = (),
-    jobs: int = 1,
-    only: Step | None = None,
+    settings: Annotated[Sequence[str], tyro.conf.arg(name="set")] = (),
     dry_run: bool = False,
-) -> None:
-    """Runs the steps of experiments that are not finished.
+) -> str | None:
+    """Runs the steps of experiments that are not finished yet.
 
     Args:
-        names: Names of experiments, such as "scenario_a/deltaco".
-        scale: Amount of data and training.
-        seeds: Training seeds; each is a separate run.
+        names: Experiments, such as scenario_a/deltaco. Without any, their names are printed.
+        scale: Size of data, networks and training: small for a CPU, or the paper's.
+        seed: Seeds of the training; each is a separate run.
         out: Folder of all outputs.
-        settings: Settings that take precedence over the recipes, such as "training.steps=2000".
-        jobs: Number of runs at a time. Each has its share of the cores, and its own copy of the frames.
-        only: The only step to run; the steps before it must be finished.
-        dry_run: Whether to print the commands instead.
+        settings: Settings that override the recipe, such as training.steps=2000.
+        dry_run: Print the commands without running them.
 
     Raises:
         ExperimentError: A setting is invalid, a run began with other settings, or a step failed.
     """
-    if jobs < 1 or not names:
-        raise ExperimentError(
-            f"Name at least one experiment, and at least one job. Got {len(names)} and {jobs}."
-        )
+    if not names:
+        return "\n".join(experiment_names())
     recipes = [read_recipe(name, scale, settings) for name in dict.fromkeys(names)]
-    runs = [Run(recipe, seed, out) for seed in dict.fromkeys(seeds) for recipe in recipes]
+    # Fine-tuning starts once the runs that it may start from are done.
+    recipes.sort(key=lambda recipe: recipe.start_from in names)
+    runs = [Run(recipe, each, out) for recipe in recipes for each in dict.fromkeys(seed)]
     for run in runs:
         run.check_settings()
-    # Fine-tuning starts once the runs that it may start from are done.
-    first = [run for run in runs if run.recipe.start_from not in names]
-    second = [run for run in runs if run not in first]
-    remaining = [command for run in first for command in run.commands(only)]
+        if run.recipe.start_from not in (None, *names) and last_step(run.folder) == 0:
+            run.best_start()  # or an error, before anything is collected
     report = ["report", *(str(run.folder) for run in runs), "--out", str(out / "report")]
     if dry_run:
-        lines = [*map(command_line, remaining), *(f"# then {run}, from its best start" for run in second)]
-        lines += [command_line(report)] if only in (None, "report") else []
-        print(*dict.fromkeys(lines), sep="\n")  # noqa: T201
-        return
-    for run in runs if only in (None, "collect") else []:
-        for command in run.collect_commands():
-            call(command)
-    for wave in (first, second):
-        for run in wave:
-            run.check_step(only)
-        if only in (None, "train", "evaluate"):
-            _train_and_evaluate(wave, jobs, only)
-    if only in (None, "report"):
-        call(report)
-
-
-def _train_and_evaluate(runs: Sequence[Run], jobs: int, only: Step | None) -> None:
-    """Trains and evaluates runs, several at a time. After a failure, those already started are completed."""
-
-    def work(run: Run, log: Path | None = None, n_threads: int | None = None) -> None:
-        if only in (None, "train"):
-            run.train(log, n_threads)
-        if only in (None, "evaluate"):
-            run.evaluate(log, n_threads)
-
-    jobs = min(jobs, len(runs))
-    if jobs <= 1:
+        lines = []
         for run in runs:
-            work(run)
-        return
-    n_threads = max(1, available_cores() // jobs)
-    failure: BaseException | None = None
-    with ThreadPoolExecutor(jobs) as pool, tqdm(total=len(runs), desc="Runs", dynamic_ncols=True) as progress:
-        futures: dict[Future[None], Run] = {pool.submit(work, run, run.log, n_threads): run for run in runs}
-        waiting = set(futures)
-        try:
-            while waiting:
-                done, waiting = wait(waiting, timeout=1, return_when=FIRST_COMPLETED)
-                for future in done:
-                    if not future.cancelled():
-                        failure = failure or future.exception()
-                        progress.update()
-                if failure:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                states = [
-                    f"{futures[item]} {last_progress(futures[item].log)}"
-                    for item in waiting
-                    if item.running()
-                ]
-                progress.set_postfix_str("; ".join(sorted(states)))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    if failure:
-        raise failure
-
-
-def available_cores() -> int:
-    """Returns the number of the processor's cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def last_progress(log: Path) -> str:
-    """Returns the percentage of the last progress bar in a log; "" without any."""
-    if not log.is_file():
-        return ""
-    found = re.findall(r"\d+%(?=\|)", log.read_bytes()[-2000:].decode(errors="replace"))
-    return found[-1] if found else ""
+            if run.recipe.start_from in names:
+                lines.append(f"# then {run}, from its best start")
+            else:
+                lines += map(command_line, run.commands())
+        return "\n".join(dict.fromkeys([*lines, command_line(report)]))
+    for run in runs:
+        for command in run.commands():
+            run.execute(command)
+    call(report)
+    return None

@@ -22,7 +22,7 @@ def expert_demonstration(
 
     Args:
         task_id: Index of the task.
-        number: Number of the demonstration. 0 is the task's only episode in the dataset `E102`.
+        number: Number of the demonstration. 0 is the task's first episode for validation.
         scene: Settings of the scene; the episode has the default length.
         camera: Camera of the frames, if the control has several.
     """

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Annotated
 
 import httpx
-from huggingface_hub import DatasetCard, HfApi, constants, get_token
+import tyro
+from huggingface_hub import HfApi
 from huggingface_hub.errors import HFValidationError, RevisionNotFoundError
-from huggingface_hub.utils import validate_repo_id
 
-from lerobot_deltaco.collect import is_finished
-from lerobot_deltaco.dataset_card import CARD_FILE, write_dataset_card
+from lerobot_deltaco.collect import CollectionPlan, collect
+from lerobot_deltaco.dataset_card import write_dataset_card
 from lerobot_deltaco.dataset_writer import CODEBASE_VERSION
 
 
@@ -19,69 +22,74 @@ class HubError(RuntimeError):
     """Raised when something cannot be published; the message says why, and what to do."""
 
 
-def check_push(repo_id: str) -> None:
-    """Checks the requirements of a push, so that a collection that ends with one fails early.
+def collect_and_push(
+    root: Path,
+    plan: Annotated[CollectionPlan, tyro.conf.arg(name="")],
+    workers: int = len(os.sched_getaffinity(0)),
+    push_to_hub: str | None = None,
+    private: bool = False,
+) -> str:
+    """Collects successful episodes of the expert, or continues an interrupted collection.
+
+    Args:
+        root: Folder of the dataset.
+        plan: Episodes to collect.
+        workers: Number of processes; the dataset is the same with any number.
+        push_to_hub: Repository on the Hugging Face Hub, USER/NAME, where the finished dataset is published
+            with its card; needs HF_TOKEN.
+        private: Whether a new repository on the Hub is private.
+    """
+    if push_to_hub is not None:
+        create_repository(push_to_hub, private)  # fails before a long collection
+    summary = collect(root, plan, workers)
+    return summary if push_to_hub is None else f"{summary}\nThe dataset is at {push(root, push_to_hub)}."
+
+
+@contextmanager
+def _publishing(repo_id: str) -> Iterator[None]:
+    try:
+        yield
+    except (httpx.HTTPError, HFValidationError, OSError) as error:
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise HubError(
+            f"Cannot push to {repo_id!r}: {reason}. The repository id is USER/NAME, and HF_TOKEN a token "
+            "with write access. A push can be repeated."
+        ) from None
+
+
+def create_repository(repo_id: str, private: bool = False) -> None:
+    """Creates the repository of a dataset unless it exists.
 
     Raises:
-        HubError: The repository id is invalid, or there is no token.
+        HubError: The id is invalid, there is no token that may write, or the Hub cannot be reached.
     """
-    try:
-        if repo_id.count("/") != 1:
-            raise HFValidationError("It must have one slash.")
-        validate_repo_id(repo_id)
-    except HFValidationError as error:
-        raise HubError(f"The repository id must be USER/NAME. Got {repo_id!r}. {error}") from None
-    if get_token() is None:
-        raise HubError(
-            "There is no token for the Hugging Face Hub. Set HF_TOKEN to a token with write access "
-            "(https://huggingface.co/settings/tokens), or log in with `hf auth login`."
-        )
+    with _publishing(repo_id):
+        HfApi().create_repo(repo_id, private=private or None, repo_type="dataset", exist_ok=True)
 
 
-def push(root: Path, repo_id: str, private: bool = False, branch: str | None = None) -> str:
-    """Uploads a finished dataset with its card.
+def push(root: Path, repo_id: str) -> str:
+    """Uploads a finished dataset with its card in one commit, tagged with the version that LeRobot looks for.
+
+    LeRobot's own `push_to_hub` writes a card of its own, and keeps files of an earlier dataset, which it
+    would read.
 
     Args:
         root: Folder of the dataset. The card is written into it.
-        repo_id: "USER/NAME" on the Hub. The repository is created if it does not exist; its files from an
-            earlier dataset are deleted.
-        private: Whether to create a new repository as private.
-        branch: Branch to upload to, created if it does not exist. None: the main branch, tagged with the
-            version of the format, which LeRobot looks for.
+        repo_id: Repository on the Hub, in which this dataset replaces an earlier one.
 
     Returns:
         Address of the dataset.
 
     Raises:
-        HubError: The dataset is not finished, the repository id is invalid, there is no token, or the Hub
-            refuses or cannot be reached.
+        HubError: The Hub refuses, or cannot be reached.
     """
-    check_push(repo_id)
-    if not is_finished(root):
-        raise HubError(f"{root} holds no finished dataset of `deltaco collect`. Run `deltaco collect` first.")
     write_dataset_card(root, repo_id)
-    # Imported here, since it takes 10 s.
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     api = HfApi()
-    try:
-        dataset = LeRobotDataset(repo_id, root=root, revision="main")
-        # The tag is set below, on the commit with our card.
-        dataset.push_to_hub(branch=branch, private=private or None, tag_version=False)
-        remote = api.list_repo_files(repo_id, repo_type="dataset", revision=branch)
-        # LeRobot reads every file in these folders.
-        stale = [
-            name for name in remote if name.startswith(("data/", "meta/")) and not (root / name).exists()
-        ]
-        if stale:
-            api.delete_files(repo_id, stale, repo_type="dataset", revision=branch)
-        card = DatasetCard.load(root / CARD_FILE)
-        card.push_to_hub(repo_id, repo_type="dataset", revision=branch)
-        if branch is None:
-            with suppress(RevisionNotFoundError):
-                api.delete_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset")
-            api.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset")
-    except (httpx.HTTPError, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise HubError(f"Cannot push to {repo_id}: {reason} A push can be repeated.") from None
-    return f"{constants.ENDPOINT}/datasets/{repo_id}"
+    with _publishing(repo_id):
+        api.upload_folder(
+            repo_id=repo_id, folder_path=root, repo_type="dataset", delete_patterns=["data/*", "meta/*"]
+        )
+        with suppress(RevisionNotFoundError):
+            api.delete_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset")
+        api.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset")
+    return f"{api.endpoint}/datasets/{repo_id}"

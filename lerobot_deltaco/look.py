@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
+from lerobot_deltaco.arguments import LookArguments
 from lerobot_deltaco.base_config import TaskConditionedConfig
 from lerobot_deltaco.checkpoints import LoadedPolicy
 from lerobot_deltaco.dataset_reading import open_folder_or_hub
@@ -60,21 +61,8 @@ class View(NamedTuple):
     video: str | None = None
 
 
-def look(
-    checkpoint: str,
-    dataset: str | None = None,
-    episodes: int = 12,
-    out: Path = Path("outputs/look"),
-) -> str:
+def look(arguments: LookArguments) -> str:
     """Draws where a policy looks in episodes of a dataset or of the benchmark, on one self-contained page.
-
-    Args:
-        checkpoint: Folder of a policy of the type deltaco_match, or of its training run; or id of a
-            repository on the Hugging Face Hub.
-        dataset: Folder of a LeRobotDataset, or its id on the Hub. Without one, episodes of the benchmark's
-            test tasks are run.
-        episodes: Number of episodes, evenly spread.
-        out: Folder for the page.
 
     Returns:
         How many are right, and where the page is.
@@ -82,6 +70,7 @@ def look(
     Raises:
         ValueError: The policy finds no locations, or does not fit the dataset.
     """
+    checkpoint, dataset, episodes = arguments.checkpoint, arguments.dataset, arguments.episodes
     if episodes < 1:
         raise ValueError(f"`episodes` must be at least 1. Got {episodes}.")
     loaded = load_conditioned(checkpoint)
@@ -90,10 +79,10 @@ def look(
             f"{checkpoint} holds a policy of the type {loaded.policy.config.type!r}, which does not look for "
             "locations. `deltaco look` needs one of the type deltaco_match."
         )
-    out.mkdir(parents=True, exist_ok=True)
+    arguments.out.mkdir(parents=True, exist_ok=True)
     if dataset is None:
         results, tolerance = ["Successful episodes"], None
-        views = _benchmark_views(loaded, episodes, out)
+        views = _benchmark_views(loaded, episodes, arguments.out)
     else:
         results, tolerance = (
             [f"Episodes with the right {what} location" for what in ("pick", "place")],
@@ -105,7 +94,7 @@ def look(
     for n, text in enumerate(results):
         known = [view.right[n] for view in shown if view.right[n] is not None]
         rates += [(text, sum(known), len(known))] if known else []
-    page = out / "index.html"
+    page = arguments.out / "index.html"
     write_page(
         "look.html",
         page,

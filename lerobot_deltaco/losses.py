@@ -131,7 +131,6 @@ def imitation_loss(
     action: Tensor,
     is_pad: Tensor | None,
     gripper_index: int | None,
-    gripper_weight: float,
     gripper_kind: str,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Returns the imitation loss L_pi (equation 2), in single precision; of a chunk, the mean over its steps.
@@ -144,8 +143,7 @@ def imitation_loss(
             beyond those that are predicted do not count.
         is_pad: Steps beyond the end of the episode, which do not count, (batch, steps) bool; None for none.
         gripper_index: The gripper's dimension of the action; None without a gripper.
-        gripper_weight: Weight of the gripper's loss.
-        gripper_kind: Kind of the gripper's loss, as in `gripper_loss`.
+        gripper_kind: Kind of the gripper's loss, one of `GRIPPER_LOSSES`.
 
     Returns:
         Loss of each sample, (batch,), and its parts to log, each of shape ().
@@ -169,7 +167,7 @@ def imitation_loss(
     is_right = ((gripper > 0) == (target > 0.5)) * valid
     logged["gripper_loss"] = error.mean()
     logged["gripper_accuracy"] = is_right.sum() / n_steps.sum()
-    return likelihood + gripper_weight * error, logged
+    return likelihood + GRIPPER_LOSSES[gripper_kind] * error, logged
 
 
 def split_action(action: Tensor, gripper_index: int | None) -> tuple[Tensor, Tensor | None]:

@@ -18,6 +18,7 @@ from PIL import Image
 from gym_deltaco.layout import Layout
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import N_ROWS, TASKS, get_task
+from lerobot_deltaco.arguments import PlayArguments
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
 from lerobot_deltaco.demonstrations import Demonstration
 from lerobot_deltaco.evaluate import Simulators
@@ -534,17 +535,13 @@ def build_page(player: Player, name: str) -> gr.Blocks:
     return page
 
 
-def play(checkpoint: str | None = None, port: int = 7860) -> None:
+def play(arguments: PlayArguments) -> None:
     """Serves the page on this machine until it is interrupted.
-
-    Args:
-        checkpoint: Folder of a policy or of a training run, or id of a repository on the Hub; None for the
-            checkpoint that comes with the project.
-        port: Port to serve at.
 
     Raises:
         ValueError: There is no checkpoint, its policy is not one for the benchmark, or the port is taken.
     """
+    checkpoint, port = arguments.checkpoint, arguments.port
     with tempfile.TemporaryDirectory(prefix="deltaco-play-") as folder:
         chosen = Path(checkpoint) if checkpoint else shipped_checkpoint()
         page = build_page(Player(chosen, Path(folder)), checkpoint or chosen.name)

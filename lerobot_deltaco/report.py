@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+import tyro
 
 from gym_deltaco.atomic_files import write_text
 from gym_deltaco.tasks import get_task
@@ -27,7 +28,7 @@ KINDS = ("name", "color", "shape", "color_shape", "foreign")
 _OPTIONS_OF_A_RUN = {"seed", "device", "pretrained_path", "demo_root", "repo_id", "push_to_hub"}
 
 
-def write_report(paths: Sequence[Path], out: Path) -> Path:
+def write_report(paths: tyro.conf.Positional[Sequence[Path]], out: Path = Path("outputs/report")) -> Path:
     """Writes a page, tables and a figure from records of evaluations.
 
     Args:

@@ -1,4 +1,4 @@
-"""Draws the documentation's images of the benchmark: objects, scenes, expert and ambiguity schemes."""
+"""Draws the documentation's images of the benchmark: objects, scenes, joint control, ambiguity schemes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from gym_deltaco.camera import Camera
 from gym_deltaco.env import PickPlaceEnv
@@ -31,14 +30,12 @@ from gym_deltaco.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 
 # Tasks of all kinds with various containers: six names, three colors, three shapes
 SCENE_TASKS = (4, 64, 123, 179, 231, 258, 33, 234, 187, 90, 144, 296)
-EPISODE_TASKS = (4, 231, 187)
 CONTAINER_TASK, OBJECT_TASK = 236, 31  # white object in left bin; jar in green bin
 VIEW_SIZE, POLICY_SIZE = 256, 48  # px, of images for people and for policies
 CROP_SIZE = 14  # px of the policy's image, around an object
 CLOSE_UP = Camera(
     (*TRAY_CENTER, TRAY_FLOOR + 0.033), distance=0.21, yaw=CAMERA.yaw, pitch=-35, fov=30, near=0.02
 )
-FRAME_MS, LAST_FRAME_MS = 125, 1500  # three times slower than nominal
 N_TRIES = 50  # scenes, to find one that shows what is meant
 ACCENT = "#c45400"
 DPI = 100
@@ -97,24 +94,6 @@ def _draw_scenes(task_ids: Sequence[int], scene: SceneConfig, path: Path) -> Non
     _save(figure, path)
 
 
-def draw_episodes(out: Path) -> None:
-    """Draws an animation of the expert in several tasks, each until shortly after its success."""
-    frames, durations = [], []
-    with closing(PickPlaceEnv()) as env:
-        for task_id in EPISODE_TASKS:
-            images = _expert_images(env, task_id, episode_seed(0, "train", task_id, 0))
-            frames += [_captioned(image, get_task(task_id).instruction) for image in images]
-            durations += [FRAME_MS] * (len(images) - 1) + [LAST_FRAME_MS]
-    # With one palette for all frames, only changes are stored.
-    palette = Image.fromarray(np.concatenate(frames)).quantize()
-    first, *others = [
-        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames
-    ]
-    first.save(
-        out / "episode.gif", save_all=True, append_images=others, duration=durations, loop=0, optimize=True
-    )
-
-
 def _expert_images(env: PickPlaceEnv, task_id: int, seed: int) -> list[NDArray[np.uint8]]:
     """Returns the images of an episode before the first step and after each, until two after its success."""
     env.reset(seed=seed, options={"task_id": task_id})
@@ -128,18 +107,10 @@ def _expert_images(env: PickPlaceEnv, task_id: int, seed: int) -> list[NDArray[n
     return images
 
 
-def _captioned(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
-    """Returns an image with a caption of up to three lines above it."""
-    canvas = Image.new("RGB", (VIEW_SIZE, VIEW_SIZE + 56), "white")
-    canvas.paste(Image.fromarray(image), (0, 56))
-    ImageDraw.Draw(canvas).text((4, 4), textwrap.fill(text, 34), "black", ImageFont.load_default(14))
-    return np.asarray(canvas)
-
-
 def draw_joint_control(out: Path) -> None:
     """Draws an episode with joint control, at the end of each stage, as both cameras see it."""
     with closing(PickPlaceEnv(scene=SceneConfig(control="joints", image_size=160))) as env:
-        steps = list(expert_episode(env, EPISODE_TASKS[0], episode_seed(0, "train", EPISODE_TASKS[0], 0)))
+        steps = list(expert_episode(env, SCENE_TASKS[0], episode_seed(0, "train", SCENE_TASKS[0], 0)))
         fps = env.metadata["render_fps"]
     ends = {step.stage: (number, step) for number, step in enumerate(steps)}
     figure, axes = _grid(2, len(ends), (1.75 * len(ends), 4))
@@ -265,7 +236,6 @@ def main(arguments: list[str] | None = None) -> None:
             draw_objects,
             draw_scenes,
             draw_foreign_scenes,
-            draw_episodes,
             draw_ambiguity,
             draw_joint_control,
         ):

@@ -13,8 +13,7 @@ SCRIPT = Path(__file__).parents[1] / "benchmarks" / "benchmark.py"
 @pytest.mark.parametrize(
     "words",
     [
-        ["env", "--episodes", "2", "--workers", "1", "--seconds", "0.01"],
-        ["collect", "--episodes-per-task", "1", "--workers", "2"],
+        ["env", "--episodes", "2", "--seconds", "0.01"],
         ["train", "--batch-size", "16", "--steps", "3", "--options", "backbone=strided"],
         ["policy", "--batch-size", "16", "--seconds", "0.01"],
     ],
@@ -23,7 +22,6 @@ SCRIPT = Path(__file__).parents[1] / "benchmarks" / "benchmark.py"
 def test_a_benchmark_prints_a_table(words, monkeypatch, capsys):
     spec = importlib.util.spec_from_file_location("benchmark", SCRIPT)
     module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "benchmark", module)  # for worker processes
     spec.loader.exec_module(module)
     monkeypatch.syspath_prepend(SCRIPT.parent)
     monkeypatch.setattr(sys, "argv", ["benchmark.py", *words])

@@ -20,13 +20,15 @@ from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from lerobot_deltaco import cli
+from lerobot_deltaco.arguments import CheckArguments, PolicyOptions
 from lerobot_deltaco.check import _staying_edges, check
 
 
 def checked(root, out, **options):
     """The report, and the page; a report of a refusal is that of the error."""
     try:
-        report = check(str(root), {"image_size": 24, **options}, 4, 100, out=out)
+        policy = PolicyOptions(**{"image_size": 24, **options})
+        report = check(CheckArguments(str(root), policy, batch_size=4, steps=100, out=out))
     except ValueError as error:
         report = str(error)
     return report, (out / "index.html").read_text()

@@ -91,16 +91,16 @@ def test_an_unknown_command_names_the_valid_ones(monkeypatch):
 
 
 def run_with(monkeypatch, function):
-    monkeypatch.setattr(cli, "_look", lambda: function)
-    monkeypatch.setattr(sys, "argv", ["deltaco", "look"])
+    monkeypatch.setattr(cli, "_imported", lambda path: function)
+    monkeypatch.setattr(sys, "argv", ["deltaco", "report"])
     cli.main()
 
 
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (ImportError("no simulator"), "deltaco look: no simulator"),
-        (FileNotFoundError("no file"), "deltaco look: no file"),
+        (ImportError("no simulator"), "deltaco report: no simulator"),
+        (FileNotFoundError("no file"), "deltaco report: no file"),
         (KeyboardInterrupt(), "\nInterrupted. Run the same command again to continue."),
     ],
     ids=lambda value: type(value).__name__,
@@ -121,7 +121,7 @@ def test_a_full_disk_is_named_whatever_reports_it(monkeypatch, error):
     def fail() -> None:
         raise error("I/O error: No space left on device (os error 28)")
 
-    monkeypatch.setattr(cli, "_train", lambda arguments: fail())
+    monkeypatch.setattr(cli, "_run", lambda name, arguments: fail())
     monkeypatch.setattr(sys, "argv", ["deltaco", "train", "--steps=3", "--output_dir=/mnt/full/run"])
     with pytest.raises(
         SystemExit, match=r"^deltaco train: The disk of /mnt/full/run is full. .*--resume=true"

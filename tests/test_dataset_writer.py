@@ -169,15 +169,6 @@ def test_tables_have_the_columns_types_and_values_of_lerobots(root, reference, f
             assert nested(ours[name].to_list()) == nested(theirs[name].to_list()), name
 
 
-def test_images_have_the_names_and_pixels_of_lerobots(root, reference):
-    ours, theirs = (read_table(path, "data")[1]["observation.image"] for path in (root, reference))
-    for our_cell, their_cell in zip(ours, theirs, strict=True):
-        assert our_cell["path"] == their_cell["path"]
-        our_image, their_image = (Image.open(io.BytesIO(cell["bytes"])) for cell in (our_cell, their_cell))
-        assert our_image.mode == their_image.mode == "RGB"
-        np.testing.assert_array_equal(our_image, their_image)
-
-
 def test_each_episode_is_a_row_group_of_the_file_that_its_metadata_name(root):
     _, rows = read_table(root, "meta/episodes")
     for index, row in rows.iterrows():
@@ -213,21 +204,6 @@ def test_every_frame_reads_like_one_that_lerobot_wrote(dataset, reference):
                 assert torch.equal(ours[name], theirs[name]), name
             else:
                 assert ours[name] == theirs[name]
-
-
-def test_subset_of_episodes_and_neighboring_frames_can_be_read(root, episodes):
-    offsets = [-1, 0, 1]
-    deltas = {"action": [offset / FPS for offset in offsets]}
-    subset = LeRobotDataset(REPO_ID, root=root, episodes=[1, 4], delta_timestamps=deltas)
-    assert len(subset) == LENGTHS[1] + LENGTHS[4]
-    for position, (episode, step) in enumerate([(1, i) for i in range(4)] + [(4, i) for i in range(3)]):
-        frame, actions = subset[position], episodes[episode].frames["action"]
-        assert frame["episode_index"] == episode
-        assert frame["task"] == episodes[episode].task
-        steps = np.array([step + offset for offset in offsets])
-        is_inside = (steps >= 0) & (steps < len(actions))
-        np.testing.assert_array_equal(frame["action"], actions[np.clip(steps, 0, len(actions) - 1)])
-        np.testing.assert_array_equal(frame["action_is_pad"], ~is_inside)
 
 
 def test_lerobot_deletes_and_merges_episodes(dataset, episodes, tmp_path):

@@ -17,7 +17,6 @@ import tyro
 
 from gym_deltaco.tasks import OBJECTS, TASK_SETS
 from lerobot_deltaco import cli
-from lerobot_deltaco.collect import DATA_SETS
 from lerobot_deltaco.recipes import read_recipe
 
 ROOT = Path(__file__).parents[1]
@@ -58,11 +57,13 @@ def commands(path: Path) -> Iterator[list[str]]:
 
 def parse_deltaco(name: str, arguments: list[str]) -> dict[str, object]:
     """Parses the arguments of a subcommand, and runs nothing."""
-    function = getattr(cli, f"_{name}")()
+    kind = cli.command_arguments(name)
+    if isinstance(kind, type):
+        return vars(tyro.cli(kind, args=arguments))
 
-    @functools.wraps(function)
+    @functools.wraps(kind)
     def bind(*args: object, **kwargs: object) -> dict[str, object]:
-        return inspect.signature(function).bind(*args, **kwargs).arguments
+        return inspect.signature(kind).bind(*args, **kwargs).arguments
 
     return tyro.cli(bind, args=arguments)
 
@@ -119,7 +120,7 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         parsed = parse_deltaco(name, arguments)
         if name == "experiment":
             for experiment in parsed["names"]:
-                read_recipe(experiment, parsed.get("scale", "small"), parsed.get("set", ()))
+                read_recipe(experiment, parsed.get("scale", "small"), parsed.get("settings", ()))
     elif command in LEROBOT_CONFIGURATIONS and arguments != ["--help"]:
         parse_lerobot(command, arguments, monkeypatch)
     elif command == "make":
@@ -209,9 +210,8 @@ def test_every_page_is_in_the_table_of_contents():
 
 
 def test_the_tables_of_the_benchmark_are_those_of_the_code():
-    benchmark, datasets = ((DOCS / f"{name}.md").read_text() for name in ("benchmark", "datasets"))
+    benchmark = (DOCS / "benchmark.md").read_text()
     for label in OBJECTS:
         assert f"| {label.index} | {label.name} | {label.shape} | {label.color} |" in benchmark
     for name, tasks in TASK_SETS.items():
         assert re.search(rf"^\| `{name}` \| .* \| {len(tasks)} \|$", benchmark, re.MULTILINE), name
-    assert all(f"`{name}`" in datasets for name in DATA_SETS)

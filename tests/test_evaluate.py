@@ -26,6 +26,7 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco import cli, language
 from lerobot_deltaco import evaluate as evaluate_module
+from lerobot_deltaco.arguments import EvaluateArguments
 from lerobot_deltaco.base_policy import TaskConditionedPolicy
 from lerobot_deltaco.checkpoints import find_checkpoints, load_policy
 from lerobot_deltaco.collect import CollectionPlan, collect
@@ -165,7 +166,8 @@ def test_lerobot_eval_has_the_same_scenes_and_successes(
     lerobot_eval.main()
     scenes = set(seen)
     seen.clear()
-    evaluate_checkpoints(folder, EvaluationPlan(tasks, trials=2), "last", tmp_path, command="", device="cpu")
+    plan = EvaluationPlan(tasks, trials=2)
+    evaluate_checkpoints(EvaluateArguments(folder, plan, out=tmp_path, processes=1, device="cpu"))
     assert scenes == set(seen)
     (record,) = read_records(tmp_path)
     info = json.loads((tmp_path / "eval_info.json").read_text())

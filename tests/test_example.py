@@ -13,6 +13,7 @@ from tiny_runs import run_training
 
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import get_task
+from lerobot_deltaco.arguments import EvaluateArguments
 from lerobot_deltaco.checkpoints import find_checkpoints, load_policy
 from lerobot_deltaco.collect import CollectionPlan, collect
 from lerobot_deltaco.demonstrations import as_uint8
@@ -54,12 +55,12 @@ def received(monkeypatch):
 
 def test_evaluations_give_the_demonstrations_of_the_protocol(checkpoint, received, tmp_path, monkeypatch):
     plan = EvaluationPlan(TASKS, trials=2, scene=SceneConfig(episode_length=2))
-    evaluate_checkpoints(checkpoint, plan, "last", tmp_path, command="", device="cpu")
+    evaluate_checkpoints(EvaluateArguments(checkpoint, plan, out=tmp_path, processes=1, device="cpu"))
     episodes = read_records(tmp_path)[0].episodes
     assert episodes["demonstration_task"].tolist() == [24, 24, 35, 35]
     for task_id, (shown,) in zip(episodes["task_id"], episodes["demonstrated_objects"], strict=True):
         assert shown in get_task(task_id).targets
-    # The same as the task's only episode in E102.
+    # The same as the task's first episode for validation.
     collect(tmp_path / "e102", CollectionPlan(TASKS, 1, split="validation"))
     dataset = LeRobotDataset("test/e102", root=tmp_path / "e102")
     for episode in dataset.meta.episodes:

@@ -7,7 +7,7 @@ import shutil
 from itertools import batched
 
 import pytest
-from fake_hub import USER, WITHOUT_CARD_CHECK, FakeHub, Repo
+from fake_hub import USER, FakeHub, Repo
 from fresh_python import run_python
 from huggingface_hub import DatasetCard
 from PIL import Image
@@ -15,11 +15,9 @@ from PIL import Image
 from gym_deltaco.env import ACTION_SCALE
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, TASKS
-from lerobot_deltaco import hub as hub_module
 from lerobot_deltaco.collect import CollectionPlan, collect
 from lerobot_deltaco.dataset_card import CARD_FILE, TASKS_IMAGE, dataset_card, write_dataset_card
 from lerobot_deltaco.dataset_writer import INFO_FILE
-from lerobot_deltaco.hub import HubError, check_push, push
 
 REPO_ID = f"{USER}/three.tasks"
 KEY = "dataset", REPO_ID
@@ -28,9 +26,10 @@ PLAN = CollectionPlan("4,32,90", 4)
 PUSH = """
 import sys
 from pathlib import Path
-from lerobot_deltaco.hub import HubError, push
+from lerobot_deltaco.hub import HubError, create_repository, push
 try:
-    print(push(Path(sys.argv[1]), sys.argv[2], private=sys.argv[3] == "private", branch=sys.argv[4] or None))
+    create_repository(sys.argv[2], private=True)
+    print(push(Path(sys.argv[1]), sys.argv[2]))
 except HubError as error:
     sys.exit(str(error))
 """
@@ -55,10 +54,8 @@ def hub():
         yield hub
 
 
-def run_push(hub, home, root, private="", branch=""):
-    # The card's check goes to a fixed address of the real Hub.
-    program, environment = WITHOUT_CARD_CHECK + PUSH, hub.environment(home)
-    return run_python(program, root, REPO_ID, private, branch, env=environment)
+def run_push(hub, home, root, repo_id=REPO_ID, **options):
+    return run_python(PUSH, root, repo_id, env=hub.environment(home, **options))
 
 
 # The card
@@ -202,45 +199,30 @@ for fetched, kept in zip(dataset, local, strict=True):
 
 
 @pytest.mark.slow
-def test_private_repository_and_branch(copy, tmp_path):
+def test_a_new_repository_is_private_and_tagged(copy, tmp_path):
     with FakeHub() as hub:
-        result = run_push(hub, tmp_path, copy, "private", "draft")
+        result = run_push(hub, tmp_path, copy)
         assert result.returncode == 0, result.stderr
         repo = hub.repos[KEY]
     assert repo.visibility == "private"
-    assert not repo.tags
-    assert not repo.files("main")
-    assert {CARD_FILE, INFO_FILE} <= set(repo.files("draft"))
+    assert {CARD_FILE, INFO_FILE} <= set(repo.files("v3.0"))
 
 
-@pytest.mark.slow
-def test_push_that_the_hub_refuses_is_one_line(copy, tmp_path):
+@pytest.mark.parametrize(
+    ("repo_id", "options", "reason"),
+    [
+        (REPO_ID, {}, "This Hub does not do that"),
+        (REPO_ID, {"token": None}, "HF_TOKEN a token with write access"),
+        ("us er/name", {}, "The repository id is USER/NAME"),
+    ],
+    ids=["refused", "no token", "invalid id"],
+)
+def test_what_cannot_be_pushed_is_one_line(copy, tmp_path, repo_id, options, reason):
     with FakeHub() as hub:
         hub.refused = "POST /api/datasets/.*/commit/"
-        result = run_push(hub, tmp_path, copy)
+        result = run_push(hub, tmp_path, copy, repo_id, **options)
     assert result.returncode == 1
     *_, last = result.stderr.splitlines()
-    assert last.startswith(f"Cannot push to {REPO_ID}: ")
+    assert last.startswith(f"Cannot push to '{repo_id}': ")
+    assert reason in last
     assert last.endswith("A push can be repeated.")
-
-
-def test_invalid_repository_id_is_refused(monkeypatch):
-    monkeypatch.setattr(hub_module, "get_token", lambda: "token")
-    for repo_id in ("", "name", "a/b/c", "user/", "us er/name", "u/na--me", "u/" + 97 * "n"):
-        with pytest.raises(HubError, match=r"must be USER/NAME. Got ") as info:
-            check_push(repo_id)
-        assert repr(repo_id) in str(info.value)
-        assert "\n" not in str(info.value)
-    for repo_id in ("user/name", "a-b/c_d.E1"):
-        check_push(repo_id)
-
-
-def test_push_needs_a_token_and_a_finished_dataset(copy, monkeypatch, tmp_path):
-    monkeypatch.setattr(hub_module, "get_token", lambda: None)
-    with pytest.raises(HubError, match="Set HF_TOKEN to a token with write access"):
-        push(copy, REPO_ID)
-    monkeypatch.setattr(hub_module, "get_token", lambda: "token")
-    (copy / INFO_FILE).unlink()
-    for root in (copy, tmp_path / "missing"):
-        with pytest.raises(HubError, match=f"{root} holds no finished dataset of `deltaco collect`"):
-            push(root, REPO_ID)

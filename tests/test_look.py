@@ -12,6 +12,7 @@ from gym_deltaco.expert import expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import OBJECTS, TASKS, get_task
 from lerobot_deltaco import look as room
+from lerobot_deltaco.arguments import LookArguments
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
 from lerobot_deltaco.look import look
 from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_found, write_video
@@ -129,7 +130,7 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     folder = save_tiny_policy(tmp_path / "policy")
     drawn = []
     monkeypatch.setattr(room, "draw_found", lambda *args: drawn.append(args) or draw_found(*args))
-    report = look(str(folder), str(tmp_path / "data"), 3, tmp_path / "out")
+    report = look(LookArguments(str(folder), str(tmp_path / "data"), 3, tmp_path / "out"))
     text = (tmp_path / "out/index.html").read_text()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["index.html"]
     assert text.count("data:image/jpeg;base64") == 3
@@ -144,7 +145,7 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
 
 
 def test_without_a_dataset_episodes_of_the_benchmark_are_run(tmp_path):
-    look(str(save_tiny_policy(tmp_path / "policy")), episodes=2, out=tmp_path / "out")
+    look(LookArguments(str(save_tiny_policy(tmp_path / "policy")), episodes=2, out=tmp_path / "out"))
     text = (tmp_path / "out/index.html").read_text()
     assert text.count("data:image/jpeg;base64") == text.count("data:video/mp4;base64") == 2
     assert "of 2</b>" in text
@@ -153,7 +154,7 @@ def test_without_a_dataset_episodes_of_the_benchmark_are_run(tmp_path):
 def test_what_does_not_fit_is_an_error_that_says_so(tmp_path):
     folder = save_tiny_policy(tmp_path / "policy")
     with pytest.raises(ValueError, match="`episodes` must be at least 1"):
-        look(str(folder), episodes=0)
+        look(LookArguments(str(folder), episodes=0))
     with pytest.raises(ValueError, match="has no checkpoints"):
         load_conditioned(tmp_path / "nothing")
     features = {"observation.images.top": {"dtype": "image", "shape": (32, 32, 3), "names": ["h", "w", "c"]}}
@@ -164,6 +165,6 @@ def test_what_does_not_fit_is_an_error_that_says_so(tmp_path):
     other.save_episode()
     other.finalize()
     with pytest.raises(ValueError, match=r"needs 'observation.image'.*observation.images.top"):
-        look(str(folder), str(tmp_path / "other"), out=tmp_path / "out")
+        look(LookArguments(str(folder), str(tmp_path / "other"), out=tmp_path / "out"))
     with pytest.raises(FileNotFoundError, match="There is no dataset in"):
-        look(str(folder), str(tmp_path / "nothing"), out=tmp_path / "out")
+        look(LookArguments(str(folder), str(tmp_path / "nothing"), out=tmp_path / "out"))

@@ -74,7 +74,6 @@ def test_steps_beyond_the_end_of_an_episode_do_not_count(gripper_index):
             action,
             is_pad,
             gripper_index,
-            3.0,
             "cross_entropy",
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -115,8 +116,8 @@ def record_demonstration(task_id: int, number: int = 0, scene: SceneConfig = DEF
 
     Args:
         task_id: Index of the task, as in `gym_deltaco.tasks`.
-        number: Number of the demonstration. 0 is the one that the protocol gives: the task's only episode in
-            the dataset `E102`.
+        number: Number of the demonstration. 0 is the one that the protocol gives: the task's first episode
+            for validation.
         scene: Settings of the scene.
 
     Raises:
@@ -135,6 +136,7 @@ def record_demonstration(task_id: int, number: int = 0, scene: SceneConfig = DEF
     raise RuntimeError(f"The expert failed {_MAX_ATTEMPTS} times at: {env.task.instruction}")
 
 
+@dataclass(eq=False)
 class Expert:
     """Policy for one episode that reads the privileged state of the scene.
 
@@ -154,28 +156,24 @@ class Expert:
         is_done: Whether the episode may end before its last step.
     """
 
-    is_done = False
+    env: PickPlaceEnv
+    rng: np.random.Generator
+    noise: float = EXPERT_NOISE
+    target_object: int | None = None
+    target_container: int | None = None
 
-    def __init__(
-        self,
-        env: PickPlaceEnv,
-        rng: np.random.Generator,
-        noise: float = EXPERT_NOISE,
-        target_object: int | None = None,
-        target_container: int | None = None,
-    ) -> None:
-        self._scene = env.scene
-        self._rng = rng
-        self._noise = noise
+    def __post_init__(self) -> None:
+        self._scene = self.env.scene
         layout = self._scene.layout
-        self._target = layout.target_object if target_object is None else target_object
-        self._container = layout.target_container if target_container is None else target_container
+        self._target = layout.target_object if self.target_object is None else self.target_object
+        self._container = layout.target_container if self.target_container is None else self.target_container
         self._grasp_height = layout.objects[self._target].model.grasp_height
         middle = layout.containers[self._container].quadrant.container_center
         spread = _DROP_FRACTION * np.array(CONTAINER_HALF_EXTENTS)
-        self._drop_xy = rng.uniform(middle - spread, middle + spread)
+        self._drop_xy = self.rng.uniform(middle - spread, middle + spread)
         self._rest: NDArray[np.float64] | None = None
         self.stage = Stage.REACH
+        self.is_done = False
 
     def act(self) -> NDArray[np.float32]:
         """Returns the next action, (4,) in [-1, 1], with noise."""
@@ -184,7 +182,7 @@ class Expert:
         motion = np.clip((goal - gripper) / ACTION_SCALE, -1, 1)
         if self.stage is Stage.CARRY:
             motion *= min(1.0, _CARRY_SPEED / np.linalg.norm(motion))
-        motion += self._rng.normal(0, self._noise, 3)
+        motion += self.rng.normal(0, self.noise, 3)
         return np.clip([*motion, command], -1, 1).astype(np.float32)
 
     def _plan(self, gripper: NDArray[np.float64]) -> tuple[Stage, NDArray[np.float64], float]:
@@ -232,26 +230,14 @@ class JointExpert(Expert):
     """The expert with joint control: smooth, at its own speed in each episode, with pauses as people make.
 
     The end effector accelerates and brakes evenly towards the goal of each stage, and stands still while the
-    gripper closes or opens. The joints' targets have correlated noise.
-
-    Args:
-        env: Environment with joint control, already reset.
-        rng: Source of the drop point, the speeds, the pauses and the noise.
-        noise: Standard deviation of the noise on the joints, in units of 0.04 rad.
-        target_object: As for `Expert`.
-        target_container: As for `Expert`.
+    gripper closes or opens. The joints' targets have correlated noise, whose standard deviation is `noise` in
+    units of 0.04 rad.
     """
 
-    def __init__(
-        self,
-        env: PickPlaceEnv,
-        rng: np.random.Generator,
-        noise: float = EXPERT_NOISE,
-        target_object: int | None = None,
-        target_container: int | None = None,
-    ) -> None:
-        super().__init__(env, rng, noise, target_object, target_container)
-        self._step_time = 1 / env.scene_config.interface.fps
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rng = self.rng
+        self._step_time = 1 / self.env.scene_config.interface.fps
         self._speed, self._acceleration, gripper_speed = (
             rng.uniform(*limits) for limits in (_SPEED, _ACCELERATION, _GRIPPER_SPEED)
         )
@@ -279,7 +265,7 @@ class JointExpert(Expert):
         # A pause brakes, too.
         self._move(self._position if is_paused or self._wait else self._goal)
         self._joints = inverse(self._position, near=self._joints)
-        fresh = self._rng.normal(0, self._noise * _JOINT_NOISE, len(self._joints))
+        fresh = self.rng.normal(0, self.noise * _JOINT_NOISE, len(self._joints))
         self._joint_noise = _NOISE_DECAY * self._joint_noise + np.sqrt(1 - _NOISE_DECAY**2) * fresh
         return np.array([*(self._joints + self._joint_noise), self._opening], dtype=np.float32)
 

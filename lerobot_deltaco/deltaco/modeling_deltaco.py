@@ -31,14 +31,7 @@ from lerobot_deltaco.deltaco.demo_encoders import (
 )
 from lerobot_deltaco.demonstrations import Demonstration, DemonstrationBank, sample_frames
 from lerobot_deltaco.language import InstructionEmbeddings
-from lerobot_deltaco.losses import (
-    GRIPPER_LOSSES,
-    contrastive_logits,
-    contrastive_loss,
-    cosine_loss,
-    imitation_loss,
-    join_action,
-)
+from lerobot_deltaco.losses import contrastive_logits, contrastive_loss, cosine_loss
 from lerobot_deltaco.networks import (
     BACKBONES,
     PolicyNetwork,
@@ -66,7 +59,6 @@ class DeltacoPolicy(TaskConditionedPolicy):
     """The paper's policy. See `TaskConditionedPolicy` for its arguments.
 
     Attributes:
-        model: Network that predicts actions.
         demo_encoder: Encoder of demonstrations, or the layers after a frozen one; None without them.
         language_head: Layers after the language encoder; None without them.
     """
@@ -148,12 +140,12 @@ class DeltacoPolicy(TaskConditionedPolicy):
                 language = self._embed_instructions(self._draw_instructions(tasks, generator), images.device)
         if config.method == "mcil":
             # The mean of the losses with the instruction's embedding and with the demonstration's.
-            parts = [self._imitation_loss(batch, images, film, None) for film in (language, demo)]
+            parts = [self._acting_loss(batch, images, film, None) for film in (language, demo)]
             loss = torch.stack([part[0] for part in parts]).mean(dim=0)
             logged = {name: torch.stack([part[1][name] for part in parts]).mean() for name in parts[0][1]}
         else:
             film, concat = self._conditioning_inputs(tasks, demo, language, images.device)
-            loss, logged = self._imitation_loss(batch, images, film, concat)
+            loss, logged = self._acting_loss(batch, images, film, concat)
         if config.conditioning.encoder_loss != "none":
             assert demo is not None
             assert language is not None
@@ -168,23 +160,12 @@ class DeltacoPolicy(TaskConditionedPolicy):
             logged["demo_accuracy"] = (logits.argmax(dim=1) == column).float().mean()
         return loss, logged
 
-    def _imitation_loss(
+    def _acting_loss(
         self, batch: dict[str, Any], images: Tensor, film: Tensor | None, concat: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the imitation loss L_pi (equation 2) of each sample, (batch,), and its parts to log."""
         predicted, gripper = self.model(images, film, self._concatenated(batch, concat))
-        kind = self.config.gripper_loss
-        index, weight = self.config.gripper_index, GRIPPER_LOSSES[kind]
-        return imitation_loss(
-            predicted,
-            gripper,
-            self.model.log_std,
-            batch[ACTION],
-            batch.get(f"{ACTION}_is_pad"),
-            index,
-            weight,
-            kind,
-        )
+        return self._imitation_loss(batch, predicted, gripper, self.config.gripper_loss)
 
     # Acting
 
@@ -196,11 +177,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
             self._start(self._begin_episode(*self._tasks_of(batch), images.device))
         episode: Episode = self._episode
         concat = self._concatenated(batch, episode.concat)
-        predicted, gripper = episode.network(images, episode.film, concat)
-        if gripper is not None:
-            gripper = torch.sigmoid(gripper.float())
-        chunk = join_action(predicted.mode.float(), gripper, self.config.gripper_index)
-        return self._checked_action(chunk, batch)
+        return self._likeliest(batch, *episode.network(images, episode.film, concat))
 
     def _begin_episode(
         self,

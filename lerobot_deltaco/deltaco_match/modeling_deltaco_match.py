@@ -53,7 +53,7 @@ from lerobot_deltaco.deltaco_match.words import (
     vocabulary_of,
 )
 from lerobot_deltaco.demonstrations import DemonstrationBank, RobotData, read_robot_data
-from lerobot_deltaco.losses import GRIPPER_LOSSES, imitation_loss, join_action, location_loss
+from lerobot_deltaco.losses import location_loss
 from lerobot_deltaco.networks import (
     BACKBONES,
     PolicyNetwork,
@@ -120,7 +120,6 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     """The project's own policy. See `TaskConditionedPolicy` for its arguments.
 
     Attributes:
-        model: Network that predicts actions.
         robot_states: The robot's states at locations.
         feature_matching: Finds what to pick, and how high.
         attention: Finds what a demonstration moved, and where it was put.
@@ -221,7 +220,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         noise = torch.randn(len(rows), generator=generator).to(rows.device)
         heights = known.heights[rows] + _HEIGHT_NOISE * noise
         images = change_colors(images, changes)
-        loss, logged = self._imitation_loss(batch, images, locations, heights, generator)
+        loss, logged = self._acting_loss(batch, images, locations, heights, generator)
         # An episode without a grasp has no locations, and teaches nothing.
         loss = torch.where((rows >= 0) & known.found[rows], loss, 0.0)
         loss = loss.index_add(0, some.to(rows.device), len(rows) / n_some * finding.sum(dim=1))
@@ -307,9 +306,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             found = self._find(batch, tasks, self.banked_demonstrations(tasks))
             locations = torch.where(is_known[:, None, None], locations, found.locations)
             heights = torch.where(is_known, heights, found.heights)
-        return self._imitation_loss(batch, self._images(batch), locations, heights)
+        return self._acting_loss(batch, self._images(batch), locations, heights)
 
-    def _imitation_loss(
+    def _acting_loss(
         self,
         batch: dict[str, Any],
         images: Tensor,
@@ -320,16 +319,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """Returns the imitation loss of each sample, (batch,), and its parts to log."""
         concat = self._concatenated(batch, locations, heights, generator)
         predicted, gripper = self.model(images, None, concat, locations)
-        return imitation_loss(
-            predicted,
-            gripper,
-            self.model.log_std,
-            batch[ACTION],
-            batch.get(f"{ACTION}_is_pad"),
-            self.config.gripper_index,
-            GRIPPER_LOSSES[_GRIPPER_LOSS],
-            _GRIPPER_LOSS,
-        )
+        return self._imitation_loss(batch, predicted, gripper, _GRIPPER_LOSS)
 
     # Acting
 
@@ -346,10 +336,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         episode: Episode = self._episode
         locations, heights = episode.found.locations, episode.found.heights
         concat = self._concatenated(batch, locations, heights)
-        predicted, gripper = episode.network(self._images(batch), None, concat, locations)
-        gripper = torch.sigmoid(gripper.float())
-        chunk = join_action(predicted.mode.float(), gripper, self.config.gripper_index)
-        return self._checked_action(chunk, batch)
+        return self._likeliest(batch, *episode.network(self._images(batch), None, concat, locations))
 
     @property
     def found(self) -> Found | None:

@@ -1,0 +1,116 @@
+"""Arguments of the commands whose modules import torch, which their `--help` should not wait for."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from lerobot_deltaco.records import EvaluationPlan
+
+
+@dataclass(frozen=True)
+class EvaluateArguments:
+    """Arguments of `deltaco evaluate`. The defaults are the leaderboard's protocol.
+
+    Args:
+        checkpoint: Output folder of a training run, or folder of a policy.
+        plan: Episodes to run.
+        steps: Checkpoints of a training run to evaluate: all, last, or steps such as 4000,8000.
+        out: Folder of the records; by default, that of the training run, or outputs/evaluate/NAME.
+        processes: Number of processes that share the episodes; by default, one for each core.
+        device: Device of the policy, such as cpu.
+        demo_repo_id: Dataset of demonstrations, in place of the checkpoint's own.
+        demo_root: Folder of that dataset, if it is not in LeRobot's cache.
+        experiment: Name of the policy in tables; by default, the job name of its training run.
+        rename_map: Names under which the policy knows the environment's observations, as JSON.
+    """
+
+    checkpoint: tyro.conf.Positional[Path]
+    plan: Annotated[EvaluationPlan, tyro.conf.arg(name="")] = EvaluationPlan()  # noqa: RUF009
+    steps: str = "all"
+    out: Path | None = None
+    processes: int = len(os.sched_getaffinity(0))
+    device: str | None = None
+    demo_repo_id: str | None = None
+    demo_root: Path | None = None
+    experiment: str | None = None
+    rename_map: str | None = None
+
+
+@dataclass(frozen=True)
+class PolicyOptions:
+    """Options of `deltaco train` on which it depends what is taken from a dataset.
+
+    Args:
+        demo_camera: Name of the camera of demonstrations. By default, the first.
+        gripper: Gripper's dimension of the action: an index, or "auto" for the last one whose name contains
+            "gripper".
+        gripper_closed: Whether low or high values of the gripper's dimension mean closed.
+        image_size: Height and width to which images are scaled, px.
+        chunk_size: Number of steps that the policy predicts at once, on which the time depends; None, as in
+            training, chooses it by the length of the episodes.
+    """
+
+    demo_camera: str | None = None
+    gripper: str = "auto"
+    gripper_closed: str = "low"
+    image_size: int = 48
+    chunk_size: int | None = None
+
+
+@dataclass(frozen=True)
+class CheckArguments:
+    """Arguments of `deltaco check`.
+
+    Args:
+        dataset: Folder of a LeRobotDataset, or its id on the Hugging Face Hub.
+        policy: Options as for `deltaco train`.
+        batch_size: Batch size that the time of training is estimated for.
+        steps: Number of training steps that it is estimated for.
+        episodes: Number of episodes to show; those that are left out come first.
+        out: Folder for the page.
+    """
+
+    dataset: tyro.conf.Positional[str]
+    policy: PolicyOptions = PolicyOptions()
+    batch_size: int = 64
+    steps: int = 8000
+    episodes: int = 48
+    out: Path = Path("outputs/check")
+
+
+@dataclass(frozen=True)
+class LookArguments:
+    """Arguments of `deltaco look`.
+
+    Args:
+        checkpoint: Folder of a policy of the type deltaco_match, or of its training run; or id of a
+            repository on the Hugging Face Hub.
+        dataset: Folder of a LeRobotDataset, or its id on the Hub. Without one, episodes of the benchmark's
+            test tasks are run.
+        episodes: Number of episodes, evenly spread.
+        out: Folder for the page.
+    """
+
+    checkpoint: tyro.conf.Positional[str]
+    dataset: str | None = None
+    episodes: int = 12
+    out: Path = Path("outputs/look")
+
+
+@dataclass(frozen=True)
+class PlayArguments:
+    """Arguments of `deltaco play`.
+
+    Args:
+        checkpoint: Folder of a policy or of a training run, or id of a repository on the Hugging Face Hub. By
+            default, it is the one that comes with the project.
+        port: Port to serve at.
+    """
+
+    checkpoint: tyro.conf.Positional[str | None] = None
+    port: int = 7860
