@@ -28,26 +28,28 @@ def success_steps(job):
     return steps
 
 
-def check_success(ambiguity, task_ids, n_episodes, rate_per_task, rate_by_step_22):
+def steps_of_tasks(ambiguity, task_ids, n_episodes):
+    """Returns `success_steps` of tasks, (tasks, episodes)."""
     jobs = [(ambiguity, task_id, n_episodes) for task_id in task_ids]
     with get_context("spawn").Pool(2) as pool:
-        steps = np.array(pool.map(success_steps, jobs, chunksize=1))  # (tasks, episodes)
-    assert np.isfinite(steps).mean() >= 0.95
-    assert np.median(steps) <= 15
-    assert (steps <= 22).mean() >= rate_by_step_22
-    rates = np.isfinite(steps).mean(axis=1)
-    assert [job for job, rate in zip(jobs, rates, strict=True) if rate < rate_per_task] == []
+        return np.array(pool.map(success_steps, jobs, chunksize=1))
 
 
 @pytest.mark.parametrize(("ambiguity", "task_ids"), [("container", SAMPLE), ("object", SAMPLE[::4])])
 def test_expert_succeeds_in_a_sample_of_tasks(ambiguity, task_ids):
-    check_success(ambiguity, task_ids, 2, rate_per_task=0.5, rate_by_step_22=0.9)
+    steps = steps_of_tasks(ambiguity, task_ids, 1)
+    assert np.isfinite(steps).mean() >= 0.95
+    assert np.median(steps) <= 15
+    assert (steps <= 22).mean() >= 0.9
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ambiguity", AMBIGUITIES)
 def test_expert_succeeds_in_every_task(ambiguity):
-    check_success(ambiguity, range(N_TASKS), 50, rate_per_task=0.85, rate_by_step_22=0.95)
+    steps = steps_of_tasks(ambiguity, range(N_TASKS), 50)
+    assert np.median(steps) <= 15
+    assert (steps <= 22).mean() >= 0.95
+    assert np.isfinite(steps).mean(axis=1).min() >= 0.85
 
 
 def test_stages_come_in_order_and_command_the_gripper():

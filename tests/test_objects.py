@@ -35,8 +35,8 @@ HSV_RANGES = {
 }
 
 
-# A third of the first random objects, which all differ in shape or color
-SOME_RANDOM = range(FIRST_INDEX, FIRST_INDEX + len(COLOR_SHAPE_PAIRS), 3)
+# A fifth of the first random objects, which all differ in shape or color
+SOME_RANDOM = range(FIRST_INDEX, FIRST_INDEX + len(COLOR_SHAPE_PAIRS), 5)
 MODELS = [*range(len(OBJECTS)), *SOME_RANDOM]
 
 

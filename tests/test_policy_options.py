@@ -180,18 +180,6 @@ def test_features_that_do_not_fit_are_errors(config, message):
 # Optimization
 
 
-def test_optimizer_is_adamw_without_decay_by_default():
-    weight, reference = (torch.nn.Parameter(torch.tensor([2.0])) for _ in range(2))
-    config = DeltacoConfig(device="cpu")
-    optimizers = config.get_optimizer_preset().build([weight]), torch.optim.Adam([reference], lr=3e-4)
-    for _ in range(3):
-        for parameter, optimizer in zip((weight, reference), optimizers, strict=True):
-            optimizer.zero_grad()
-            parameter.square().sum().backward()
-            optimizer.step()
-    torch.testing.assert_close(weight, reference)
-
-
 def test_cosine_schedule_warms_up_and_ends_at_zero():
     config = DeltacoMatchConfig(device="cpu", scheduler_warmup_steps=4)
     optimizer = config.get_optimizer_preset().build([torch.nn.Parameter(torch.zeros(1))])

@@ -20,10 +20,8 @@ from small_policies import (
     batch_of,
     demos_of,
     observation,
-    random_moves,
     small_policy,
     with_chunks,
-    write_table,
 )
 
 from lerobot_deltaco.deltaco.configuration_deltaco import METHODS
@@ -52,11 +50,6 @@ VARIANTS = [
 ]
 # Frames that are trained on, of all tasks.
 FRAMES = {"deltaco": [0, 7, 16, 22, 29], "deltaco_match": list(range(0, 20 * TABLE_LENGTH, TABLE_LENGTH + 1))}
-
-
-@pytest.fixture(scope="module")
-def table(tmp_path_factory):
-    return write_table(tmp_path_factory.mktemp("data") / "table", random_moves(24))
 
 
 @pytest.fixture(params=VARIANTS, ids=lambda variant: f"{variant[0]}-{variant[1]}")
