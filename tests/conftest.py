@@ -13,8 +13,8 @@ os.environ.setdefault("WANDB_MODE", "disabled")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-# `small_policies` is imported where it is used: it imports LeRobot, which takes 10 s. Its datasets are written
-# once in a process, and tests that change files change a copy.
+# `small_policies` is imported where it is used: it imports LeRobot, which takes 10 s. A process writes each
+# dataset once, so a test that changes files changes a copy.
 
 
 @pytest.fixture
@@ -36,17 +36,17 @@ def short_fit(monkeypatch):
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory):
     """A small dataset unlike the benchmark's."""
-    from small_policies import write_dataset
+    from small_policies import hold_in_memory, write_dataset
 
-    return write_dataset(tmp_path_factory.mktemp("data") / "foreign")
+    return hold_in_memory(write_dataset(tmp_path_factory.mktemp("data") / "foreign"))
 
 
 @pytest.fixture(scope="session")
 def table(tmp_path_factory):
     """A dataset of 48 episodes of `random_moves`."""
-    from small_policies import random_moves, write_table
+    from small_policies import hold_in_memory, random_moves, write_table
 
-    return write_table(tmp_path_factory.mktemp("data") / "table", random_moves(48))
+    return hold_in_memory(write_table(tmp_path_factory.mktemp("data") / "table", random_moves(48)))
 
 
 @pytest.fixture(scope="session")

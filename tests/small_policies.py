@@ -24,6 +24,7 @@ from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.deltaco_match.words import vocabulary_of
 from lerobot_deltaco.demonstrations import DemonstrationBank
+from lerobot_deltaco.frames import FramesInMemory
 from lerobot_deltaco.recording import load_conditioned
 from lerobot_deltaco.train import train
 
@@ -189,6 +190,20 @@ def collect_benchmark(root):
     return root
 
 
+class SharedFrames(FramesInMemory):
+    """Frames that copies of a policy share."""
+
+    def __deepcopy__(self, _):
+        return self
+
+
+def hold_in_memory(dataset, **options):
+    """Lets policies that are made for a dataset get their training data from memory, which saves a second."""
+    opened = LeRobotDataset(dataset.repo_id, root=dataset.root, **options)
+    dataset.meta.frames_in_memory = SharedFrames(opened)
+    return dataset
+
+
 # Policies
 
 _SMALL = {
@@ -213,6 +228,8 @@ def demos_of(dataset):
 def with_chunks(dataset, config):
     """Returns a dataset whose frames have the actions of a chunk, as a policy's training needs them."""
     windows = resolve_delta_timestamps(config, dataset.meta)
+    if windows is None:
+        return dataset
     return LeRobotDataset(dataset.repo_id, root=dataset.root, delta_timestamps=windows)
 
 

@@ -126,7 +126,7 @@ def test_videos_equal_those_of_lerobot(video_root, seconds):
     dataset = read(video_root, delta_timestamps=windows, video_backend="pyav")
     assert_batches_are_equal(dataset, list(range(2 * LENGTH)))
     # The dataset still gives windows.
-    assert dataset[3]["action"].shape == ((3,) if seconds is None else (2, 3))
+    assert dataset[3]["action"].shape == ((2,) if seconds is None else (2, 2))
 
 
 @pytest.mark.parametrize("n_frames", [2, 3])

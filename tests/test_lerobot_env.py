@@ -6,7 +6,7 @@ import pybullet
 import pytest
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
-from lerobot.envs import EnvConfig, close_envs, env_to_policy_features, make_env, make_env_config
+from lerobot.envs import close_envs, env_to_policy_features, make_env
 from lerobot.policies import PreTrainedPolicy
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from torch import nn
@@ -48,11 +48,6 @@ def roll_out(env, seeds, n_steps=3):
 
 
 # Configuration
-
-
-def test_lerobot_knows_the_type():
-    assert EnvConfig.get_choice_class("deltaco") is DeltacoEnv
-    assert make_env_config("deltaco", task="4,50-73").type == "deltaco"
 
 
 def test_features_are_those_of_datasets_and_of_the_spaces(make_envs):

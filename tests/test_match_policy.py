@@ -21,7 +21,6 @@ from small_policies import (
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.demonstrations import DemonstrationBank
-from lerobot_deltaco.frames import FramesInMemory
 from lerobot_deltaco.normalization import StateLimits
 
 pytestmark = pytest.mark.usefixtures("short_fit")
@@ -31,21 +30,14 @@ MOVES = random_moves(N_EPISODES)  # of `table`
 RED, BLUE = TABLE_TASKS  # the tasks of the even and the odd episodes
 
 
-@pytest.fixture(scope="module")
-def frames(table):
-    return FramesInMemory(table)
-
-
 @pytest.fixture
-def make(table, frames):
+def make(table):
     """Makes a policy that has its training data, with the same weights each time."""
 
     def make(**options):
         torch.manual_seed(0)
         policy, _, _ = small_policy(table, "deltaco_match", **options)
-        policy.set_training_data(
-            frames.demonstrations("observation.image", TABLE_SIZE, 2), frames.robot_data("observation.image")
-        )
+        policy._prepare_training()
         return policy
 
     return make
@@ -148,7 +140,8 @@ def test_too_few_grasps_are_an_error_before_training(table):
         policy(batch_of(table, [0]))
 
 
-def test_greater_values_of_the_gripper_may_mean_closed(make, table, frames, caplog):
+def test_greater_values_of_the_gripper_may_mean_closed(table, caplog):
+    frames = table.meta.frames_in_memory
     bank = frames.demonstrations("observation.image", TABLE_SIZE, 2)
     robot = frames.robot_data("observation.image")
     inverted = robot._replace(actions=robot.actions * torch.tensor([1, 1, -1]))

@@ -114,6 +114,7 @@ def test_rollouts_move_a_robot_by_the_demonstration_of_a_new_task(
         "return_to_initial_position": False,
     }
     monkeypatch.setattr("sys.argv", ["lerobot-rollout", *as_options(options), *task])
+    monkeypatch.setattr("signal.signal", lambda *_: None)  # leave Ctrl+C to pytest
     FakeArm.sent.clear()
     lerobot_rollout.main()
     assert FakeArm.sent

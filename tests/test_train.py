@@ -184,7 +184,7 @@ def test_episodes_and_the_split_are_respected(train, seen, monkeypatch, policy):
 
     monkeypatch.setattr(DeltacoPolicy, "set_training_data", noted)
     split = {"dataset.episodes": "[1,2,3,7,8,9]", "dataset.eval_split": 0.5, "eval_steps": 2}
-    train({**POLICIES[policy], **split}, batch_size=90)
+    train({**POLICIES[policy], **split}, batch_size=30)
     trained, held_back = (
         {index for training, batch in seen if training == wanted for index in batch["episode_index"].tolist()}
         for wanted in (True, False)
@@ -212,24 +212,26 @@ def test_as_many_tasks_are_in_a_batch_as_divide_it(train, seen):
 
 
 @pytest.mark.parametrize("n_after", [0, 3])
-def test_frames_long_after_the_release_are_left_out(train, monkeypatch, n_after):
-    used = []
-    sampler = train_module.TaskBatchSampler
+def test_pauses_and_frames_long_after_the_release_are_left_out(train, monkeypatch, n_after):
+    used, held = [], []
+    sampler, in_memory = train_module.TaskBatchSampler, train_module.FramesInMemory
     monkeypatch.setattr(
         train_module,
         "TaskBatchSampler",
         lambda *arguments, use, **options: used.append(use) or sampler(*arguments, use=use, **options),
     )
-    frames = []
-    held = train_module.FramesInMemory
     monkeypatch.setattr(
-        train_module, "FramesInMemory", lambda *arguments: frames.append(held(*arguments)) or frames[0]
+        train_module, "FramesInMemory", lambda *arguments: held.append(in_memory(*arguments)) or held[0]
     )
-    train({**MATCH, "policy.frames_after_release": n_after}, steps=1)
-    gripper = frames[0].columns["action"][:, 3].reshape(-1, EPISODE_LENGTH)
-    for opening, use in zip(gripper.numpy(), used[0].reshape(-1, EPISODE_LENGTH), strict=True):
+    step = np.arange(EPISODE_LENGTH)
+    monkeypatch.setattr(train_module, "paused_frames", lambda data, fps: np.tile(step == 5, len(data.spans)))
+    train({**MATCH, "policy.frames_after_release": n_after, "policy.chunk_size": 2}, steps=1)
+    actions = held[0].columns["action"]
+    gripper = actions[:, 3].reshape(-1, EPISODE_LENGTH).numpy()
+    for opening, use in zip(gripper, used[0].reshape(-1, EPISODE_LENGTH), strict=True):
         release = np.flatnonzero((opening[1:] > 0) & (opening[:-1] <= 0))[-1] + 1
-        np.testing.assert_array_equal(use, np.arange(EPISODE_LENGTH) <= release + n_after)
+        np.testing.assert_array_equal(use, (step <= release + n_after) & (step != 5))
+    assert torch.equal(held[0].batch([4])["action"][0], actions[[4, 6]])
 
 
 def test_frames_after_the_release_are_as_many_seconds_at_any_rate():
