@@ -23,10 +23,7 @@ from gym_deltaco.scene_config import AMBIGUITIES, SceneConfig
 
 STAY_OPEN = np.array([0, 0, 0, 1], np.float32)
 STAY_CLOSED = np.array([0, 0, 0, -1], np.float32)
-TRAY_FLOOR, CONTAINER_HALF_EXTENTS = -0.37, np.array([0.075, 0.0525])  # m
 SMALL = SceneConfig(image_size=8)
-# A name, a color and a shape; colors and positions
-SOME_TASKS = (4, 82, 146, 295)
 
 
 @pytest.fixture
