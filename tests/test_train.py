@@ -122,9 +122,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(train, tmp_path, seen, name):
             assert len(set(sum(epoch, []))) == 60
 
 
-def test_a_run_does_not_resume_on_other_data(train, root, tmp_path):
+def test_a_run_does_not_resume_on_other_data(train, benchmark, tmp_path):
     saved = train(DELTACO, steps=2) / "000002" / "pretrained_model" / "train_config.json"
-    other = shutil.copytree(root, tmp_path / "other")
+    other = shutil.copytree(benchmark, tmp_path / "other")
     statistics = json.loads((other / "meta" / "stats.json").read_text())
     statistics["observation.state"]["mean"][0] += 0.5
     (other / "meta" / "stats.json").write_text(json.dumps(statistics))
