@@ -13,7 +13,8 @@ os.environ.setdefault("WANDB_MODE", "disabled")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-# Small policies. Their module is imported where it is used: it imports LeRobot, which takes 10 s.
+# `small_policies` is imported where it is used: it imports LeRobot, which takes 10 s. A process writes each
+# dataset once, so a test that changes files changes a copy.
 
 
 @pytest.fixture
@@ -24,12 +25,36 @@ def fake_language(monkeypatch):
     use_fake_encoder(monkeypatch)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
+def short_fit(monkeypatch):
+    """Fits feature matching in two steps to colors, where what it learns does not matter."""
+    from small_policies import use_short_fit
+
+    use_short_fit(monkeypatch)
+
+
+@pytest.fixture(scope="session")
 def dataset(tmp_path_factory):
     """A small dataset unlike the benchmark's."""
-    from small_policies import write_dataset
+    from small_policies import hold_in_memory, write_dataset
 
-    return write_dataset(tmp_path_factory.mktemp("data") / "foreign")
+    return hold_in_memory(write_dataset(tmp_path_factory.mktemp("data") / "foreign"))
+
+
+@pytest.fixture(scope="session")
+def table(tmp_path_factory):
+    """A dataset of 48 episodes of `random_moves`."""
+    from small_policies import hold_in_memory, random_moves, write_table
+
+    return hold_in_memory(write_table(tmp_path_factory.mktemp("data") / "table", random_moves(48)))
+
+
+@pytest.fixture(scope="session")
+def benchmark(tmp_path_factory):
+    """The folder of a small dataset of the benchmark."""
+    from small_policies import collect_benchmark
+
+    return collect_benchmark(tmp_path_factory.mktemp("data") / "small")
 
 
 @pytest.fixture
@@ -38,11 +63,3 @@ def make(dataset):
     from small_policies import small_policy
 
     return functools.partial(small_policy, dataset)
-
-
-@pytest.fixture
-def short_fit(monkeypatch):
-    """Fits feature matching in two steps to colors, where what it learns does not matter."""
-    from small_policies import use_short_fit
-
-    use_short_fit(monkeypatch)

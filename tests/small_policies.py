@@ -1,40 +1,34 @@
-"""Small datasets unlike the benchmark's, small policies, and fake encoders of sentences and images."""
+"""Small datasets, policies and trainings in this process, with fake encoders of sentences and images."""
 
 import hashlib
+import sys
 
 import numpy as np
+import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+from lerobot.scripts import lerobot_train
 from torch.utils.data import default_collate
 
-import lerobot_policy_deltaco  # noqa: F401  (registers the policies)
+import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
+from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
 from lerobot_deltaco import language
-from lerobot_deltaco.deltaco import modeling_deltaco
+from lerobot_deltaco.collect import CollectionPlan, collect
 from lerobot_deltaco.deltaco_match import feature_matching
+from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops
-from lerobot_deltaco.vision import VISION_ENCODERS
+from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.deltaco_match.words import vocabulary_of
+from lerobot_deltaco.demonstrations import DemonstrationBank
+from lerobot_deltaco.frames import FramesInMemory
+from lerobot_deltaco.recording import load_conditioned
+from lerobot_deltaco.train import train
 
-# A dataset with two cameras and a gripper in the middle of the action.
-REPO_ID = "test/foreign"
-TASKS = ["stack the cups", "pour the tea", "wave"]
-EPISODES_PER_TASK = {"stack the cups": 3, "pour the tea": 2, "wave": 1}
-EPISODES = [task for task in TASKS for _ in range(EPISODES_PER_TASK[task])]
-LENGTH = 5
-ACTION_NAMES = ["left.pos", "left_gripper.pos", "right.pos"]
-
-# A dataset of a table with two objects, of which one is moved.
-TABLE_ID = "test/table"
-TABLE_SIZE, TABLE_LENGTH = 24, 7
-TABLE_TASKS = ["move the red object left", "move the blue object right"]
-COLORS = {TABLE_TASKS[0]: (230, 40, 30), TABLE_TASKS[1]: (30, 60, 220)}
-GRIPPER = (1, 1, -1, -1, -1, 1, 1)  # in the frames of an episode; -1 is closed
-
-_SMALL = {
-    "deltaco": {"image_size": 16, "backbone": "strided"},
-    "deltaco_match": {"image_size": TABLE_SIZE, "num_mixture_components": 2, "dtype": "float32"},
-}
+# Fake encoders
 
 
 def fake_encoder(name):
@@ -50,27 +44,14 @@ def fake_encoder(name):
     return encode
 
 
+fake_encoder.calls = []
+
+
 def use_fake_encoder(monkeypatch):
     """Replaces all language encoders by the fake one."""
     fake_encoder.calls = []
     monkeypatch.setattr(language, "load_language_encoder", fake_encoder)
     torch.manual_seed(0)
-
-
-class FakeVisionEncoder:
-    """Features that are linear in the means of an image's colors, as many as those of the real encoder."""
-
-    def __init__(self, name, *_):
-        self.feature_dim = VISION_ENCODERS[name].feature_dim
-        self.weights = torch.randn(3, self.feature_dim, generator=torch.Generator().manual_seed(0))
-
-    def __call__(self, images):
-        return images.mean(dim=(2, 3)) @ self.weights
-
-
-def use_fake_vision_encoder(monkeypatch):
-    """Replaces all frozen image encoders by the fake one."""
-    monkeypatch.setattr(modeling_deltaco, "load_vision_encoder", FakeVisionEncoder)
 
 
 def use_short_fit(monkeypatch, steps=2):
@@ -85,30 +66,73 @@ def use_short_fit(monkeypatch, steps=2):
     monkeypatch.setattr(feature_matching.FeatureMatching.fit, "__defaults__", (steps,))
 
 
-def write_dataset(root, episodes=EPISODES):
-    """Writes an episode for each task named; its frames have its number as a shade of gray."""
-    features = {
-        "observation.images.top": _image_feature((20, 28, 3)),
-        "observation.images.wrist": _image_feature((24, 24, 3)),
-        "observation.state": {"dtype": "float32", "shape": (2,), "names": ["a", "b"]},
-        "action": {"dtype": "float32", "shape": (3,), "names": ACTION_NAMES},
-    }
-    rng = np.random.default_rng(0)
-    dataset = LeRobotDataset.create(REPO_ID, 10, features, root=root, use_videos=False)
-    for number, task in enumerate(episodes):
-        for step in range(LENGTH):
-            dataset.add_frame(
-                {
-                    "observation.images.top": np.full((20, 28, 3), (10 * number + step) % 256, np.uint8),
-                    "observation.images.wrist": rng.integers(0, 255, (24, 24, 3), dtype=np.uint8),
-                    "observation.state": rng.normal(size=2).astype(np.float32),
-                    "action": np.array([rng.uniform(-5, 5), step % 2, rng.uniform(100, 200)], np.float32),
-                    "task": task,
-                }
-            )
+# Datasets
+
+
+def write_episodes(root, repo_id, episodes, fps=10, video=False, **names):
+    """Writes a dataset.
+
+    Args:
+        root: Its folder.
+        repo_id: Its name.
+        episodes: (task, frames) of each episode; the values of the first frame tell the features.
+        fps: Frames per second.
+        video: Whether images are stored as videos.
+        names: Names of a feature's dimensions, by feature.
+
+    Returns:
+        The dataset, opened.
+    """
+
+    def feature(name, value):
+        if isinstance(value, str):
+            return {"dtype": "string", "shape": (1,), "names": None}
+        if value.ndim == 3:
+            image_names = ["height", "width", "channels"]
+            return {"dtype": "video" if video else "image", "shape": value.shape, "names": image_names}
+        return {"dtype": str(value.dtype), "shape": value.shape, "names": names.get(name)}
+
+    features = {name: feature(name, value) for name, value in episodes[0][1][0].items()}
+    encoder = RGBEncoderConfig(vcodec="h264") if video else None
+    dataset = LeRobotDataset.create(repo_id, fps, features, root=root, use_videos=video, rgb_encoder=encoder)
+    for task, frames in episodes:
+        for frame in frames:
+            dataset.add_frame({**frame, "task": task})
         dataset.save_episode()
     dataset.finalize()
-    return LeRobotDataset(REPO_ID, root=root)
+    return LeRobotDataset(repo_id, root=root)
+
+
+# A dataset with two cameras and a gripper in the middle of the action.
+REPO_ID = "test/foreign"
+TASKS = ["stack the cups", "pour the tea", "wave"]
+EPISODES = ["stack the cups"] * 3 + ["pour the tea"] * 2 + ["wave"]
+LENGTH = 5
+
+
+def write_dataset(root, episodes=EPISODES, cameras=("top", "wrist"), **options):
+    """Writes an episode for each task named; the first camera shows its number as a shade of gray."""
+    rng = np.random.default_rng(0)
+    first, second = (f"observation.images.{camera}" for camera in cameras)
+
+    def frame(number, step):
+        return {
+            first: np.full((20, 28, 3), (10 * number + step) % 256, np.uint8),
+            second: rng.integers(0, 255, (24, 24, 3), dtype=np.uint8),
+            "observation.state": rng.normal(size=2).astype(np.float32),
+            "action": np.array([rng.uniform(-5, 5), step % 2, rng.uniform(100, 200)], np.float32),
+        }
+
+    frames = [(task, [frame(number, step) for step in range(LENGTH)]) for number, task in enumerate(episodes)]
+    names = {"observation.state": ["a", "b"], "action": ["left.pos", "left_gripper.pos", "right.pos"]}
+    return write_episodes(root, REPO_ID, frames, **names, **options)
+
+
+# A dataset of a table with two objects, of which one is moved.
+TABLE_SIZE, TABLE_LENGTH = 24, 7
+TABLE_TASKS = ["move the red object left", "move the blue object right"]
+COLORS = {TABLE_TASKS[0]: (230, 40, 30), TABLE_TASKS[1]: (30, 60, 220)}
+GRIPPER = (1, 1, -1, -1, -1, 1, 1)  # in the frames of an episode; -1 is closed
 
 
 def random_moves(n_episodes, tasks=TABLE_TASKS):
@@ -141,31 +165,51 @@ def state_at(location):
 
 def write_table(root, episodes, n_joints=3):
     """Writes episodes of `random_moves`: grasped in frame 3, released in frame 5."""
-    features = {
-        "observation.image": _image_feature((TABLE_SIZE, TABLE_SIZE, 3)),
-        "observation.state": {"dtype": "float32", "shape": (n_joints,), "names": list("abcde"[:n_joints])},
-        "action": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "gripper"]},
-    }
-    dataset = LeRobotDataset.create(TABLE_ID, 10, features, root=root, use_videos=False)
     home = np.zeros(2)
-    for task, start, other, end in episodes:
-        for step in range(TABLE_LENGTH):
-            location = (home, start, start, start, end, end, home)[step]
-            dataset.add_frame(
-                {
-                    "observation.image": draw_table(task, start if step < 4 else end, other),
-                    "observation.state": np.resize(state_at(location), n_joints),
-                    "action": np.array([*(location - home), GRIPPER[step]], np.float32),
-                    "task": task,
-                }
-            )
-        dataset.save_episode()
-    dataset.finalize()
-    return LeRobotDataset(TABLE_ID, root=root)
+
+    def frame(step, task, start, other, end):
+        location = (home, start, start, start, end, end, home)[step]
+        return {
+            "observation.image": draw_table(task, start if step < 4 else end, other),
+            "observation.state": np.resize(state_at(location), n_joints),
+            "action": np.array([*(location - home), GRIPPER[step]], np.float32),
+        }
+
+    frames = [(move[0], [frame(step, *move) for step in range(TABLE_LENGTH)]) for move in episodes]
+    names = {"observation.state": list("abcde"[:n_joints]), "action": ["a", "b", "gripper"]}
+    return write_episodes(root, "test/table", frames, **names)
 
 
-def _image_feature(shape):
-    return {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+# A dataset of the benchmark: tasks by name, color and shape. `deltaco_match` needs 24 episodes.
+TASK_IDS = (4, 14, 55, 90)
+
+
+def collect_benchmark(root):
+    """Collects six episodes of each of the tasks `TASK_IDS`."""
+    collect(root, CollectionPlan(",".join(map(str, TASK_IDS)), 6))
+    return root
+
+
+class SharedFrames(FramesInMemory):
+    """Frames that copies of a policy share."""
+
+    def __deepcopy__(self, _):
+        return self
+
+
+def hold_in_memory(dataset, **options):
+    """Lets policies that are made for a dataset get their training data from memory, which saves a second."""
+    opened = LeRobotDataset(dataset.repo_id, root=dataset.root, **options)
+    dataset.meta.frames_in_memory = SharedFrames(opened)
+    return dataset
+
+
+# Policies
+
+_SMALL = {
+    "deltaco": {"image_size": 16, "backbone": "strided"},
+    "deltaco_match": {"image_size": TABLE_SIZE, "num_mixture_components": 2, "dtype": "float32"},
+}
 
 
 def small_policy(dataset, policy_type="deltaco", **options):
@@ -184,11 +228,13 @@ def demos_of(dataset):
 def with_chunks(dataset, config):
     """Returns a dataset whose frames have the actions of a chunk, as a policy's training needs them."""
     windows = resolve_delta_timestamps(config, dataset.meta)
+    if windows is None:
+        return dataset
     return LeRobotDataset(dataset.repo_id, root=dataset.root, delta_timestamps=windows)
 
 
 def batch_of(dataset, indices):
-    """Returns frames of a dataset as a batch."""
+    """Returns the batch that LeRobot's data loader makes of some frames."""
     return default_collate([dataset[index] for index in indices])
 
 
@@ -197,3 +243,109 @@ def observation(dataset, tasks):
     batch = batch_of(dataset, [0] * len(tasks))
     kept = {key: value for key, value in batch.items() if key.startswith("observation.")}
     return {**kept, "task": list(tasks)}
+
+
+# Benchmark tasks of which the untrained policy has a demonstration, and sentences whose words it knows.
+DEMONSTRATED = (4, 26)
+SENTENCES = (
+    *(task.instruction for task in BENCHMARK_TASKS),
+    "Put it in the green bin.",
+    "Put it in the red bin.",
+    "wave at me",
+    "",
+    "put the blue mug into the red one",
+)
+
+
+def save_tiny_policy(folder, **options):
+    """Saves an untrained `deltaco_match` for the benchmark with its processors, and returns the folder."""
+    torch.manual_seed(0)
+    config = DeltacoMatchConfig(
+        device="cpu",
+        known_words=vocabulary_of(SENTENCES),
+        gripper="3",
+        input_features={
+            "observation.image": PolicyFeature(FeatureType.VISUAL, (3, 48, 48)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (10,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
+        **options,
+    )
+    stats = {"observation.state": {"mean": torch.zeros(10), "std": torch.ones(10)}}
+    policy = DeltacoMatchPolicy(config, stats).eval()
+    frames = torch.randint(0, 256, (len(DEMONSTRATED), 2, 3, 48, 48), dtype=torch.uint8)
+    tasks = [BENCHMARK_TASKS[task_id].instruction for task_id in DEMONSTRATED]
+    policy.demonstrations = DemonstrationBank(frames, tasks, range(len(tasks)), DEMONSTRATED)
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(config, dataset_stats=stats):
+        processor.save_pretrained(folder)
+    return folder
+
+
+def load_tiny_policy(folder, **options):
+    return load_conditioned(save_tiny_policy(folder / "tiny", **options))
+
+
+# Trainings
+
+DELTACO = {"policy.type": "deltaco", "policy.backbone": "strided", "policy.tasks_per_batch": 2}
+MATCH = {
+    "policy.type": "deltaco_match",
+    "policy.tasks_per_batch": 2,
+    # accelerate keeps its precision for the whole process.
+    "policy.dtype": "float32",
+}
+ACT = {
+    "policy.type": "act",
+    "policy.dim_model": 16,
+    "policy.n_heads": 2,
+    "policy.dim_feedforward": 16,
+    "policy.n_encoder_layers": 1,
+    "policy.n_vae_encoder_layers": 1,
+    "policy.chunk_size": 5,
+    "policy.n_action_steps": 5,
+    "policy.pretrained_backbone_weights": "null",
+    "policy.push_to_hub": False,
+}
+POLICIES = {"deltaco": DELTACO, "deltaco_match": MATCH, "act": ACT}
+
+
+def run_training(root, folder, options, in_memory=True, **more):
+    """Trains in this process, since a new one takes seconds to import LeRobot.
+
+    Args:
+        root: Folder of the dataset.
+        folder: Output folder.
+        options: Options of the policy.
+        in_memory: Whether as `deltaco train`, or as `lerobot-train`.
+        more: More options, with two underscores for a dot.
+
+    Returns:
+        The folder of the checkpoints.
+    """
+    arguments = {
+        "policy.device": "cpu",
+        "dataset.repo_id": "test/small",
+        "dataset.root": root,
+        "batch_size": 6,
+        "steps": 4,
+        "save_freq": 2,
+        "log_freq": 1,
+        "num_workers": 0,
+        "output_dir": folder,
+        **options,
+        **{name.replace("__", "."): value for name, value in more.items()},
+    }
+    if "resume" in arguments:
+        arguments = {"output_dir": folder, **more}
+    with pytest.MonkeyPatch.context() as patch:
+        use_fake_encoder(patch)
+        use_short_fit(patch)
+        patch.setattr(sys, "argv", ["train", *as_options(arguments)])
+        train() if in_memory else lerobot_train.main()
+    return folder / "checkpoints"
+
+
+def as_options(values):
+    """Returns options of a command of LeRobot, by their names without dashes."""
+    return [f"--{k}={str(v).lower() if isinstance(v, bool) else v}" for k, v in values.items()]

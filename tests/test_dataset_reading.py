@@ -10,9 +10,15 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy_config
-from small_policies import EPISODES, LENGTH, small_policy, use_fake_encoder, write_dataset
-from tiny_runs import DELTACO, run_training
-from tiny_runs import write_dataset as write_random
+from small_policies import (
+    DELTACO,
+    EPISODES,
+    batch_of,
+    run_training,
+    small_policy,
+    use_fake_encoder,
+    write_dataset,
+)
 
 from lerobot_deltaco import language
 from lerobot_deltaco.base_config import check_image_shapes, dimension_names
@@ -25,16 +31,9 @@ TOP = "observation.images.top"
 DATA, TABLE = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 
 
-@pytest.fixture(scope="module")
-def intact(tmp_path_factory):
-    root = tmp_path_factory.mktemp("data") / "intact"
-    write_dataset(root)
-    return root
-
-
 @pytest.fixture
-def root(intact, tmp_path):
-    return shutil.copytree(intact, tmp_path / "copy")
+def root(dataset, tmp_path):
+    return shutil.copytree(dataset.root, tmp_path / "copy")
 
 
 def change(path, name, change_values):
@@ -206,8 +205,7 @@ def test_the_gripper_that_moves_is_chosen(stds, index, caplog):
 )
 def test_instructions_that_the_policy_cannot_tell_apart(tmp_path, monkeypatch, caplog, policy, tasks):
     use_fake_encoder(monkeypatch)
-    write_random(tmp_path / "data", tasks, 5, {"top": (16, 16)})
-    dataset = LeRobotDataset("test/small", root=tmp_path / "data")
+    dataset = write_dataset(tmp_path / "data", tasks)
     if policy == "deltaco":
         same = torch.nn.functional.normalize(torch.ones(384), dim=0)
         encode = {"wave": same, "dance": same, "sing": -same}
@@ -218,7 +216,7 @@ def test_instructions_that_the_policy_cannot_tell_apart(tmp_path, monkeypatch, c
         )
         made, before, _ = small_policy(dataset, "deltaco", method="language_only")
         for _ in range(2):
-            made(before(torch.utils.data.default_collate([dataset[0], dataset[5]])))
+            made(before(batch_of(dataset, [0, 5])))
         expected = "2 of 3 tasks from others by their instructions, such as 'wave' and 'dance'"
     else:
         small_policy(dataset, policy)
@@ -255,7 +253,7 @@ def test_only_the_chosen_episodes_are_needed(root, tmp_path, monkeypatch, in_mem
 @pytest.mark.parametrize("in_memory", [True, False])
 def test_fine_tuning_honors_the_rename_map(root, tmp_path, monkeypatch, in_memory):
     first = run_training(root, tmp_path / "first", {**DELTACO, "policy.demo_encoder": "attention"}, steps=2)
-    other = write_random(tmp_path / "other", EPISODES, LENGTH, {"front": (20, 28), "hand": (24, 24)})
+    other = write_dataset(tmp_path / "other", EPISODES, ("front", "hand")).root
     banks = banks_of(monkeypatch)
     names = {"observation.images.front": TOP, "observation.images.hand": "observation.images.wrist"}
     options = {
@@ -270,11 +268,10 @@ def test_fine_tuning_honors_the_rename_map(root, tmp_path, monkeypatch, in_memor
     assert torch.equal(banks[0].frames, expected.frames)
 
 
-def test_demonstrations_in_other_units_are_warned_of(root, intact, monkeypatch, caplog):
+def test_demonstrations_in_other_units_are_warned_of(root, dataset, monkeypatch, caplog):
     use_fake_encoder(monkeypatch)
     demos = {"demo_repo_id": "test/shown", "demo_root": str(root), "demo_encoder": "attention"}
-    training = LeRobotDataset("test/foreign", root=intact)
-    small_policy(training, "deltaco", **demos)
+    small_policy(dataset, "deltaco", **demos)
     assert not [record for record in caplog.records if record.name.startswith("lerobot_deltaco")]
     stats = json.loads((root / "meta/stats.json").read_text())
     for name, values in stats["action"].items():
@@ -282,11 +279,11 @@ def test_demonstrations_in_other_units_are_warned_of(root, intact, monkeypatch, 
             values[2] *= 57.3
     (root / "meta/stats.json").write_text(json.dumps(stats))
     change(root / DATA, "action", lambda rows: [row.__setitem__(2, row[2] * 57.3) for row in rows])
-    small_policy(training, "deltaco", **demos)
+    small_policy(dataset, "deltaco", **demos)
     assert "`action` does not fit: its dimension 2 is between" in caplog.text
     caplog.clear()
     info = json.loads((root / "meta/info.json").read_text())
     info["features"]["action"]["names"] = ["a", "b_gripper", "c"]
     (root / "meta/info.json").write_text(json.dumps(info))
-    small_policy(training, "deltaco", **demos)
+    small_policy(dataset, "deltaco", **demos)
     assert "but ['a', 'b_gripper', 'c'] in the demonstrations in test/shown" in caplog.text

@@ -136,22 +136,13 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("path", PAGES, ids=page_name)
 def test_the_commands_of_a_page_parse(path, monkeypatch):
+    mistakes = {}
     for words in commands(path):
         try:
             check(words, monkeypatch)
         except (SystemExit, Exception) as error:
-            pytest.fail(f"{shlex.join(words)}: {error}")
-
-
-def test_mistakes_in_commands_are_found(monkeypatch):
-    for command in (
-        "deltaco collect --tasks 4 --episode-number 3 --root data",
-        "deltaco experiment scenario_a/nothing",
-        "deltaco train --policy.type=deltaco_match --policy.colour=1 --dataset.repo_id=USER/NAME",
-        "make nothing",
-    ):
-        with pytest.raises((SystemExit, Exception)):
-            check(shlex.split(command), monkeypatch)
+            mistakes[shlex.join(words)] = str(error)
+    assert mistakes == {}
 
 
 def test_the_quick_start_lists_every_command():

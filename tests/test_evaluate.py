@@ -16,7 +16,7 @@ import torch
 from gymnasium.utils import seeding
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.scripts import lerobot_eval
-from tiny_runs import ACT, DELTACO, TASK_IDS, collect_benchmark, fake_language_encoder, run_training
+from small_policies import ACT, DELTACO, TASK_IDS, as_options, run_training, use_fake_encoder
 
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import Expert
@@ -24,12 +24,11 @@ from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task
-from lerobot_deltaco import cli, language
+from lerobot_deltaco import cli
 from lerobot_deltaco import evaluate as evaluate_module
 from lerobot_deltaco.arguments import EvaluateArguments
 from lerobot_deltaco.base_policy import TaskConditionedPolicy
 from lerobot_deltaco.checkpoints import find_checkpoints, load_policy
-from lerobot_deltaco.collect import CollectionPlan, collect
 from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.episodes import draw_episodes
 from lerobot_deltaco.evaluate import Evaluation, evaluate_checkpoints, run_evaluation
@@ -41,28 +40,24 @@ CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "pick_place"
 TEST_TASKS = "24,35"
 # For what is decided before the first step: an episode of two steps takes a tenth of the time.
 SHORT = SceneConfig(episode_length=2)
+BRIEFLY = "--scene.episode-length", SHORT.episode_length, "--processes", 1
 short_plan = partial(EvaluationPlan, scene=SHORT)
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    return collect_benchmark(tmp_path_factory.mktemp("data") / "small")
-
-
-@pytest.fixture(scope="module")
-def run(root):
+def run(benchmark, tmp_path_factory):
     """A training of two steps with a checkpoint of each."""
-    demos = {"policy.demo_repo_id": "test/small", "policy.demo_root": root}
-    folder = root.parent / "deltaco"
-    run_training(root, folder, {**DELTACO, **demos}, steps=2, save_freq=1, job_name="small/deltaco", seed=7)
+    folder = tmp_path_factory.mktemp("run") / "deltaco"
+    options = {**DELTACO, "policy.demo_repo_id": "test/small", "policy.demo_root": benchmark}
+    run_training(benchmark, folder, options, steps=2, save_freq=1, job_name="small/deltaco", seed=7)
     return folder
 
 
 @pytest.fixture(scope="module")
-def act_run(root):
-    folder = root.parent / "act"
-    run_training(root, folder, ACT, steps=1, save_freq=1, job_name="small/act")
-    return folder
+def act_checkpoint(benchmark, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run") / "act"
+    run_training(benchmark, folder, ACT, steps=1, save_freq=1, job_name="small/act")
+    return find_checkpoints(folder)[-1].folder
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +73,7 @@ def shipped():
 def run_command(*arguments):
     """Runs `deltaco evaluate` in this process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(language, "load_language_encoder", fake_language_encoder)
+        use_fake_encoder(patch)
         patch.setattr(sys, "argv", ["deltaco", "evaluate", *map(str, arguments)])
         cli.main()
 
@@ -101,12 +96,7 @@ def as_numbers(outcomes):
 def test_scenes_are_those_of_the_plan(loaded):
     plan = EvaluationPlan("4,14", trials=2, seed=3, scene=SceneConfig("object", episode_length=2))
     found = outcomes_of(loaded, plan)
-    assert [(each.episode.task_id, each.episode.trial) for each in found] == [
-        (4, 0),
-        (4, 1),
-        (14, 0),
-        (14, 1),
-    ]
+    assert [each.episode[:2] for each in found] == [(4, 0), (4, 1), (14, 0), (14, 1)]
     env = PickPlaceEnv(scene=plan.scene)
     for each in found:
         task_id, trial = each.episode[:2]
@@ -118,29 +108,23 @@ def test_scenes_are_those_of_the_plan(loaded):
     env.close()
 
 
-@pytest.mark.parametrize("n_processes", [1, 2])
-def test_outcomes_depend_neither_on_batches_nor_on_processes(shipped, monkeypatch, n_processes):
-    plan = EvaluationPlan(TEST_TASKS, trials=3)
-    expected = outcomes_of(shipped, plan)
+def test_outcomes_depend_neither_on_batches_nor_on_processes(shipped, monkeypatch):
+    plan = EvaluationPlan(TEST_TASKS, trials=2)
+    alone = Evaluation(shipped, plan)
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluate_module, "_MIN_BATCHES", 1)
+        together = Evaluation(shipped, plan)
+    assert (len(together.batches), len(alone.batches)) == (1, 4)
+    expected = run_evaluation(together)
     assert any(each.info["is_success"] for each in expected)
-    if n_processes == 1:
-        monkeypatch.setattr(evaluate_module, "_MAX_BATCH", 1)
-        evaluation = Evaluation(shipped, plan)
-        assert len(evaluation.batches) == 6
-        found = [each for number in reversed(range(6)) for each in evaluation.run(number)]
-        found.sort(key=lambda each: each.episode[:2])
-    else:
-        found = outcomes_of(shipped, plan, 2)
-    assert as_numbers(found) == as_numbers(expected)
+    assert as_numbers(run_evaluation(alone, 2)) == as_numbers(expected)
 
 
-@pytest.mark.parametrize(("checkpoint", "batch_size"), [("shipped", 2), ("deltaco", 1), ("act", 2)])
+@pytest.mark.parametrize(("policy", "batch_size", "scene"), [("match", 2, SceneConfig()), ("act", 1, SHORT)])
 def test_lerobot_eval_has_the_same_scenes_and_successes(
-    run, act_run, tmp_path, monkeypatch, checkpoint, batch_size
+    act_checkpoint, tmp_path, monkeypatch, policy, batch_size, scene
 ):
-    runs = {"deltaco": run, "act": act_run}
-    folder = find_checkpoints(runs[checkpoint])[-1].folder if checkpoint in runs else CHECKPOINT
-    tasks = TEST_TASKS if checkpoint == "shipped" else "4,90"
+    folder = {"act": act_checkpoint, "match": CHECKPOINT}[policy]
     seen = []
     reset = PickPlaceEnv.reset
 
@@ -150,23 +134,22 @@ def test_lerobot_eval_has_the_same_scenes_and_successes(
         return observation, info
 
     monkeypatch.setattr(PickPlaceEnv, "reset", noted)
-    words = {
+    options = {
         "policy.path": folder,
         "policy.device": "cpu",
         "env.type": "deltaco",
-        "env.task": tasks,
+        "env.task": TEST_TASKS,
         "env.render_size": 16,
+        "env.scene.episode_length": scene.episode_length,
         "eval.n_episodes": 2,
         "eval.batch_size": batch_size,
         "output_dir": tmp_path,
     }
-    monkeypatch.setattr(
-        sys, "argv", ["lerobot-eval", *(f"--{name}={value}" for name, value in words.items())]
-    )
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *as_options(options)])
     lerobot_eval.main()
     scenes = set(seen)
     seen.clear()
-    plan = EvaluationPlan(tasks, trials=2)
+    plan = EvaluationPlan(TEST_TASKS, trials=2, scene=scene)
     evaluate_checkpoints(EvaluateArguments(folder, plan, out=tmp_path, processes=1, device="cpu"))
     assert scenes == set(seen)
     (record,) = read_records(tmp_path)
@@ -232,12 +215,11 @@ def test_the_trials_of_a_task_use_its_demonstrations_in_turn(loaded, given):
     assert all(tasks == [instruction] for instruction, tasks in given)
 
 
-def test_several_demonstrations_are_combined(shipped, tmp_path, given):
-    demos = tmp_path / "demos"
-    collect(demos, CollectionPlan("24", 5))
-    policy = load_policy(CHECKPOINT, ["--device=cpu", "--demo_repo_id=test/demos", f"--demo_root={demos}"])
-    found = outcomes_of(policy, short_plan("24", trials=2, n_demonstrations=3))
-    assert [each.demonstration_episodes for each in found] == [[0, 1, 2], [3, 4, 0]]
+def test_several_demonstrations_are_combined(shipped, benchmark):
+    demos = ["--demo_repo_id=test/demos", f"--demo_root={benchmark}"]
+    policy = load_policy(CHECKPOINT, ["--device=cpu", *demos])
+    found = outcomes_of(policy, short_plan("4", trials=2, n_demonstrations=4))
+    assert [each.demonstration_episodes for each in found] == [[0, 1, 2, 3], [4, 5, 0, 1]]
     with pytest.raises(ValueError, match="`n_demonstrations` is 3, but the task .* has 1"):
         Evaluation(shipped, short_plan("24", n_demonstrations=3))
 
@@ -306,14 +288,10 @@ def test_sentences_of_people_are_used_in_turn(shipped, tmp_path, given):
     assert [instruction for instruction, _ in given] == ["putt it in teh box"] * 2
 
 
-def test_mcil_takes_the_instruction_and_the_demonstration_in_turn(root, given):
-    options = {
-        **DELTACO,
-        "policy.method": "mcil",
-        "policy.demo_repo_id": "test/small",
-        "policy.demo_root": root,
-    }
-    checkpoints = run_training(root, root.parent / "mcil", options, steps=1, save_freq=1)
+def test_mcil_takes_the_instruction_and_the_demonstration_in_turn(benchmark, tmp_path, given):
+    demos = {"policy.demo_repo_id": "test/small", "policy.demo_root": benchmark}
+    options = {**DELTACO, "policy.method": "mcil", **demos}
+    checkpoints = run_training(benchmark, tmp_path / "mcil", options, steps=1, save_freq=1)
     policy = load_policy(checkpoints / "000001" / "pretrained_model")
     outcomes_of(policy, short_plan("4", trials=2))
     task = get_task(4).instruction
@@ -324,13 +302,13 @@ def test_mcil_takes_the_instruction_and_the_demonstration_in_turn(root, given):
 
 
 def test_the_command_records_each_checkpoint_once(run, tmp_path, capsys, monkeypatch):
-    arguments = [run, "--tasks", "4,14", "--trials", 1, "--out", tmp_path, "--processes", 1]
+    arguments = [run, "--tasks", "4,14", "--trials", 1, "--out", tmp_path, *BRIEFLY]
     run_command(*arguments)
     records = read_records(tmp_path)
     assert [record.step for record in records] == [1, 2]
     record = records[-1]
     assert (record.experiment, record.policy_type, record.train_seed) == ("small/deltaco", "deltaco", 7)
-    assert record.plan == EvaluationPlan("4,14", trials=1)
+    assert record.plan == short_plan("4,14", trials=1)
     assert (record.wording, record.demonstrations) == ("templates", None)
     assert record.versions["benchmark"] == "gym_deltaco/PickPlace-v0"
     assert record.command.startswith("deltaco evaluate ")
@@ -345,9 +323,9 @@ def test_the_command_records_each_checkpoint_once(run, tmp_path, capsys, monkeyp
     assert capsys.readouterr().out.count("succeeded. Record: ") == 2
 
 
-def test_different_evaluations_are_recorded_side_by_side(run, root, tmp_path):
-    arguments = [run, "--tasks", "4", "--steps", "last", "--out", tmp_path, "--scene.episode-length", 2]
-    demos = ["--demo-repo-id", "test/others", "--demo-root", root]
+def test_different_evaluations_are_recorded_side_by_side(run, benchmark, tmp_path):
+    arguments = [run, "--tasks", "4", "--steps", "last", "--out", tmp_path, *BRIEFLY]
+    demos = ["--demo-repo-id", "test/others", "--demo-root", benchmark]
     for more in (
         ["--trials", 1],
         ["--trials", 2],
@@ -361,7 +339,7 @@ def test_different_evaluations_are_recorded_side_by_side(run, root, tmp_path):
 
 
 def test_the_record_of_another_policy_is_refused(run, tmp_path):
-    arguments = ["--tasks", "4", "--trials", 1, "--out", tmp_path, "--scene.episode-length", 2]
+    arguments = ["--tasks", "4", "--trials", 1, "--out", tmp_path, *BRIEFLY]
     run_command(run, "--steps", 2, *arguments)
     other = shutil.copytree(
         find_checkpoints(run)[0].folder, tmp_path / "other" / "000002" / "pretrained_model"
@@ -381,7 +359,7 @@ def test_an_interrupted_evaluation_leaves_no_record(run, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Evaluation, "run", interrupted)
     with pytest.raises(SystemExit, match="Interrupted. Run the same command again"):
-        run_command(run, "--tasks", "4,14", "--steps", 1, "--out", tmp_path, "--processes", 1)
+        run_command(run, "--tasks", "4,14", "--steps", 1, "--out", tmp_path, *BRIEFLY)
     assert numbers == [0, 1]
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
@@ -389,7 +367,7 @@ def test_an_interrupted_evaluation_leaves_no_record(run, tmp_path, monkeypatch):
 def test_a_process_that_dies_is_reported(loaded, monkeypatch):
     monkeypatch.setattr(Evaluation, "run", lambda self, number: os._exit(9))
     with pytest.raises(RuntimeError, match="fewer --processes"):
-        outcomes_of(loaded, EvaluationPlan("4,14", trials=1), 2)
+        outcomes_of(loaded, short_plan("4,14", trials=1), 2)
 
 
 @pytest.mark.parametrize(
@@ -439,36 +417,40 @@ def test_checkpoints_are_those_that_are_complete(run, tmp_path):
 # Policies of other types
 
 
-def test_act_is_evaluated_with_other_names_of_cameras(act_run, tmp_path):
-    folder = find_checkpoints(act_run)[-1].folder
-    run_command(folder, "--tasks", "4,7", "--trials", 1, "--out", tmp_path / "same", "--processes", 2)
+def test_act_is_evaluated_with_other_names_of_cameras(act_checkpoint, tmp_path):
+    arguments = ["--tasks", "4,7", "--trials", 1, *BRIEFLY, "--out"]
+    run_command(act_checkpoint, *arguments, tmp_path / "same")
     # The same policy, trained on a dataset that names the camera otherwise.
     copy = tmp_path / "renamed" / "checkpoints" / "000001" / "pretrained_model"
-    shutil.copytree(folder, copy)
+    shutil.copytree(act_checkpoint, copy)
     for path in copy.glob("*.json"):
         path.write_text(path.read_text().replace('"observation.image"', '"observation.images.front"'))
-    shutil.copy(folder / "policy_preprocessor.json", copy / "policy_preprocessor.json")
-    arguments = [copy, "--tasks", "4,7", "--trials", 1, "--out", tmp_path / "other"]
+    shutil.copy(act_checkpoint / "policy_preprocessor.json", copy / "policy_preprocessor.json")
     with pytest.raises(
         SystemExit, match=r"rename it: --rename_map='{\"observation.image\": \"observation.im"
     ):
-        run_command(*arguments)
-    run_command(*arguments, "--rename-map", '{"observation.image": "observation.images.front"}')
+        run_command(copy, *arguments, tmp_path / "other")
+    renaming = '{"observation.image": "observation.images.front"}'
+    run_command(copy, *arguments, tmp_path / "other", "--rename-map", renaming)
     (same,), (other,) = (read_records(tmp_path / name) for name in ("same", "other"))
     assert (same.policy_type, same.experiment) == ("act", "small/act")
     assert set(same.episodes["demonstration_task"]) == {-1}
     pd.testing.assert_frame_equal(same.episodes, other.episodes)
 
 
-def test_draws_of_a_policy_depend_on_the_scene_alone(act_run, monkeypatch):
-    policy = load_policy(find_checkpoints(act_run)[-1].folder)
-    plan = EvaluationPlan("4,14", trials=1)
-    monkeypatch.setattr(
-        policy.policy, "select_action", lambda batch: torch.rand(len(batch["task"]), 4, dtype=torch.float32)
-    )
-    expected = as_numbers(outcomes_of(policy, plan))
-    torch.rand(3)
-    assert as_numbers(outcomes_of(policy, plan)) == expected
+def test_draws_of_a_policy_depend_on_the_scene_alone(act_checkpoint, monkeypatch):
+    policy = load_policy(act_checkpoint)
+    drawn = []
+
+    def draw(batch):
+        drawn.append(torch.rand(len(batch["task"]), 4))
+        return drawn[-1]
+
+    monkeypatch.setattr(policy.policy, "select_action", draw)
+    for _ in range(2):
+        torch.rand(3)
+        outcomes_of(policy, short_plan("4,14", trials=1))
+    assert torch.equal(torch.stack(drawn[:4]), torch.stack(drawn[4:]))
 
 
 def policy_config(cameras=("observation.image",), size=48, state=10, action=4):
@@ -479,6 +461,9 @@ def policy_config(cameras=("observation.image",), size=48, state=10, action=4):
     return config
 
 
+JOINTS = {"cameras": ("observation.images.front", "observation.images.wrist"), "state": 7, "action": 7}
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -487,26 +472,34 @@ def policy_config(cameras=("observation.image",), size=48, state=10, action=4):
         ({"size": 96}, "Set `scene.image_size` to 96"),
         ({"state": 7}, r"`observation.state` of the shape \(7,\)"),
         ({"action": 7}, r"`action` of the shape \(7,\)"),
+        (JOINTS, "Set `scene.control` to joints"),
     ],
     ids=str,
 )
 def test_a_policy_for_something_else_is_refused(options, message):
     check_policy_fits(policy_config(), SceneConfig())
+    check_policy_fits(policy_config(**JOINTS), SceneConfig(control="joints"))
     with pytest.raises(ValueError, match=message):
         check_policy_fits(policy_config(**options), SceneConfig())
 
 
 def test_a_vision_language_action_model_may_lack_cameras_and_pad_the_state():
-    cameras = {"observation.image": SimpleNamespace(shape=(3, 256, 256)), "observation.images.wrist": None}
-    state = SimpleNamespace(shape=(32,))
     model = SimpleNamespace(
-        image_features=cameras,
-        empty_cameras=1,
+        image_features={
+            "observation.image": SimpleNamespace(shape=(3, 256, 256)),
+            "observation.images.wrist": None,
+        },
         max_state_dim=32,
-        robot_state_feature=state,
+        robot_state_feature=SimpleNamespace(shape=(32,)),
         action_feature=None,
     )
+    with pytest.raises(ValueError, match="observation.images.wrist, but"):
+        check_policy_fits(model, SceneConfig())
+    model.empty_cameras = 1
     check_policy_fits(model, SceneConfig())
+    del model.max_state_dim
+    with pytest.raises(ValueError, match=r"`observation.state` of the shape \(32,\)"):
+        check_policy_fits(model, SceneConfig())
 
 
 def test_joint_noise_is_a_function_of_the_episode(loaded, monkeypatch):

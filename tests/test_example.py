@@ -9,7 +9,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_eval
-from tiny_runs import run_training
+from small_policies import as_options, run_training
 
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import get_task
@@ -26,15 +26,14 @@ TASKS = "24,35"
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
+def checkpoint(benchmark, tmp_path_factory):
     """A checkpoint of the example after two steps of `lerobot-train`."""
     folder = tmp_path_factory.mktemp("example")
-    collect(folder / "data", CollectionPlan("4,14", 1))
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(EXAMPLES)
         __import__("lerobot_policy_example")
         options = {"policy.type": "example", "policy.push_to_hub": False}
-        run_training(folder / "data", folder / "run", options, in_memory=False, steps=2)
+        run_training(benchmark, folder / "run", options, in_memory=False, steps=2)
         yield find_checkpoints(folder / "run")[-1].folder
 
 
@@ -69,19 +68,19 @@ def test_evaluations_give_the_demonstrations_of_the_protocol(checkpoint, receive
         assert (episode["tasks"][0], as_uint8(images).numpy().tobytes()) in received
     by_set_tasks = set(received)
     received.clear()
-    words = {
+    options = {
         "policy.path": checkpoint,
         "policy.device": "cpu",
         "env.type": "deltaco",
         "env.task": TASKS,
-        "env.demonstrations": "true",
+        "env.demonstrations": True,
         "env.scene.episode_length": 2,
         "env.render_size": 16,
         "eval.n_episodes": 1,
         "eval.batch_size": 1,
         "output_dir": tmp_path / "eval",
     }
-    monkeypatch.setattr(sys, "argv", ["eval", *(f"--{name}={value}" for name, value in words.items())])
+    monkeypatch.setattr(sys, "argv", ["eval", *as_options(options)])
     lerobot_eval.main()
     assert received == by_set_tasks
 

@@ -28,26 +28,28 @@ def success_steps(job):
     return steps
 
 
-def check_success(ambiguity, task_ids, n_episodes, rate_per_task, rate_by_step_22):
+def steps_of_tasks(ambiguity, task_ids, n_episodes):
+    """Returns `success_steps` of tasks, (tasks, episodes)."""
     jobs = [(ambiguity, task_id, n_episodes) for task_id in task_ids]
     with get_context("spawn").Pool(2) as pool:
-        steps = np.array(pool.map(success_steps, jobs, chunksize=1))  # (tasks, episodes)
-    assert np.isfinite(steps).mean() >= 0.95
-    assert np.median(steps) <= 15
-    assert (steps <= 22).mean() >= rate_by_step_22
-    rates = np.isfinite(steps).mean(axis=1)
-    assert [job for job, rate in zip(jobs, rates, strict=True) if rate < rate_per_task] == []
+        return np.array(pool.map(success_steps, jobs, chunksize=1))
 
 
 @pytest.mark.parametrize(("ambiguity", "task_ids"), [("container", SAMPLE), ("object", SAMPLE[::4])])
 def test_expert_succeeds_in_a_sample_of_tasks(ambiguity, task_ids):
-    check_success(ambiguity, task_ids, 2, rate_per_task=0.5, rate_by_step_22=0.9)
+    steps = steps_of_tasks(ambiguity, task_ids, 1)
+    assert np.isfinite(steps).mean() >= 0.95
+    assert np.median(steps) <= 15
+    assert (steps <= 22).mean() >= 0.9
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ambiguity", AMBIGUITIES)
 def test_expert_succeeds_in_every_task(ambiguity):
-    check_success(ambiguity, range(N_TASKS), 50, rate_per_task=0.85, rate_by_step_22=0.95)
+    steps = steps_of_tasks(ambiguity, range(N_TASKS), 50)
+    assert np.median(steps) <= 15
+    assert (steps <= 22).mean() >= 0.95
+    assert np.isfinite(steps).mean(axis=1).min() >= 0.85
 
 
 def test_stages_come_in_order_and_command_the_gripper():
@@ -67,10 +69,3 @@ def test_noise_is_on_the_motion_and_not_on_the_gripper():
     spread = np.std([step.action for step in steps if step.stage is Stage.REST], axis=0)
     np.testing.assert_allclose(spread[:3], np.sqrt(2) * 0.1, rtol=0.25)
     assert spread[3] == 0
-
-
-def test_episode_is_a_function_of_its_seed():
-    with closing(PickPlaceEnv()) as env:
-        first, again, other = ([step.action for step in expert_episode(env, 7, seed)] for seed in (3, 3, 4))
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)

@@ -9,7 +9,7 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from PIL import Image
-from tiny_runs import batch_of, write_dataset
+from small_policies import batch_of, write_episodes
 
 from lerobot_deltaco import frames as frames_module
 from lerobot_deltaco.demonstrations import RobotData, read_demonstrations, read_robot_data
@@ -19,26 +19,44 @@ from lerobot_deltaco.pauses import paused_frames
 TASKS = ["stack the cups", "pour the tea", "wave"] * 2
 LENGTH = 5
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
-CAMERAS = {"top": (20, 28), "wrist": (24, 24)}
-MORE_FEATURES = {
-    "observation.pose": lambda rng: rng.normal(size=(2, 3)).astype(np.float32),
-    "observation.flag": lambda rng: rng.integers(0, 2, 1).astype(bool),
-    "force": lambda rng: rng.normal(size=2),
-    "count": lambda rng: rng.integers(0, 99, 1).astype(np.int32),
-    "levels": lambda rng: rng.integers(0, 255, 3, dtype=np.uint8),
-    "note": lambda rng: f"note {rng.integers(99)}",
-}
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    return write_dataset(tmp_path_factory.mktemp("data") / "small", TASKS, LENGTH, CAMERAS, **MORE_FEATURES)
+    """A dataset of random numbers with features of all kinds."""
+    rng = np.random.default_rng(0)
+
+    def frame(step):
+        return {
+            TOP: rng.integers(0, 255, (20, 28, 3), dtype=np.uint8),
+            WRIST: rng.integers(0, 255, (24, 24, 3), dtype=np.uint8),
+            "observation.state": rng.normal(size=2).astype(np.float32),
+            "observation.pose": rng.normal(size=(2, 3)).astype(np.float32),
+            "observation.flag": rng.integers(0, 2, 1).astype(bool),
+            "action": np.array([*rng.uniform(-5, 5, 2), step % 2], np.float32),
+            "force": rng.normal(size=2),
+            "count": rng.integers(0, 99, 1).astype(np.int32),
+            "levels": rng.integers(0, 255, 3, dtype=np.uint8),
+            "note": f"note {rng.integers(99)}",
+        }
+
+    folder = tmp_path_factory.mktemp("data") / "small"
+    write_episodes(folder, "test/small", [(task, [frame(n) for n in range(LENGTH)]) for task in TASKS])
+    return folder
 
 
 @pytest.fixture(scope="module")
 def video_root(tmp_path_factory):
+    """A dataset whose only camera is stored as a video, of shades that are 10 apart."""
+
+    def frame(episode, step):
+        image = np.full((64, 96, 3), 60 * episode + 10 * step, np.uint8)
+        return {TOP: image, "action": np.array([episode, step], np.float32)}
+
     folder = tmp_path_factory.mktemp("data") / "video"
-    return write_dataset(folder, TASKS[:2], LENGTH, {"top": (32, 48)}, video=True)
+    episodes = [(TASKS[n], [frame(n, step) for step in range(LENGTH)]) for n in range(2)]
+    write_episodes(folder, "test/small", episodes, video=True)
+    return folder
 
 
 def read(root, **options):
@@ -108,7 +126,7 @@ def test_videos_equal_those_of_lerobot(video_root, seconds):
     dataset = read(video_root, delta_timestamps=windows, video_backend="pyav")
     assert_batches_are_equal(dataset, list(range(2 * LENGTH)))
     # The dataset still gives windows.
-    assert dataset[3]["action"].shape == ((3,) if seconds is None else (2, 3))
+    assert dataset[3]["action"].shape == ((2,) if seconds is None else (2, 2))
 
 
 @pytest.mark.parametrize("n_frames", [2, 3])
@@ -125,6 +143,12 @@ def test_demonstrations_and_robot_data_equal_those_that_are_read(root, n_frames)
         assert torch.equal(robot.states[first : last + 1], expected_robot.states[a : b + 1])
         assert torch.equal(robot.actions[first : last + 1], expected_robot.actions[a : b + 1])
         assert torch.equal(robot.images([first, last]), expected_robot.images([a, b]))
+
+
+def test_demonstrations_are_read_from_videos(video_root):
+    bank = read_demonstrations(read(video_root, video_backend="pyav"), TOP, 16, 2)
+    shades = bank.frames.float().mean(dim=(2, 3, 4))
+    torch.testing.assert_close(shades, torch.tensor([[0.0, 40], [60, 100]]), atol=6, rtol=0)
 
 
 def test_images_are_scaled_on_request(root):

@@ -4,19 +4,16 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.envs import env_to_policy_features
 from lerobot.envs.utils import preprocess_observation
 
-from gym_deltaco.control import CONTROLS
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import Stage, expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from lerobot_deltaco.collect import CollectionPlan, collect
 from lerobot_deltaco.dataset_card import dataset_card
-from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
-from lerobot_deltaco.lerobot_env import DeltacoEnv, check_policy_fits
+from lerobot_deltaco.lerobot_env import DeltacoEnv
 
 SCENE = SceneConfig(control="joints", image_size=16)
 REST = [1.57, -0.6, -0.6, 0.0, -1.57, 0.0]
@@ -146,20 +143,3 @@ def test_dataset_and_environment_have_the_names_of_a_robot(tmp_path):
     card = dataset_card(tmp_path)
     assert "--scene.control joints" in card
     assert "nominal" not in card
-
-
-def policy_config(control):
-    interface = CONTROLS[control]
-    config = DeltacoConfig(device="cpu")
-    image = PolicyFeature(FeatureType.VISUAL, (3, 16, 16))
-    state = PolicyFeature(FeatureType.STATE, (len(interface.state_names),))
-    config.input_features = {**dict.fromkeys(interface.camera_keys, image), "observation.state": state}
-    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (len(interface.action_names),))}
-    return config
-
-
-def test_a_policy_is_evaluated_with_the_control_of_its_training():
-    for control, other in (("joints", "position"), ("position", "joints")):
-        check_policy_fits(policy_config(control), SceneConfig(control=control, image_size=16))
-        with pytest.raises(ValueError, match=f"Set `scene.control` to {control}"):
-            check_policy_fits(policy_config(control), SceneConfig(control=other, image_size=16))

@@ -1,18 +1,16 @@
 """The benchmark as LeRobot sees it: configuration, lazy vector environments, evaluation."""
 
-import gymnasium as gym
 import numpy as np
 import pybullet
 import pytest
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
-from lerobot.envs import EnvConfig, close_envs, env_to_policy_features, make_env, make_env_config
+from lerobot.envs import close_envs, env_to_policy_features, make_env
 from lerobot.policies import PreTrainedPolicy
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from torch import nn
 
 from gym_deltaco.scene_config import SceneConfig
-from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import TASKS, select_tasks
 from lerobot_deltaco.lerobot_env import DeltacoEnv, EvaluationEnv
 
@@ -48,11 +46,6 @@ def roll_out(env, seeds, n_steps=3):
 
 
 # Configuration
-
-
-def test_lerobot_knows_the_type():
-    assert EnvConfig.get_choice_class("deltaco") is DeltacoEnv
-    assert make_env_config("deltaco", task="4,50-73").type == "deltaco"
 
 
 def test_features_are_those_of_datasets_and_of_the_spaces(make_envs):
@@ -111,18 +104,6 @@ def test_simulators_start_at_the_first_reset_and_are_passed_on(make_envs):
         env.reset(seed=0)
         env.close()
         assert len(simulators() - before) == 2
-
-
-def test_each_task_has_scenes_of_its_own(make_envs):
-    for env, task in zip(make_envs("4,54", n_envs=2).values(), (TASKS[4], TASKS[54]), strict=True):
-        observation, info = env.reset(seed=[1000, 1001])
-        assert info["task_id"].tolist() == [task.index] * 2
-        assert env.call("task_description") == (task.instruction,) * 2
-        direct = gym.make("gym_deltaco/PickPlace-v0", task_id=task.index)
-        for n in range(2):
-            seed = episode_seed(0, "evaluation", task.index, 0, 1000 + n)
-            np.testing.assert_array_equal(observation["pixels"][n], direct.reset(seed=seed)[0]["pixels"])
-        direct.close()
 
 
 def test_a_borrowed_simulator_does_not_remember(make_envs):

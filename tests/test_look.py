@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
-from tiny_policy import load_tiny_policy, save_tiny_policy
+from small_policies import load_tiny_policy, save_tiny_policy
 
 from gym_deltaco.env import ACTION_NAMES, STATE_NAMES, PickPlaceEnv
 from gym_deltaco.expert import expert_episode

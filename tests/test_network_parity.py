@@ -102,22 +102,18 @@ def test_likelihood_of_an_action_matches_formula():
     expected = -reference.normal_log_density(mean, log_std, target)
     found = gaussian_negative_log_likelihood(mean_tensor, log_std_tensor, target_tensor)
     np.testing.assert_allclose(found.numpy(), expected, **TOLERANCE)
-    one_component = mixture_negative_log_likelihood(
-        mean_tensor[:, None, None], torch.zeros(BATCH, 1), log_std_tensor, target_tensor[:, None]
-    )
-    np.testing.assert_allclose(one_component.numpy(), expected, **TOLERANCE)
 
 
-def test_likelihood_of_a_mixture_matches_formula():
-    means, mean_tensor = drawn(BATCH, 4, 3, seed=1)
-    target, target_tensor = drawn(BATCH, 3, seed=2)
-    log_std, log_std_tensor = drawn(4, 3, seed=3)
-    logits, logit_tensor = drawn(BATCH, 4, seed=4)
+@pytest.mark.parametrize("n_components", [1, 4])
+def test_likelihood_of_a_mixture_of_steps_matches_formula(n_components):
+    n_steps = 2
+    means, mean_tensor = drawn(BATCH, n_components, n_steps, 3, seed=1)
+    target, target_tensor = drawn(BATCH, n_steps, 3, seed=2)
+    log_std, log_std_tensor = drawn(n_components, n_steps, 3, seed=3)
+    logits, logit_tensor = drawn(BATCH, n_components, seed=4)
     probabilities = np.exp(reference.log_softmax(logits))
-    densities = np.exp(reference.normal_log_density(means, log_std, target[:, None]))
-    found = mixture_negative_log_likelihood(
-        mean_tensor[:, :, None], logit_tensor, log_std_tensor[:, None], target_tensor[:, None]
-    )
+    densities = np.exp(reference.normal_log_density(means, log_std, target[:, None]).sum(axis=2))
+    found = mixture_negative_log_likelihood(mean_tensor, logit_tensor, log_std_tensor, target_tensor)
     np.testing.assert_allclose(found.numpy(), -np.log((probabilities * densities).sum(axis=1)), **TOLERANCE)
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from urllib.parse import parse_qsl
 
 import pytest
-from tiny_policy import DEMONSTRATED, save_tiny_policy
+from small_policies import DEMONSTRATED, save_tiny_policy
 
 from gym_deltaco.layout import Layout, PlacedContainer
 from gym_deltaco.tasks import COLOR_SHAPE_TASKS, OBJECTS, TASKS, get_task

@@ -8,7 +8,7 @@ import sys
 import time
 
 import pytest
-from tiny_policy import save_tiny_policy
+from small_policies import save_tiny_policy
 
 playwright = pytest.importorskip("playwright.sync_api", reason="Playwright's Python package is not installed")
 pytest.importorskip("gradio", reason="the extra `play` is not installed")

@@ -92,24 +92,18 @@ def test_bfloat16_needs_instructions_of_the_processor(monkeypatch, caplog):
         assert ("no bfloat16 instructions" in caplog.text) == (not supported)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--policy.type=deltaco", "--policy.temperature=1e-40"], "`temperature` must be from 0.001"),
-        (["--policy.type=deltaco_match", "--policy.crop_size=2"], "`crop_size` must be from 0.01"),
-    ],
-)
-def test_command_line_of_lerobot_logs_what_is_wrong(options, message, monkeypatch, caplog):
+def test_command_line_of_lerobot_logs_what_is_wrong(monkeypatch, caplog):
     """LeRobot's parser says no more than which class it cannot make."""
 
     @parser.wrap()
     def main(config: TrainPipelineConfig):
         return config
 
-    monkeypatch.setattr("sys.argv", ["lerobot-train", "--dataset.repo_id=user/data", *options])
+    options = ["--dataset.repo_id=user/data", "--policy.type=deltaco_match", "--policy.crop_size=2"]
+    monkeypatch.setattr("sys.argv", ["lerobot-train", *options])
     with pytest.raises((SystemExit, draccus.utils.ParsingError)):
         main()
-    assert message in caplog.text
+    assert "`crop_size` must be from 0.01" in caplog.text
 
 
 # What the dataset says
@@ -178,18 +172,6 @@ def test_features_that_do_not_fit_are_errors(config, message):
 
 
 # Optimization
-
-
-def test_optimizer_is_adamw_without_decay_by_default():
-    weight, reference = (torch.nn.Parameter(torch.tensor([2.0])) for _ in range(2))
-    config = DeltacoConfig(device="cpu")
-    optimizers = config.get_optimizer_preset().build([weight]), torch.optim.Adam([reference], lr=3e-4)
-    for _ in range(3):
-        for parameter, optimizer in zip((weight, reference), optimizers, strict=True):
-            optimizer.zero_grad()
-            parameter.square().sum().backward()
-            optimizer.step()
-    torch.testing.assert_close(weight, reference)
 
 
 def test_cosine_schedule_warms_up_and_ends_at_zero():

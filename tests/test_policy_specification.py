@@ -11,6 +11,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDataset
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import get_policy_class
 from small_policies import (
@@ -19,13 +20,14 @@ from small_policies import (
     TASKS,
     batch_of,
     demos_of,
+    hold_in_memory,
     observation,
-    random_moves,
     small_policy,
     with_chunks,
-    write_table,
 )
 
+from lerobot_deltaco import base_policy
+from lerobot_deltaco.dataset_reading import open_dataset
 from lerobot_deltaco.deltaco.configuration_deltaco import METHODS
 from lerobot_deltaco.networks import BACKBONES
 
@@ -55,15 +57,21 @@ FRAMES = {"deltaco": [0, 7, 16, 22, 29], "deltaco_match": list(range(0, 20 * TAB
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory):
-    return write_table(tmp_path_factory.mktemp("data") / "table", random_moves(24))
+def short_table(table):
+    """As many episodes of the table as `deltaco_match` needs."""
+    return hold_in_memory(LeRobotDataset(table.repo_id, root=table.root), episodes=list(range(24)))
+
+
+# Opening a dataset takes longer than a training step.
+open_once = functools.cache(open_dataset)
 
 
 @pytest.fixture(params=VARIANTS, ids=lambda variant: f"{variant[0]}-{variant[1]}")
-def make(request, dataset, table, fake_language, short_fit):
+def make(request, dataset, short_table, fake_language, short_fit, monkeypatch):
     """Makes the policy that is tested, its processors and its data, always with the same weights."""
+    monkeypatch.setattr(base_policy, "open_dataset", open_once)
     policy_type, options = request.param
-    data = {"deltaco": dataset, "deltaco_match": table}[policy_type]
+    data = {"deltaco": dataset, "deltaco_match": short_table}[policy_type]
 
     def make(with_demos=False):
         torch.manual_seed(0)
@@ -119,9 +127,7 @@ def test_training_loss_has_gradients_and_leaves_the_batch_unchanged(make):
     assert ("gripper_accuracy" in logged) == (made.config.gripper_index is not None)
     if made.config.type == "deltaco":
         assert ("demo_accuracy" in logged) == (made.config.conditioning.encoder_loss != "none")
-    trained = {id(parameter) for parameter in made.policy.get_optim_params()}
-    for name, parameter in made.policy.named_parameters():
-        assert (parameter.grad is not None) == (id(parameter) in trained), name
+    assert any(parameter.grad.any() for parameter in made.policy.get_optim_params())
     assert_same(kept, made.batch)
     each, _ = twin(made.batch, reduction="none")
     assert each.shape == (len(kept["task"]),)

@@ -4,38 +4,26 @@ import numpy as np
 import pytest
 import torch
 from lerobot.rollout.inference.sync import SyncInferenceEngine
-from small_policies import (
-    TABLE_LENGTH,
-    TABLE_TASKS,
-    random_moves,
-    small_policy,
-    use_short_fit,
-    write_table,
-)
+from small_policies import TABLE_LENGTH, TABLE_TASKS, demos_of, small_policy
 
 
+@pytest.mark.usefixtures("short_fit")
 @pytest.mark.parametrize("chunk_size", [1, 4])
-def test_a_new_task_is_found_in_the_current_image(chunk_size, tmp_path, monkeypatch):
-    use_short_fit(monkeypatch)
-    dataset = write_table(tmp_path / "data", random_moves(24))
-    policy, before, after = small_policy(
-        dataset, "deltaco_match", chunk_size=chunk_size, demo_repo_id="table", demo_root=str(dataset.root)
-    )
+def test_a_new_task_is_found_in_the_current_image(table, chunk_size):
+    policy, before, after = small_policy(table, "deltaco_match", chunk_size=chunk_size, **demos_of(table))
     policy._prepare_training()
     policy.eval()
-    names = dataset.meta.features["action"]["names"]
+    names = table.meta.features["action"]["names"]
 
     def engine(task):
-        return SyncInferenceEngine(
-            policy, before, after, dataset.meta.features, names, task, "cpu", "mock_robot"
-        )
+        return SyncInferenceEngine(policy, before, after, table.meta.features, names, task, "cpu", "robot")
 
     def seen(row):
         """An observation as a robot gives it."""
-        image = dataset[row]["observation.image"].permute(1, 2, 0).numpy()
+        image = table[row]["observation.image"].permute(1, 2, 0).numpy()
         return {
             "observation.image": np.round(255 * image).astype(np.uint8),
-            "observation.state": dataset[row]["observation.state"].numpy(),
+            "observation.state": table[row]["observation.state"].numpy(),
         }
 
     running = engine(TABLE_TASKS[0])
@@ -51,6 +39,6 @@ def test_a_new_task_is_found_in_the_current_image(chunk_size, tmp_path, monkeypa
     fresh = engine(TABLE_TASKS[1])
     fresh.reset()
     # Nothing of the old task is left, not even the rest of its chunk.
-    assert torch.equal(actions[0], fresh.get_action(seen(TABLE_LENGTH)))
-    assert torch.equal(actions[1], fresh.get_action(seen(TABLE_LENGTH)))
+    for action in actions:
+        assert torch.equal(action, fresh.get_action(seen(TABLE_LENGTH)))
     assert torch.equal(locations, policy.found.locations)
