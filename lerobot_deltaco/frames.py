@@ -120,7 +120,9 @@ class FramesInMemory(torch.utils.data.Dataset):
 
     def __getattr__(self, name: str) -> Any:
         # LeRobot's loop asks for the metadata, the episodes and the number of frames.
-        return getattr(self.__dict__["_dataset"], name)
+        if "_dataset" not in self.__dict__:  # a copy that is being made
+            raise AttributeError(name)
+        return getattr(self._dataset, name)
 
     def batch(self, indices: Sequence[int] | Tensor) -> dict[str, Any]:
         """Returns what LeRobot's data loader would give for some frames, with images as uint8.
