@@ -93,7 +93,7 @@ class TrainingStart:
     def __init__(self, dataset: LeRobotDataset, config: DeltacoMatchConfig) -> None:
         self.dataset, self.config = dataset, config
         self.refusal: str | None = None
-        self.bytes, self.image_size = 0, config.image_size
+        self.bytes = 0
         self.policy: DeltacoMatchPolicy | None = None
         self.bank: DemonstrationBank | None = None
         self.grasps: list[Grasp | str] = []
@@ -138,20 +138,11 @@ def check(arguments: CheckArguments) -> str:
     meta = opened.meta
     tasks = [names[0] for names in meta.episodes["tasks"]]
     views, staying = _read_episodes(start, tasks, arguments.episodes)
-    facts = [
-        ("dataset", f"{meta.total_episodes} episodes, {meta.total_frames:,} frames, {meta.fps} per second"),
-        *_camera_facts(config, staying),
-        *_gripper_facts(start),
-        *_unit_facts(start),
-        *_pause_facts(opened),
-    ]
+    dimensions = _dimensions(start)
+    facts = _facts(start, staying, dimensions)
     if start.refusal is None:
         facts += _estimates(start, arguments.batch_size, arguments.steps)
-    warnings = [
-        *start.warnings,
-        *_task_warnings(meta.episodes["tasks"]),
-        *_camera_warnings(config, staying),
-    ]
+    warnings = [*start.warnings, *_advice(start, staying)]
     found = Counter(
         task for task, grasp in zip(tasks, start.grasps, strict=False) if isinstance(grasp, Grasp)
     )
@@ -165,7 +156,7 @@ def check(arguments: CheckArguments) -> str:
         warnings=warnings,
         facts=facts,
         tasks=counts,
-        dimensions=_dimensions(start),
+        dimensions=dimensions,
         views=views,
         n_episodes=meta.total_episodes,
         has_locations=start.locations is not None,
@@ -270,92 +261,73 @@ def _staying_edges(images: Tensor) -> float:
     return ((others - first).abs() < _SAME * first.abs())[:, strong].float().mean().item()
 
 
-# Facts, each with its name
-
-
-def _camera_facts(config: DeltacoMatchConfig, staying: dict[str, float]) -> list[tuple[str, str]]:
-    chosen = config.cameras[0] if config.image_features else None
-    return [
-        (
-            "demo camera" if camera == chosen else "camera",
-            f"{camera} {'stands still' if fraction >= _MIN_STAYING else 'moves'} "
-            f"({100 * fraction:.0f} % of the edges stay where they are)",
-        )
-        for camera, fraction in staying.items()
-    ]
-
-
-def _camera_warnings(config: DeltacoMatchConfig, staying: dict[str, float]) -> list[str]:
-    if not config.image_features or staying.get(config.cameras[0], 1.0) >= _MIN_STAYING:
-        return []
-    still = [camera for camera, fraction in staying.items() if fraction >= _MIN_STAYING]
-    advice = f"Set --policy.demo_camera={still[0]}." if still else "No camera of the dataset does."
-    return [
-        f"The demonstration camera, {config.cameras[0]}, does not seem to stand still, as it must. {advice}"
-    ]
-
-
-def _gripper_facts(start: TrainingStart) -> list[tuple[str, str]]:
-    if not start.grasps:
-        return []
-    n_found = sum(isinstance(grasp, Grasp) for grasp in start.grasps)
-    return [
-        (
-            "gripper",
-            f"{start.config.name_gripper(start.dataset.meta.features)}; {start.config.gripper_closed} values "
-            "close it",
-        ),
-        ("grasps", f"in {n_found} of {len(start.grasps)} episodes; others are left out"),
-    ]
-
-
-def _pause_facts(dataset: LeRobotDataset) -> list[tuple[str, str]]:
-    """Returns how many frames training leaves out as pauses."""
-    if OBS_STATE not in dataset.meta.features:
-        return []
-    paused = paused_frames(read_robot_data(dataset, range(dataset.meta.total_episodes)), dataset.fps)
-    return [("pauses", f"the robot stands still in {100 * paused.mean():.0f} % of the frames")]
+# Facts and advice
 
 
 def _dimensions(start: TrainingStart) -> dict[str, list[tuple[str, float, float]]]:
     """Returns the name, the minimum and the maximum of each dimension of the state and the action."""
     found, meta = {}, start.dataset.meta
-    for feature in {OBS_STATE, ACTION} & set(meta.features) & set(meta.stats):
-        low, high = (np.ravel(meta.stats[feature][end]).tolist() for end in ("min", "max"))
-        # Names that cannot be read are an error of the policy.
-        names = dimension_names(meta.features[feature]) if start.policy is not None else []
-        names = names or [str(n) for n in range(len(low))]
-        found[feature] = list(zip(names, low, high, strict=True))
+    for feature in (OBS_STATE, ACTION):
+        if feature in meta.features and feature in meta.stats:
+            low, high = (np.ravel(meta.stats[feature][end]).tolist() for end in ("min", "max"))
+            # Names that cannot be read are an error of the policy.
+            names = dimension_names(meta.features[feature]) if start.policy is not None else []
+            found[feature] = list(zip(names or map(str, range(len(low))), low, high, strict=True))
     return found
 
 
-def _unit_facts(start: TrainingStart) -> list[tuple[str, str]]:
-    """Returns guesses of the units, from the ranges of all dimensions but the gripper's."""
-    facts = []
-    for feature, dimensions in sorted(_dimensions(start).items(), reverse=True):
-        arm = [(a, b) for name, a, b in dimensions if "gripper" not in name.lower()] or [(0.0, 0.0)]
-        low, high = min(a for a, _ in arm), max(b for _, b in arm)
+def _facts(
+    start: TrainingStart, staying: dict[str, float], dimensions: dict[str, list[tuple[str, float, float]]]
+) -> list[tuple[str, str]]:
+    """Returns what a policy would take from the dataset, each fact with its name."""
+    dataset, config, meta = start.dataset, start.config, start.dataset.meta
+    facts = [
+        ("dataset", f"{meta.total_episodes} episodes, {meta.total_frames:,} frames, {meta.fps} per second")
+    ]
+    for camera, fraction in staying.items():
+        is_chosen = bool(config.image_features) and camera == config.cameras[0]
+        does = "stands still" if fraction >= _MIN_STAYING else "moves"
+        text = f"{camera} {does} ({100 * fraction:.0f} % of the edges stay where they are)"
+        facts.append(("demo camera" if is_chosen else "camera", text))
+    if start.grasps:
+        n_found = sum(isinstance(grasp, Grasp) for grasp in start.grasps)
+        closing = f"{config.name_gripper(meta.features)}; {config.gripper_closed} values close it"
+        facts.append(("gripper", closing))
+        facts.append(("grasps", f"in {n_found} of {len(start.grasps)} episodes; others are left out"))
+    for feature, rows in dimensions.items():
+        arm = [ends for name, *ends in rows if "gripper" not in name.lower()] or [[0.0, 0.0]]
+        low, high = min(low for low, _ in arm), max(high for _, high in arm)
         greatest = max(-low, high)
         unit = "radians" if greatest <= 2 * np.pi else "degrees, or LeRobot's -100..100"
         unit = "-1..1, or meters" if greatest <= 1 else unit
         facts.append(("units", f"{feature}: from {low:.4g} to {high:.4g}, so probably {unit}"))
+    if OBS_STATE in meta.features:
+        paused = paused_frames(read_robot_data(dataset, range(meta.total_episodes)), dataset.fps)
+        facts.append(("pauses", f"the robot stands still in {100 * paused.mean():.0f} % of the frames"))
     return facts
 
 
-def _task_warnings(tasks_of_episodes: Sequence[Sequence[str]]) -> list[str]:
-    counts = Counter(tasks[0] for tasks in tasks_of_episodes)
-    warnings = [
+def _advice(start: TrainingStart, staying: dict[str, float]) -> list[str]:
+    """Returns what training does not warn of."""
+    config, tasks_of_episodes = start.config, start.dataset.meta.episodes["tasks"]
+    advice = [
         f"Episode {episode} has {len(tasks)} tasks, of which only the first counts: {tasks[0]!r}."
         for episode, tasks in enumerate(tasks_of_episodes)
         if len(tasks) > 1
     ]
-    single = [task for task, n in counts.items() if n == 1]
+    single = [task for task, n in Counter(tasks[0] for tasks in tasks_of_episodes).items() if n == 1]
     if single:
-        warnings.append(
+        advice.append(
             f"{len(single)} tasks have a single episode, which demonstrates itself, such as {single[0]!r}. "
             "Record at least two."
         )
-    return warnings
+    if config.image_features and staying.get(config.cameras[0], 1.0) < _MIN_STAYING:
+        still = [camera for camera, fraction in staying.items() if fraction >= _MIN_STAYING]
+        other = f"Set --policy.demo_camera={still[0]}." if still else "No camera of the dataset does."
+        advice.append(
+            f"The demonstration camera, {config.cameras[0]}, must stand still, but seems to move. {other}"
+        )
+    return advice
 
 
 # Time and memory

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -185,7 +184,7 @@ def record_scene(checkpoint: Path, seed: int) -> list[dict[str, Any]]:
     # Only here, since LeRobot takes seconds to import.
     from PIL import Image
 
-    from lerobot_deltaco.pictures import demonstration_ends, draw_found, write_video
+    from lerobot_deltaco.pictures import demonstration_ends, draw_found, encode_video
     from lerobot_deltaco.recording import benchmark_scene, load_conditioned, record_episode
 
     loaded = load_conditioned(checkpoint)
@@ -197,17 +196,14 @@ def record_scene(checkpoint: Path, seed: int) -> list[dict[str, Any]]:
         for container, sentence in enumerate(SENTENCES):
             recording = record_episode(loaded, SCENE_TASK, seed, sentence, given, scene, VIDEO_SIZE)
             assert recording.found is not None
-            with tempfile.TemporaryDirectory() as folder:
-                video = Path(folder, "episode.mp4")
-                write_video(recording.frames, video)
-                episodes.append(
-                    {
-                        "sentence": sentence,
-                        "video": data_uri("video/mp4", video.read_bytes()),
-                        "maps": picture_uri(draw_found(recording.frames[0], ends, recording.found)),
-                        "success": bool(recording.info["object_containers"][index] == container),
-                    }
-                )
+            episodes.append(
+                {
+                    "sentence": sentence,
+                    "video": data_uri("video/mp4", encode_video(recording.frames)),
+                    "maps": picture_uri(draw_found(recording.frames[0], ends, recording.found)),
+                    "success": bool(recording.info["object_containers"][index] == container),
+                }
+            )
         images = [picture_uri(Image.fromarray(end)) for end in ends]
         rows.append({"name": name, "images": images, "episodes": episodes})
     return rows

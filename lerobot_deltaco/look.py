@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,9 +28,9 @@ from lerobot_deltaco.pictures import (
     PLACE_COLOR,
     demonstration_ends,
     draw_found,
-    write_video,
+    encode_video,
 )
-from lerobot_deltaco.recording import benchmark_scene, load_conditioned, record_demonstration, record_episode
+from lerobot_deltaco.recording import benchmark_scene, find_demonstration, load_conditioned, record_episode
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -79,15 +78,11 @@ def look(arguments: LookArguments) -> str:
             f"{checkpoint} holds a policy of the type {loaded.policy.config.type!r}, which does not look for "
             "locations. `deltaco look` needs one of the type deltaco_match."
         )
-    arguments.out.mkdir(parents=True, exist_ok=True)
     if dataset is None:
-        results, tolerance = ["Successful episodes"], None
-        views = _benchmark_views(loaded, episodes, arguments.out)
+        results = ["Successful episodes"]
+        views = _benchmark_views(loaded, episodes)
     else:
-        results, tolerance = (
-            [f"Episodes with the right {what} location" for what in ("pick", "place")],
-            TOLERANCE,
-        )
+        results = [f"Episodes with the right {what} location" for what in ("pick", "place")]
         views = _dataset_views(loaded, open_folder_or_hub(dataset), episodes)
     shown = list(tqdm(views, desc="Looking", unit="episode", total=episodes))
     rates = []
@@ -102,43 +97,32 @@ def look(arguments: LookArguments) -> str:
         source=dataset or "scenes of the benchmark",
         views=shown,
         rates=rates,
-        tolerance=tolerance,
+        tolerance=None if dataset is None else TOLERANCE,
         pick_color=f"rgb{PICK_COLOR}",
         place_color=f"rgb{PLACE_COLOR}",
     )
     return "\n".join([*(f"{text}: {n_right} of {n}" for text, n_right, n in rates), f"See {page}."])
 
 
-def _benchmark_views(loaded: LoadedPolicy, n_episodes: int, out: Path) -> Iterator[View]:
+def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[View]:
     """Runs episodes of the benchmark's test tasks."""
-    policy, config = loaded.policy, loaded.policy.config
-    scene, task_ids = benchmark_scene(config), select_tasks(_BENCHMARK_TASKS)
-    simulators, video = Simulators(scene, MIN_SIDE), out / "episode.mp4"
+    policy, scene = loaded.policy, benchmark_scene(loaded.policy.config)
+    task_ids, simulators = select_tasks(_BENCHMARK_TASKS), Simulators(scene, MIN_SIDE)
     for index in _spread(len(task_ids), n_episodes):
         task = get_task(task_ids[index])
-        shown = []
-        if config.uses_demonstrations:
-            bank = policy.demonstrations
-            is_known = bank is not None and task.instruction in bank.rows
-            shown = [
-                bank.of_task(task.instruction)[0]
-                if is_known
-                else record_demonstration(config, task, 0, scene)
-            ]
+        shown = [find_demonstration(policy, task, scene)] if policy.config.uses_demonstrations else []
         seed = episode_seed(0, "evaluation", task.index, 0, _BENCHMARK_SEED)
         recording = record_episode(
             loaded, task.index, seed, task.instruction, shown, scene, MIN_SIDE, simulators=simulators
         )
         assert recording.found is not None
         ends = demonstration_ends(shown[0]) if shown else None
-        picture = draw_found(recording.frames[0], ends, recording.found)
-        write_video(recording.frames, video)
+        picture = picture_uri(draw_found(recording.frames[0], ends, recording.found))
+        video = data_uri("video/mp4", encode_video(recording.frames))
         is_success = bool(recording.info["is_success"])
-        text = "success" if is_success else "failure"
-        text = f"Task {task.index}: {text}{_how_sure(policy, task.instruction, recording.found)}"
-        uri = data_uri("video/mp4", video.read_bytes())
-        video.unlink()
-        yield View(task.instruction, picture_uri(picture), text, (is_success,), uri)
+        text = f"Task {task.index}: {'success' if is_success else 'failure'}"
+        text += _how_sure(policy, task.instruction, recording.found)
+        yield View(task.instruction, picture, text, (is_success,), video)
     simulators.close()
 
 

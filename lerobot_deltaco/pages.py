@@ -1,4 +1,4 @@
-"""Self-contained HTML pages, from the templates beside this file."""
+"""HTML from the templates beside this file, with its pictures and videos inside."""
 
 from __future__ import annotations
 
@@ -13,6 +13,17 @@ from PIL import Image
 from gym_deltaco.atomic_files import write_text
 
 
+def render(template: str, **values: Any) -> str:
+    """Returns a template with values filled in."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        undefined=jinja2.StrictUndefined,
+        autoescape=True,
+        trim_blocks=True,
+    )
+    return environment.get_template(template).render(**values)
+
+
 def write_page(template: str, path: Path, **values: Any) -> None:
     """Writes a page.
 
@@ -21,14 +32,7 @@ def write_page(template: str, path: Path, **values: Any) -> None:
         path: File to write; its folder is made.
         values: Values for the template.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        undefined=jinja2.StrictUndefined,
-        autoescape=True,
-        trim_blocks=True,
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, environment.get_template(template).render(**values))
+    write_text(path, render(template, **values))
 
 
 def picture_uri(picture: Image.Image) -> str:

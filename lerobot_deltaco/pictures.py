@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
+import io
 from collections.abc import Sequence
-from pathlib import Path
 
 import av
 import numpy as np
@@ -117,21 +116,23 @@ def demonstration_ends(demonstration: Demonstration) -> NDArray[np.uint8]:
     return demonstration.frames[[0, -1]].permute(0, 2, 3, 1).cpu().numpy()
 
 
-def write_video(frames: Sequence[NDArray[np.uint8]], path: Path, fps: int = VIDEO_FPS) -> None:
-    """Writes an H.264 video in MP4, which browsers play. The last frame stays for a second.
+def encode_video(frames: Sequence[NDArray[np.uint8]], fps: int = VIDEO_FPS) -> bytes:
+    """Encodes an H.264 video in MP4, which browsers play. The last frame stays for a second.
 
     Args:
         frames: Images, (H, W, 3); an odd row or column is cut off.
-        path: File to write.
         fps: Frames per second.
+
+    Returns:
+        The content of the file.
     """
-    partial = path.with_name(f".{path.name}.part")
+    content = io.BytesIO()
     height, width = (side // 2 * 2 for side in frames[0].shape[:2])
-    with av.open(str(partial), "w", format="mp4", options={"movflags": "faststart"}) as container:
+    with av.open(content, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "20"})
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for image in (*frames, *[frames[-1]] * round(_HELD_SECONDS * fps)):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    os.replace(partial, path)
+    return content.getvalue()

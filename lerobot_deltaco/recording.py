@@ -1,4 +1,4 @@
-"""Recordings of benchmark episodes: a policy's, and the expert's demonstrations."""
+"""Recordings of benchmark episodes by a policy, and demonstrations for it."""
 
 from __future__ import annotations
 
@@ -100,22 +100,25 @@ def record_episode(
     return Recording(frames, first["observed"], found, info, first["layout"], in_containers)
 
 
-def record_demonstration(
-    config: TaskConditionedConfig, task: Task, number: int = 0, scene: SceneConfig | None = None
+def find_demonstration(
+    policy: TaskConditionedPolicy, task: Task, scene: SceneConfig, number: int = 0
 ) -> Demonstration:
-    """Records a demonstration of a task by the scripted expert.
+    """Returns a demonstration of a task: the checkpoint's own, or one that the scripted expert records.
 
     Args:
-        config: Configuration of the policy that the demonstration is for.
+        policy: The policy that the demonstration is for.
         task: The task.
-        number: Number of the demonstration, which draws its scene.
-        scene: Settings of the scene; None for the benchmark's with the policy's image size.
+        scene: Settings of the scenes.
+        number: Number of the expert's demonstration, which draws its scene; with 0, the checkpoint's comes
+            first.
 
     Raises:
         RuntimeError: The expert has failed too often.
     """
-    camera = config.cameras[0].rpartition(".")[-1]
-    whole = expert_demonstration(task.index, number, scene or benchmark_scene(config), camera)
+    config, bank = policy.config, policy.demonstrations
+    if number == 0 and bank is not None and task.instruction in bank.rows:
+        return bank.of_task(task.instruction)[0]
+    whole = expert_demonstration(task.index, number, scene, config.cameras[0].rpartition(".")[-1])
     kept = kept_frames(0, len(whole.frames) - 1, config.n_demo_frames)
     has_grasp = config.gripper_index is not None and config.state_dim > 0
     return replace(

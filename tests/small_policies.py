@@ -253,7 +253,7 @@ SENTENCES = (
     "Put it in the red bin.",
     "wave at me",
     "",
-    "put the blue mug into the red one",
+    "put the blue goblet into the red one",
 )
 
 

@@ -1,5 +1,7 @@
 """Pictures, videos and the page of `deltaco look`."""
 
+import io
+
 import av
 import numpy as np
 import pytest
@@ -15,8 +17,8 @@ from lerobot_deltaco import look as room
 from lerobot_deltaco.arguments import LookArguments
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
 from lerobot_deltaco.look import look
-from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_found, write_video
-from lerobot_deltaco.recording import load_conditioned, record_demonstration, record_episode
+from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_found, encode_video
+from lerobot_deltaco.recording import benchmark_scene, find_demonstration, load_conditioned, record_episode
 
 
 def found_at(pick, place, by_demonstration=(True, True), size=24):
@@ -54,17 +56,15 @@ def test_attention_is_drawn_only_where_the_demonstration_tells():
     assert (last == 128).all()
 
 
-def test_a_video_is_one_that_browsers_play_and_its_end_stays(tmp_path):
+def test_a_video_is_one_that_browsers_play_and_its_end_stays():
     frames = [np.full((65, 48, 3), 20 * n, np.uint8) for n in range(10)]
-    write_video(frames, tmp_path / "video.mp4", fps=8)
-    with av.open(str(tmp_path / "video.mp4")) as video:
+    with av.open(io.BytesIO(encode_video(frames, fps=8))) as video:
         stream = video.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert (stream.width, stream.height) == (48, 64)
         images = [frame.to_ndarray(format="rgb24") for frame in video.decode(stream)]
     assert len(images) == 10 + 8
     assert abs(int(images[-1].mean()) - 180) < 5
-    assert [path.name for path in tmp_path.iterdir()] == ["video.mp4"]
 
 
 def test_an_episode_is_recorded(tmp_path):
@@ -86,9 +86,10 @@ def test_an_episode_is_recorded(tmp_path):
 
 
 def test_the_expert_records_a_demonstration_of_any_task(tmp_path):
-    config = load_tiny_policy(tmp_path).policy.config
+    policy = load_tiny_policy(tmp_path).policy
+    scene = benchmark_scene(policy.config)
     for task_id in (0, 134, 299):
-        one, same, other = (record_demonstration(config, get_task(task_id), n) for n in (0, 0, 1))
+        one, same, other = (find_demonstration(policy, get_task(task_id), scene, n) for n in (0, 0, 1))
         assert one.task == TASKS[task_id].instruction
         assert TASKS[task_id].describes(OBJECTS[one.target_object])
         assert one.frames.shape == (2, 3, 48, 48)

@@ -21,7 +21,7 @@ PhraseSplit = Literal["train", "held_out"]
 
 _FILE = Path(__file__).with_name("phrases.yaml")
 _P_NO_ARTICLE, _P_TYPO = 0.3, 0.1
-_MIN_TYPO_LENGTH = 5  # letters, of a word that is misspelled
+MIN_TYPO_LENGTH = 5  # letters, of a word that is misspelled
 _P_HELD_OUT = 0.4  # of each part of a held-out sentence
 _ENDS = ("", "", ".", "!")
 
@@ -42,7 +42,7 @@ def paraphrase(task: Task, split: PhraseSplit, rng: np.random.Generator) -> str:
 
 def _draw_sentence(task: Task, split: PhraseSplit, rng: np.random.Generator) -> tuple[str, bool]:
     """Draws a sentence, and returns whether it has a held-out phrase."""
-    phrases, is_new = _phrases(), False
+    phrases, is_new = read_phrases(), False
 
     def draw(lists: Mapping[str, list[str]]) -> str:
         nonlocal is_new
@@ -74,16 +74,27 @@ def _draw_sentence(task: Task, split: PhraseSplit, rng: np.random.Generator) -> 
 
 def _misspell(sentence: str, rng: np.random.Generator) -> str:
     """Returns a sentence with two letters of a word swapped, or one left out or doubled."""
-    words = [found for found in re.finditer(r"[a-z]+", sentence) if len(found[0]) >= _MIN_TYPO_LENGTH]
+    words = [found for found in re.finditer(r"[a-z]+", sentence) if len(found[0]) >= MIN_TYPO_LENGTH]
     if not words:
         return sentence
     word = words[int(rng.integers(len(words)))]
-    place = word.start() + int(rng.integers(1, len(word[0]) - 1))
-    before, pair, after = sentence[:place], sentence[place : place + 2], sentence[place + 2 :]
-    changed = (pair[::-1], pair[1:], pair[0] + pair)[int(rng.integers(3))]
-    return before + changed + after
+    position = int(rng.integers(1, len(word[0]) - 1))
+    changed = misspellings(word[0], position)[int(rng.integers(3))]
+    return sentence[: word.start()] + changed + sentence[word.end() :]
+
+
+def misspellings(word: str, position: int) -> tuple[str, str, str]:
+    """Returns a word with two letters swapped, with one left out, and with one doubled.
+
+    Args:
+        word: The word.
+        position: Index of the letter; another one follows.
+    """
+    before, pair, after = word[:position], word[position : position + 2], word[position + 2 :]
+    return before + pair[::-1] + after, before + pair[1:] + after, before + pair[0] + pair + after
 
 
 @cache
-def _phrases() -> dict[str, Any]:
+def read_phrases() -> dict[str, Any]:
+    """Returns the phrases of `phrases.yaml`."""
     return yaml.safe_load(_FILE.read_text(encoding="utf-8"))
