@@ -168,6 +168,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
                 self._actions = deque(chunk.unbind(dim=1))
             return self._actions.popleft()
 
+    @property
+    def p_pick(self) -> Tensor | None:
+        """Probability that the policy gave what it picks, (batch,); None if it gives none."""
+        return None
+
     def _begins_episode(self, batch: dict[str, Any]) -> bool:
         """Returns whether an action for a batch begins an episode: after a reset, or for other tasks."""
         return self._episode is None or self._episode.instructions != self._tasks_of(batch)[0]

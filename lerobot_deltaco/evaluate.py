@@ -155,8 +155,8 @@ class Evaluation:
             infos = run_episodes(
                 self.loaded, self.simulators, batch, demonstrations, callback, self.plan.joint_noise
             )
-        found = getattr(self.loaded.policy, "found", None)
-        p_picks = [math.nan] * len(batch) if found is None else found.p_pick.tolist()
+        p_pick = self.loaded.policy.p_pick if isinstance(self.loaded.policy, TaskConditionedPolicy) else None
+        p_picks = [math.nan] * len(batch) if p_pick is None else p_pick.tolist()
         # Without the demonstrations' tensors, which should not be sent between processes.
         return [
             Outcome(

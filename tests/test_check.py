@@ -88,7 +88,7 @@ def test_what_does_not_fit_is_shown_without_a_policy(tmp_path):
 
 
 def test_tasks_with_the_same_words_are_named(table, tmp_path, monkeypatch):
-    same = ["move the red object 1", "Move the red object 2!"]
+    same = ["move the red object 🙂", "Move the red object!"]
     for task in same:
         monkeypatch.setitem(COLORS, task, COLORS[TABLE_TASKS[0]])
     moves = [(same[n % 2], *move[1:]) for n, move in enumerate(random_moves(24))]

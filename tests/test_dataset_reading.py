@@ -220,7 +220,7 @@ def test_instructions_that_the_policy_cannot_tell_apart(tmp_path, monkeypatch, c
         expected = "2 of 3 tasks from others by their instructions, such as 'wave' and 'dance'"
     else:
         small_policy(dataset, policy)
-        expected = "2 of 3 tasks" if "放" not in tasks[0] else ""
+        expected = "2 of 3 tasks" if "🍎" in tasks[0] else ""
     assert caplog.text.count("cannot tell") == bool(expected)
     assert expected in caplog.text
 

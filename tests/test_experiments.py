@@ -92,6 +92,7 @@ def make_record(experiment, seed, step, plan):
             "object_containers": [-1, -1, -1],
             "right_object": False,
             "right_container": False,
+            "p_pick": None,
         }
         for task_id in plan.task_ids
         for trial in range(plan.trials)

@@ -309,10 +309,10 @@ def test_a_loss_that_is_not_finite_ends_the_training(train, tmp_path, monkeypatc
 def test_a_mistake_ends_the_command_in_one_line(benchmark, tmp_path, monkeypatch, options, message):
     monkeypatch.chdir(tmp_path)
 
-    def train(arguments):
+    def train(name, arguments):
         run_training(benchmark, tmp_path / "run", options)
 
-    monkeypatch.setattr(cli, "_train", train)
+    monkeypatch.setattr(cli, "_run", train)
     monkeypatch.setattr(sys, "argv", ["deltaco", "train"])
     with pytest.raises(SystemExit) as error:
         cli.main()

@@ -343,6 +343,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """What was found at the start of the running episode; None before its first action."""
         return None if self._episode is None else self._episode.found
 
+    @property
+    def p_pick(self) -> Tensor | None:
+        """Probability of the pick location among the proposals, (batch,); None before the first action."""
+        return None if self._episode is None else self._episode.found.p_pick
+
     @torch.no_grad()
     def _find(
         self,
