@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RowsOf = Callable[[Result, Sequence[Result]], Iterator[dict[str, Any]]]
-PAGE, FIGURE = "report.md", "success.png"
+PAGE, FIGURE, CALIBRATION = "report.md", "success.png", "calibration.png"
 _SURE = (0, 0.5, 0.7, 0.9, 0.97, 1)  # bounds of a policy's probability of what it picks
 KINDS = ("name", "color", "shape", "color_shape", "foreign")
 # Options of a policy that may differ between the training runs of an experiment.
@@ -51,6 +51,10 @@ def write_report(paths: tyro.conf.Positional[Sequence[Path]], out: Path = Path("
         else:
             write_text(out / f"{name}.csv", csv_table(table))
     draw_success(results).savefig(out / FIGURE)
+    if tables["calibration"].empty:
+        (out / CALIBRATION).unlink(missing_ok=True)
+    else:
+        draw_calibration(tables["calibration"]).savefig(out / CALIBRATION)
     write_text(out / PAGE, "\n".join(_page(results, tables)))
     return out / PAGE
 
@@ -68,6 +72,8 @@ def _page(results: Sequence[Result], tables: dict[str, pd.DataFrame]) -> Iterato
         if not tables[name].empty:
             yield f"## {name.capitalize()}\n\n{text} [CSV]({name}.csv)\n"
             yield markdown_table(tables[name].map(escape))
+            if name == "calibration":
+                yield f"![Right grasps by the policy's probability]({CALIBRATION})\n"
     if warnings := list(_warnings(results)):
         yield "## Warnings\n\n" + "".join(f"- {warning}\n" for warning in warnings)
     made_with = {f"{name} {version}" for item in versions for name, version in item.items()}
@@ -163,7 +169,9 @@ def counterfactual_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[st
 
 
 def calibration_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
-    """Yields how often grasps are of the right object, by how sure the policy was."""
+    """Yields how often grasps are of the right object, by how sure the policy was, if its inputs agree."""
+    if result.settings["counterfactual"] != "none":
+        return
     grasps = result.episodes[result.episodes["grasped_object"] >= 0]
     for sure, some in grasps.groupby(pd.cut(grasps["p_pick"], _SURE, include_lowest=True), observed=True):
         yield {
@@ -292,4 +300,21 @@ def draw_success(results: Sequence[Result]) -> Figure:
     for ax in axes:
         ax.grid(color="0.92")
         ax.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def draw_calibration(table: pd.DataFrame) -> Figure:
+    """Draws how often grasps are right over the policy's probability, points being as large as their number."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5, 4.2), dpi=140, layout="constrained")
+    ax = figure.subplots()
+    ax.plot([0, 1], [0, 1], color="0.8", linestyle=":")
+    for (experiment, _), rows in table.groupby(["experiment", "variant"], sort=False):
+        (line,) = ax.plot(rows["mean_probability"], rows["right_object"], linewidth=1, label=experiment)
+        ax.scatter(rows["mean_probability"], rows["right_object"], rows["grasps"], color=line.get_color())
+    ax.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="probability of the choice", ylabel="right object grasped")
+    ax.legend(frameon=False, fontsize=7, loc="lower right")
+    ax.grid(color="0.92")
+    ax.spines[["top", "right"]].set_visible(False)
     return figure
