@@ -89,8 +89,10 @@ def parse_lerobot(command: str, arguments: list[str], monkeypatch: pytest.Monkey
     from lerobot.configs import PreTrainedConfig
 
     monkeypatch.syspath_prepend(ROOT / "examples")
-    for module in ("lerobot.policies", "lerobot.envs", "lerobot_policy_deltaco", "lerobot_policy_example"):
+    own = ("lerobot_policy_deltaco", "lerobot_policy_example", "other_environments")
+    for module in ("lerobot.policies", "lerobot.envs", *own):
         importlib.import_module(module)
+    arguments = [word for word in arguments if not word.startswith("--env.discover_packages_path=")]
     module, name = LEROBOT_CONFIGURATIONS[command]
     configuration = getattr(importlib.import_module(module), name)
     if any(word.startswith("--policy.path=") for word in arguments):

@@ -195,9 +195,13 @@ def test_changes_alone_tell_where_states_are_in_the_image():
     first = stacked_images([draw_table(task, start, other) for task, start, other, _ in moves])
     last = stacked_images([draw_table(task, end, other) for task, _, other, end in moves])
     starts = np.stack([start for _, start, _, _ in moves])
-    states = torch.from_numpy(np.stack([state_at(start) for start in starts]))
+    states = torch.from_numpy(np.stack([state_at(start) for start in starts])).float()
+    # Velocities are large while the arm moves, but only noise at a grasp.
+    velocities = 0.05 * torch.randn(len(states), 5, generator=torch.Generator().manual_seed(0))
+    scale = torch.cat([1 / states.std(dim=0), torch.ones(5)])
+    states = torch.cat([states, velocities], dim=1)
     to_image = StateToImage(states.shape[1])
-    to_image.fit(first, last, states)
+    to_image.fit(first, last, states, scale)
     errors = (to_image(states) - torch.from_numpy(starts).float()).norm(dim=1) * TABLE_SIZE / 2  # px
     assert errors.median() < 1
     assert errors.max() < 2.5

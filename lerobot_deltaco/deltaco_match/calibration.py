@@ -41,18 +41,20 @@ class StateToImage(nn.Module):
         self.register_buffer("scale", torch.zeros(state_dim))
         self.register_buffer("weights", torch.zeros(_quadratic(self.mean).shape[-1], 2))
 
-    def fit(self, first: Tensor, last: Tensor, states: Tensor) -> None:
+    def fit(self, first: Tensor, last: Tensor, states: Tensor, scale: Tensor) -> None:
         """Learns the map from episodes.
 
         Args:
             first: First images of episodes, (episodes, 3, H, W) uint8.
             last: Last images of the same episodes.
             states: States at their grasps, (episodes, state), at least `MIN_EPISODES`.
+            scale: Factor by which each dimension counts, (state,), such as 1 / its standard deviation over
+                all frames. So velocities, which are only noise at a grasp, hardly count.
         """
         states = states.float()
         mean, std = states.mean(dim=0), states.std(dim=0)
         self.mean.copy_(mean)
-        self.scale.copy_(torch.where(std > 1e-6 * (1 + mean.abs()), 1 / std.clamp_min(1e-12), 0.0))
+        self.scale.copy_(torch.where(std > 1e-6 * (1 + mean.abs()), scale, 0.0))
         changes = _changes(first, last)  # (episodes, H, W)
         x = (states - mean) * self.scale.to(mean)
         centers, members = _clusters(x)

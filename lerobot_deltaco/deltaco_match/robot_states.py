@@ -95,7 +95,7 @@ class RobotStates(nn.Module):
             ValueError: There are too few episodes in which the gripper closes and opens.
         """
         found = keyframes.found
-        self.to_image.fit(first[found], last[found], keyframes.states[found, 0])
+        self.to_image.fit(first[found], last[found], keyframes.states[found, 0], scale)
         locations = self.to_image(keyframes.states).clamp(-1, 1)
         locations = torch.where(found[:, None, None], locations, 0.0)
         self.state_scale.copy_(scale)
