@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 PARAPHRASE_SPLITS = ("all", "train", "held_out")
 # Choice of `chunk_size`: its duration, the least length of the episodes, in frames, and its maximum.
-_CHUNK_SECONDS, _MIN_CHUNKED_FRAMES, _MAX_CHUNK = 2 / 3, 60, 50
+_CHUNK_SECONDS, _MIN_CHUNKED_SECONDS, _MAX_CHUNK = 2 / 3, 2.5, 50
 # Options that name files and datasets of the training machine, whose contents are in the checkpoint.
 SOURCES = ("paraphrases", "demo_repo_id", "demo_root")
 
@@ -41,7 +41,7 @@ class TaskConditionedConfig(PreTrainedConfig):
             the task string.
         image_size: Height and width to which images are scaled, px.
         chunk_size: Number of steps that the policy predicts at once. With None, training chooses two thirds
-            of a second, or one step if episodes have fewer than 60.
+            of a second, or one step if episodes last less than 2.5 s.
         n_action_steps: Number of steps of a chunk that are carried out before the next one is predicted;
             None for all.
         temporal_ensemble_coeff: Coefficient of ACT's temporal ensembling, which predicts a chunk at every
@@ -243,7 +243,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     def set_dataset_length(self, meta: LeRobotDatasetMetadata) -> None:
         """Chooses `chunk_size` by the length of the training episodes, if it is not given."""
         if self.chunk_size is None:
-            is_short = meta.total_frames < _MIN_CHUNKED_FRAMES * meta.total_episodes
+            is_short = meta.total_frames < _MIN_CHUNKED_SECONDS * meta.fps * meta.total_episodes
             self.chunk_size = 1 if is_short else min(max(1, round(_CHUNK_SECONDS * meta.fps)), _MAX_CHUNK)
 
     def validate_features(self) -> None:
