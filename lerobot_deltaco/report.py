@@ -304,7 +304,7 @@ def draw_success(results: Sequence[Result]) -> Figure:
 
 
 def draw_calibration(table: pd.DataFrame) -> Figure:
-    """Draws how often grasps are right over the policy's probability, points being as large as their number."""
+    """Draws how often grasps are right over the policy's probability, points as large as their number."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 4.2), dpi=140, layout="constrained")

@@ -190,7 +190,8 @@ def test_cosine_schedule_warms_up_and_ends_at_zero():
 
 
 @pytest.mark.parametrize(
-    ("n_frames", "fps", "expected"), [(30, 24, 1), (150, 30, 20), (400, 50, 33), (90, 1, 1), (57, 10, 7), (900, 200, 50)]
+    ("n_frames", "fps", "expected"),
+    [(30, 24, 1), (150, 30, 20), (400, 50, 33), (90, 1, 1), (57, 10, 7), (900, 200, 50)],
 )
 def test_a_chunk_lasts_two_thirds_of_a_second_where_steps_are_small(n_frames, fps, expected):
     meta = SimpleNamespace(total_frames=7 * n_frames, total_episodes=7, fps=fps)
