@@ -15,7 +15,7 @@ from PIL import Image
 
 from gym_deltaco.layout import Layout
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import N_ROWS, TASKS, get_task, select_tasks
+from gym_deltaco.tasks import N_ROWS, TASKS, ContainerWord, get_task, select_tasks
 from lerobot_deltaco.arguments import PlayArguments
 from lerobot_deltaco.demonstrations import Demonstration
 from lerobot_deltaco.evaluate import Simulators
@@ -254,7 +254,7 @@ def suggest_sentences(choice: Choice, layout: Layout) -> list[str]:
     target = layout.objects[layout.target_object].label
     others = [item.label for item in layout.objects if item.label != target]
     bins = layout.containers[layout.target_container], layout.containers[1 - layout.target_container]
-    words = ("left", "right", "front", "back")
+    words: tuple[ContainerWord, ...] = ("left", "right", "front", "back")
     side = next(word for word in words if bins[1].satisfies(word) and not bins[0].satisfies(word))
     return [
         get_task(choice.task_id).instruction,
@@ -402,7 +402,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
         def on(triggers: list[Any], function: Any, taken: Any, changed: Any, **options: Any) -> None:
             gr.on(triggers, function, taken, changed, concurrency_id="policy", concurrency_limit=1, **options)
 
-        quiet = {"show_progress": "hidden"}
+        quiet: dict[str, Any] = {"show_progress": "hidden"}
         on([page.load], begin, None, outputs, **quiet)
         on([task.input, seed.submit, seed.blur], change_scene, [seen, *inputs], outputs, **quiet)
         on([new_scene.click], draw_scene, [seen, *inputs], outputs, **quiet)
