@@ -21,7 +21,7 @@ from lerobot_deltaco.paraphrases import GRAMMAR
 logger = logging.getLogger(__name__)
 
 PARAPHRASE_SPLITS = ("all", "train", "held_out")
-# Choice of `chunk_size`: its duration, the least length of the episodes, in frames, and its maximum.
+# Choice of `chunk_size`: its duration and the least duration of the episodes, in s, and its maximum.
 _CHUNK_SECONDS, _MIN_CHUNKED_SECONDS, _MAX_CHUNK = 2 / 3, 2.5, 50
 # Options that name files and datasets of the training machine, whose contents are in the checkpoint.
 SOURCES = ("paraphrases", "demo_repo_id", "demo_root")
