@@ -51,8 +51,14 @@ benchmark: $(INSTALLED) ## Measure speed: make benchmark ARGS=env, train or poli
 coverage: $(INSTALLED) ## Run the default tests and report which lines they reach: htmlcov/index.html
 	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered --cov-report=html $(ARGS)
 
-release: $(INSTALLED) ## Check what a release needs, and print the commands that publish it
-	$(BIN)/python scripts/release.py $(ARGS)
+release: $(INSTALLED) docs ## Build the wheel, and try it in an empty environment; `uv publish dist/*.whl` publishes it
+	test -z "$$(git status --porcelain)"
+	rm -rf dist
+	$(BIN)/uv build --out-dir dist
+	$(BIN)/uv venv --python $(BIN)/python dist/trial
+	$(BIN)/uv pip install --python dist/trial "$$(ls dist/*.whl)[sim,offline]"
+	cd dist && trial/bin/deltaco evaluate trial/lib/python3*/site-packages/lerobot_deltaco/checkpoints/pick_place \
+		--tasks 24 --trials 1
 
 # Candidates are run, not only looked up: a shim may be on the path and still fail. Building PyBullet also needs
 # Python's headers.
