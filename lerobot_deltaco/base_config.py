@@ -4,7 +4,6 @@
 
 import copy
 import logging
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +19,6 @@ from lerobot_deltaco.paraphrases import GRAMMAR
 
 logger = logging.getLogger(__name__)
 
-PARAPHRASE_SPLITS = ("all", "train", "held_out")
 # Choice of `chunk_size`: its duration and the least duration of the episodes, in s, and its maximum.
 _CHUNK_SECONDS, _MIN_CHUNKED_SECONDS, _MAX_CHUNK = 2 / 3, 2.5, 50
 # Options that name files and datasets of the training machine, whose contents are in the checkpoint.
@@ -33,10 +31,9 @@ class TaskConditionedConfig(PreTrainedConfig):
 
     Args:
         paraphrases: Sentences in people's words for the benchmark's tasks, from which instructions are drawn
-            in training: "grammar" for those that the benchmark makes from phrases, or a CSV file. With
-            "grammar", the tasks of other datasets keep their task strings.
-        paraphrases_split: Split of the sentences for training: train, the sentences that are not held out for
-            any task; held_out; or all.
+            in training: "grammar" for those that the benchmark makes from phrases; or a CSV file, of whose
+            sentences the last one of each task is held out. With "grammar", the tasks of other datasets keep
+            their task strings.
         p_paraphrase: Probability that a training sample's instruction is such a sentence; otherwise, it is
             the task string.
         image_size: Height and width to which images are scaled, px.
@@ -77,7 +74,6 @@ class TaskConditionedConfig(PreTrainedConfig):
     """
 
     paraphrases: str | None = None
-    paraphrases_split: str = "train"
     p_paraphrase: float = 1.0
     image_size: int = 48
     chunk_size: int | None = 1
@@ -128,51 +124,27 @@ class TaskConditionedConfig(PreTrainedConfig):
         Raises:
             ValueError: An option is invalid; the message says what is valid.
         """
-        self.check_choices(
-            paraphrases_split=PARAPHRASE_SPLITS,
-            gripper_closed=("low", "high"),
-            dtype=("float32", "bfloat16"),
-        )
+        self.check_choices(gripper_closed=("low", "high"), dtype=("float32", "bfloat16"))
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
             raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
         self.check_ranges(
             p_paraphrase=(0, 1),
             image_size=(16, 1024),
             num_mixture_components=(1, 1000),
-            tasks_per_batch=(0, 1_000_000),
-            upsampled_fraction=(0, 1),
-            seed=(0, 2**63 - 1),
+            chunk_size=(1, 1000),
+            n_action_steps=(1, self.chunk_size or _MAX_CHUNK),
             optimizer_lr=(1e-12, 10),
-            optimizer_weight_decay=(0, 1e3),
-            scheduler_warmup_steps=(0, 1_000_000_000),
-            grad_clip_norm=(0, 1e6),
         )
-        if self.chunk_size is not None:
-            self.check_ranges(chunk_size=(1, 1000))
-        longest = self.chunk_size or _MAX_CHUNK
-        if self.n_action_steps is not None and not 1 <= self.n_action_steps <= longest:
-            raise ValueError(
-                f"`n_action_steps` must be from 1 to `chunk_size`, {longest}. Got {self.n_action_steps}."
-            )
         if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
             raise ValueError(
                 "`temporal_ensemble_coeff` needs `n_action_steps=1`: it predicts a chunk at every step. "
                 f"Got {self.n_action_steps}."
             )
-        check_pattern("upsampled_tasks", self.upsampled_tasks)
         if self.demo_repo_id is not None and not self.demo_repo_id.strip():
             raise ValueError(
                 "`demo_repo_id` is empty. Name a dataset, such as USER/NAME, or leave it out. With "
                 "--policy.demo_root, any name will do."
             )
-        # Images must stay in 0..1, and actions in -1..1: the networks are made for these.
-        valid = {"VISUAL": ("IDENTITY",), "ACTION": ("MIN_MAX", "IDENTITY")}
-        for kind, names in valid.items():
-            mode = self.normalization_mapping.get(kind, NormalizationMode.IDENTITY)
-            if mode.name not in names:
-                raise ValueError(
-                    f"`normalization_mapping` must be {' or '.join(names)} for {kind}. Got {mode.name}."
-                )
 
     def check_choices(self, **choices: Any) -> None:
         """Checks that options are among their valid values.
@@ -186,14 +158,14 @@ class TaskConditionedConfig(PreTrainedConfig):
                 raise ValueError(f"`{name}` must be one of {names}. Got {getattr(self, name)!r}.")
 
     def check_ranges(self, **ranges: tuple[float, float]) -> None:
-        """Checks that options are between their minimum and maximum valid values.
+        """Checks that options, if given, are between their minimum and maximum valid values.
 
         Raises:
             ValueError: One is not.
         """
         for name, (least, greatest) in ranges.items():
             value = getattr(self, name)
-            if not least <= value <= greatest:
+            if value is not None and not least <= value <= greatest:
                 raise ValueError(f"`{name}` must be from {least} to {greatest}. Got {value}.")
 
     # From the dataset
@@ -205,10 +177,6 @@ class TaskConditionedConfig(PreTrainedConfig):
 
         LeRobot calls this with the training dataset's features, before it makes the policy. The policy calls
         it again with the statistics, which tell which of several grippers moves.
-
-        Args:
-            features: Features of the training dataset.
-            stats: Its statistics.
 
         Raises:
             ValueError: The names of the action's dimensions cannot be read.
@@ -257,29 +225,14 @@ class TaskConditionedConfig(PreTrainedConfig):
                 "The policy needs at least one camera. The dataset's inputs are "
                 f"{', '.join(sorted(self.input_features or {})) or 'none'}."
             )
-        if self.action_feature is None:
-            raise ValueError(
-                "The policy needs the feature 'action'. The dataset's outputs are "
-                f"{', '.join(sorted(self.output_features or {})) or 'none'}."
-            )
+        assert self.action_feature is not None
         check_image_shapes({name: feature.shape for name, feature in self.image_features.items()})
-        for name, feature in (
-            ("action", self.action_feature),
-            ("observation.state", self.robot_state_feature),
-        ):
-            if feature is not None and (len(feature.shape) != 1 or feature.shape[0] < 1):
-                raise ValueError(
-                    f"`{name}` must be a vector, of the shape (n,). The dataset's has the shape "
-                    f"{tuple(feature.shape)}."
-                )
         (action_dim,) = self.action_feature.shape
         if self.gripper_index is not None and not self.gripper_index < action_dim:
             raise ValueError(
                 f"`gripper` is {self.gripper_index}, but the action has only the dimensions 0 to "
                 f"{action_dim - 1}. Name one of these, or 'none'."
             )
-        if action_dim == 1 and self.gripper_index is not None:
-            raise ValueError("The action consists only of the gripper. Set `gripper` to 'none' to learn it.")
         if self.demo_camera is not None and self.demo_camera not in self.image_features:
             raise ValueError(
                 f"`demo_camera` must be one of the dataset's cameras, {', '.join(self.image_features)}. Got "
@@ -309,12 +262,10 @@ class TaskConditionedConfig(PreTrainedConfig):
         """Size of the robot's state, 0 without one."""
         return self.robot_state_feature.shape[0] if self.robot_state_feature else 0
 
-    # Implemented by each policy
-
     @property
     def uses_demonstrations(self) -> bool:
         """Whether the policy takes demonstrations."""
-        raise NotImplementedError
+        return True
 
     @property
     def n_demo_frames(self) -> int:
@@ -363,9 +314,6 @@ def dimension_names(feature: dict[str, Any]) -> list[str]:
 
     These are a list, lists in a list or under names of groups, and a dictionary from name to index.
 
-    Args:
-        feature: The feature, as in meta/info.json.
-
     Raises:
         ValueError: The names cannot be read, or are not as many as the dimensions.
     """
@@ -393,7 +341,7 @@ def _flat_names(names: Any) -> list[Any]:
 
 
 def check_image_shapes(shapes: dict[str, Sequence[int]]) -> None:
-    """Checks that cameras give images of three colors.
+    """Checks that cameras, unlike depth cameras, give images of three colors.
 
     Args:
         shapes: Shapes of the cameras' images, by name.
@@ -408,18 +356,6 @@ def check_image_shapes(shapes: dict[str, Sequence[int]]) -> None:
             "lerobot-edit-dataset --repo_id=DATASET --operation.type=remove_feature "
             f'--operation.feature_names="{list(wrong)}" makes a dataset without them.'
         )
-
-
-def check_pattern(name: str, pattern: str | None) -> None:
-    """Checks that an option is a regular expression, or None.
-
-    Raises:
-        ValueError: It is not.
-    """
-    try:
-        re.compile(pattern or "")
-    except re.error as error:
-        raise ValueError(f"`{name}` must be a regular expression. Got {pattern!r}: {error}.") from None
 
 
 def _has_bfloat16() -> bool:

@@ -6,7 +6,7 @@ import contextlib
 import copy
 import logging
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -14,12 +14,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
+from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
 from lerobot_deltaco.base_config import TaskConditionedConfig
 from lerobot_deltaco.dataset_reading import (
     check_episode_numbers,
@@ -36,8 +37,9 @@ from lerobot_deltaco.demonstrations import (
 )
 from lerobot_deltaco.language import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.losses import imitation_loss, join_action
-from lerobot_deltaco.networks import ActionDistribution, PolicyNetwork
+from lerobot_deltaco.networks import ActionDistribution, PolicyNetwork, fuse_batch_norms
 from lerobot_deltaco.normalization import StateLimits
+from lerobot_deltaco.paraphrases import GRAMMAR, read_paraphrases
 from lerobot_deltaco.task_bank import (
     PROCESSORS,
     TASK_BANK,
@@ -155,16 +157,16 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             ValueError: There is no instruction, or a task has no demonstration.
             FloatingPointError: The action is not finite, or absurdly large.
         """
-        config = self.config
         # In bfloat16, in which LeRobot's training evaluates, an action would depend on the rest of the batch.
+        coefficient = self.config.temporal_ensemble_coeff
         with torch.autocast(self.step.device.type, enabled=False):
-            if config.temporal_ensemble_coeff is not None:
+            if coefficient is not None:
                 chunk = self.predict_action_chunk(batch)
                 if self._ensemble is None:
-                    self._ensemble = ACTTemporalEnsembler(config.temporal_ensemble_coeff, chunk.shape[1])
+                    self._ensemble = ACTTemporalEnsembler(coefficient, chunk.shape[1])
                 return self._ensemble.update(chunk)
             if self._begins_episode(batch) or not self._actions:
-                chunk = self.predict_action_chunk(batch)[:, : config.n_action_steps]
+                chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
                 self._actions = deque(chunk.unbind(dim=1))
             return self._actions.popleft()
 
@@ -194,23 +196,6 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             f"{'none' if tasks is None else repr(tasks)}. LeRobot takes it from the environment's "
             '`task_description`, or from --task; in Python, set observation["task"] before the preprocessor.'
         )
-
-    def _checked_action(self, action: Tensor, batch: dict[str, Any]) -> Tensor:
-        """Returns an action unless it could not be carried out.
-
-        Raises:
-            FloatingPointError: It is not finite, or absurdly far outside of -1..1.
-        """
-        if bool((action.abs() < _ABSURD_ACTION).all()):  # False for NaN
-            return action
-        damaged = _not_finite(batch)
-        cause = (
-            f"In the observation, {', '.join(f'`{name}`' for name in damaged)} has numbers that are not "
-            "finite: check the sensors, and the normalization statistics of the checkpoint."
-            if damaged
-            else "The observation is finite, so the weights of the checkpoint are damaged. Fetch it again."
-        )
-        raise FloatingPointError(f"The policy's action is not finite, or absurdly large. {cause}")
 
     def banked_demonstrations(self, tasks: Sequence[str], n_each: int = 1) -> list[list[Demonstration]]:
         """Returns demonstrations of tasks from the bank; samples of the same task take different ones.
@@ -261,13 +246,26 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             predicted, gripper, log_std, batch[ACTION], is_pad, self.config.gripper_index, gripper_kind
         )
 
+    def _acting_network(self) -> PolicyNetwork:
+        """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
+        return self.model if self.training else fuse_batch_norms(self.model)
+
     def _likeliest(
         self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None
     ) -> Tensor:
-        """Returns the likeliest actions of a chunk, (batch, steps, action), unless they are absurd."""
+        """Returns the likeliest actions of a chunk, (batch, steps, action); an absurd one is an error."""
         opening = None if gripper is None else torch.sigmoid(gripper.float())
         action = join_action(predicted.mode.float(), opening, self.config.gripper_index)
-        return self._checked_action(action, batch)
+        if bool((action.abs() < _ABSURD_ACTION).all()):  # False for NaN
+            return action
+        damaged = _not_finite(batch)
+        cause = (
+            f"In the observation, {', '.join(f'`{name}`' for name in damaged)} has numbers that are not "
+            "finite: check the sensors, and the normalization statistics of the checkpoint."
+            if damaged
+            else "The observation is finite, so the weights of the checkpoint are damaged. Fetch it again."
+        )
+        raise FloatingPointError(f"The policy's action is not finite, or absurdly large. {cause}")
 
     # Training
 
@@ -308,7 +306,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             robot_data = read_robot_data(dataset, chosen, self.config.cameras[0])
         self.set_training_data(bank, robot_data)
 
-    def _read_bank(self, dataset: Any, episodes: Sequence[int] | None) -> DemonstrationBank:
+    def _read_bank(self, dataset: LeRobotDataset, episodes: Sequence[int] | None) -> DemonstrationBank:
         config = self.config
         return read_demonstrations(
             dataset, config.cameras[0], config.image_size, config.n_demo_frames, episodes
@@ -321,7 +319,12 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
         if self._meta is not None:
             compare_robots(self._meta, dataset.meta)
-        return self._read_bank(dataset, None)
+        bank = self._read_bank(dataset, None)
+        self._complete_bank(bank, dataset)
+        return bank
+
+    def _complete_bank(self, bank: DemonstrationBank, dataset: LeRobotDataset) -> None:
+        """Adds what else the policy needs of demonstrations for evaluation."""
 
     def _step_generator(self) -> torch.Generator:
         """Returns the random generator of a training step, on the CPU."""
@@ -340,11 +343,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     def _finish_step(
         self, batch: dict[str, Any], loss: Tensor, logged: dict[str, Tensor], reduction: str
     ) -> tuple[Tensor, dict[str, float]]:
-        """Checks and reduces the loss of each sample (batch,), and counts the training step.
-
-        Raises:
-            TrainingDivergedError: The loss is not finite.
-        """
+        """Checks and reduces the loss of each sample (batch,), and counts the training step."""
         if self.training:
             if not bool(torch.isfinite(loss).all()):
                 raise TrainingDivergedError(_why_not_finite(batch, int(self.step)))
@@ -362,11 +361,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     # Checkpoints
 
     def _save_pretrained(self, save_directory: Path, *args: Any, **kwargs: Any) -> None:
-        name = _non_finite_weight(self)
-        if name is not None:
+        damaged = _not_finite(self.state_dict())
+        if damaged:
             raise TrainingDivergedError(
-                f"After training step {int(self.step)}, the weight {name} is not finite, and no checkpoint "
-                "is saved. Lower --policy.optimizer_lr, or limit the gradient with "
+                f"After training step {int(self.step)}, the weight {damaged[0]} is not finite, and no "
+                "checkpoint is saved. Lower --policy.optimizer_lr, or limit the gradient with "
                 "--policy.grad_clip_norm=10, and continue from the last checkpoint with --resume=true."
             )
         # LeRobot 0.6.1 may pass a `state_dict`; later versions do not, and call this on every process.
@@ -424,9 +423,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         if policy._stats is not None:
             # Training normalizes states by its own dataset, not by that of the weights that it begins with.
             policy.state_limits = limits
-        name = _non_finite_weight(policy)
-        if name is not None:
-            raise ValueError(f"{model_file} is damaged: the weight {name} has numbers that are not finite.")
+        damaged = _not_finite(policy.state_dict())
+        if damaged:
+            raise ValueError(
+                f"{model_file} is damaged: the weight {damaged[0]} has numbers that are not finite."
+            )
         return policy
 
     def generate_model_card(
@@ -465,29 +466,18 @@ def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadat
     """Reads the sentences for training, by task string."""
     if config.paraphrases is None:
         return None
-    from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
-    from lerobot_deltaco.paraphrases import GRAMMAR, read_paraphrases
-
     known = {task.instruction: task.index for task in (*TASKS, *COLOR_SHAPE_TASKS)}
     needed = [known[text] for text in meta.tasks.index if text in known]
-    sentences = read_paraphrases(config.paraphrases, config.paraphrases_split, needed)
+    sentences = read_paraphrases(config.paraphrases, "train", needed)
     by_task = {get_task(task_id).instruction: own for task_id, own in sentences.items()}
     return Paraphrases(by_task, config.p_paraphrase, is_complete=config.paraphrases != GRAMMAR)
 
 
-def _non_finite_weight(module: nn.Module) -> str | None:
-    """Returns the name of a weight with a number that is not finite; None if there is none."""
-    for name, tensor in module.state_dict().items():
-        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-            return name
-    return None
-
-
-def _not_finite(batch: dict[str, Any]) -> list[str]:
-    """Returns the names of the tensors of a batch with numbers that are not finite."""
+def _not_finite(tensors: Mapping[str, Any]) -> list[str]:
+    """Returns the names of the tensors with numbers that are not finite."""
     return [
         name
-        for name, values in batch.items()
+        for name, values in tensors.items()
         if isinstance(values, Tensor) and values.is_floating_point() and not bool(values.isfinite().all())
     ]
 

@@ -109,7 +109,7 @@ class TrainingStart:
         self.bytes = memory_for_frames(dataset, size)
         self.policy = make_policy(config, ds_meta=dataset.meta).train()
         self.policy.feature_matching.fitted.fill_(True)  # the fit takes minutes, and is left out
-        data = read_robot_data(dataset, range(dataset.meta.total_episodes), config.cameras[0])
+        data = read_robot_data(dataset, range(dataset.meta.total_episodes))
         self.grasps = find_grasps(config.gripper_opening(data.actions), data.spans)
         self.bank = read_demonstrations(dataset, config.cameras[0], config.image_size, config.n_demo_frames)
         self.policy.set_training_data(self.bank, data)

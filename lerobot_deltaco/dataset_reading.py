@@ -7,10 +7,10 @@ have a table of episodes, statistics or tasks that do not belong to the frames.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -28,11 +28,7 @@ _TOLERANCE = 1e-3  # of numbers beyond the range of the statistics, as a fractio
 
 
 def check_dataset_folder(option: str, root: str | Path | None) -> None:
-    """Checks that a folder holds a dataset, if the Hub is offline.
-
-    Args:
-        option: Command-line option that names the folder, for the error.
-        root: The folder; None for LeRobot's cache.
+    """Checks that the folder named by a command-line option holds a dataset, if the Hub is offline.
 
     Raises:
         FileNotFoundError: It holds none.
@@ -95,32 +91,27 @@ def missing_files_named(
         yield
     except Exception as error:
         folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
-        if not (folder / "meta/info.json").exists():
-            raise
-        for name in ("meta/tasks.parquet", "meta/episodes"):
-            if not (folder / name).exists():
-                _raise_missing(folder / name, "The dataset", error)
-        meta = LeRobotDatasetMetadata(repo_id, folder)
-        chosen = range(meta.total_episodes) if episodes is None else episodes
-        check_episode_numbers(repo_id, meta.total_episodes, chosen)
-        for episode in chosen:
-            for path in _files(meta, episode):
+        if (folder / "meta/info.json").exists():
+            for owner, path in _needed_files(repo_id, folder, episodes):
                 if not path.exists():
-                    _raise_missing(path, f"Episode {episode}", error)
+                    raise FileNotFoundError(
+                        f"{path} is missing. {owner} needs it, and it could not be downloaded. Copy it "
+                        "there, or leave out the episode with --dataset.episodes."
+                    ) from error
         raise
 
 
-def _raise_missing(path: Path, owner: str, error: Exception) -> NoReturn:
-    raise FileNotFoundError(
-        f"{path} is missing. {owner} needs it, and it could not be downloaded. Copy it there, or leave out "
-        "the episode with --dataset.episodes."
-    ) from error
-
-
-def _files(meta: LeRobotDatasetMetadata, episode: int) -> list[Path]:
-    """Returns the files that hold an episode."""
-    videos = [meta.get_video_file_path(episode, name) for name in meta.video_keys]
-    return [meta.root / path for path in (meta.get_data_file_path(episode), *videos)]
+def _needed_files(repo_id: str, folder: Path, episodes: Sequence[int] | None) -> Iterator[tuple[str, Path]]:
+    """Yields the files of a dataset that some episodes need, and who needs each."""
+    for name in ("meta/tasks.parquet", "meta/episodes"):
+        yield "The dataset", folder / name
+    meta = LeRobotDatasetMetadata(repo_id, folder)
+    chosen = range(meta.total_episodes) if episodes is None else episodes
+    check_episode_numbers(repo_id, meta.total_episodes, chosen)
+    for episode in chosen:
+        videos = [meta.get_video_file_path(episode, name) for name in meta.video_keys]
+        for path in (meta.get_data_file_path(episode), *videos):
+            yield f"Episode {episode}", meta.root / path
 
 
 def check_episode_numbers(repo_id: str, total: int, episodes: Sequence[int]) -> None:
@@ -130,11 +121,16 @@ def check_episode_numbers(repo_id: str, total: int, episodes: Sequence[int]) -> 
         ValueError: It does not.
     """
     if not len(episodes) or not all(0 <= episode < total for episode in episodes):
-        shown = ", ".join(map(str, episodes[:10])) + (", ..." if len(episodes) > 10 else "")  # noqa: PLR2004
         raise ValueError(
-            f"{repo_id} has the episodes 0 to {total - 1}. Got {shown or 'none'}. Name others in "
+            f"{repo_id} has the episodes 0 to {total - 1}. Got {shortened(episodes)}. Name others in "
             "`demo_episodes` or --dataset.episodes."
         )
+
+
+def shortened(numbers: Sequence[int], n_shown: int = 10) -> str:
+    """Returns the first of some numbers as text."""
+    text = ", ".join(map(str, numbers[:n_shown]))
+    return f"{text}, ..." if len(numbers) > n_shown else text or "none"
 
 
 def training_argument(name: str) -> Any:
@@ -212,22 +208,25 @@ def frame_name(dataset: LeRobotDataset, row: int, camera: str | None = None) -> 
 
 
 def read_frame(dataset: LeRobotDataset, row: int, camera: str) -> dict[str, Any]:
-    """Returns a row of a dataset.
+    """Returns a row of a dataset; an error names the frame whose image cannot be decoded.
 
     Raises:
         ValueError: An image of a camera cannot be decoded.
     """
-    return decoding(dataset, row, camera, lambda: dataset[row])
+    with decoding(dataset, row, camera):
+        item = dataset[row]
+    return item
 
 
-def decoding(dataset: LeRobotDataset, row: int, camera: str, decode: Callable[[], Any]) -> Any:
-    """Returns what a function decodes.
+@contextmanager
+def decoding(dataset: LeRobotDataset, row: int, camera: str) -> Iterator[None]:
+    """Names the frame in errors while an image of a camera is decoded.
 
     Raises:
         ValueError: It fails; the message names the frame.
     """
     try:
-        return decode()
+        yield
     except Exception as error:
         raise ValueError(
             f"The image {camera} in {frame_name(dataset, row, camera)} cannot be decoded: {error}. Record "
@@ -272,59 +271,40 @@ def _check_tasks(meta: LeRobotDatasetMetadata) -> None:
 def _check_episodes(dataset: LeRobotDataset) -> None:
     """Checks that the table of episodes agrees with the frames, and that each episode has one task."""
     meta = dataset.meta
-
-    def disagree(episode: int, problem: str) -> NoReturn:
-        raise ValueError(
-            f"Episode {episode} of {dataset.repo_id}: {problem} (frames: "
-            f"{meta.root / meta.get_data_file_path(episode)}; table: {meta.root / 'meta/episodes'}). "
-            "Convert or record the dataset again, or leave out the episode with --dataset.episodes."
-        )
-
-    chosen = sorted(range(meta.total_episodes) if dataset.episodes is None else set(dataset.episodes))
     table = {
         name: meta.episodes[name][:]
         for name in ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index")
     }
-    names = meta.tasks.index
-    numbers, index, frame_index, tasks = (
-        column(dataset, name).reshape(-1) for name in ("episode_index", "index", "frame_index", "task_index")
+    index, frame_index, tasks = (
+        column(dataset, name).reshape(-1) for name in ("index", "frame_index", "task_index")
     )
-    starts = np.flatnonzero(np.diff(numbers, prepend=-1))
-    if len(set(numbers[starts].tolist())) < len(starts):
-        values, counts = np.unique(numbers[starts], return_counts=True)
-        disagree(int(values[np.argmax(counts > 1)]), "its frames are not consecutive")
-    spans = episode_spans(dataset)
-    for episode in chosen:
-        if episode not in spans:
-            disagree(episode, "the table has it, but it has no frames")
-        if table["episode_index"][episode] != episode:
-            disagree(episode, f"row {episode} of the table is of episode {table['episode_index'][episode]}")
-        first, last = spans[episode]
-        said, found = table["length"][episode], last - first + 1
-        if said != found:
-            disagree(episode, f"it has {found} frames, but {said} by the table")
-        own = index[first : last + 1]
-        if (np.diff(own) != 1).any() or (frame_index[first : last + 1] != np.arange(found)).any():
-            disagree(episode, "`index` or `frame_index` does not count its frames")
-        said = table["dataset_from_index"][episode], table["dataset_to_index"][episode]
-        if said != (own[0], own[-1] + 1):
-            disagree(
-                episode,
-                f"its frames have the indices {own[0]} to {own[-1]}, but {said[0]} to {said[1] - 1} by the "
-                "table",
+    spans, names = episode_spans(dataset), meta.tasks.index
+    for episode in sorted(range(meta.total_episodes) if dataset.episodes is None else set(dataset.episodes)):
+        first, last = spans.get(episode, (0, -1))
+        rows = slice(first, last + 1)
+        start, stop = table["dataset_from_index"][episode], table["dataset_to_index"][episode]
+        present = [names[n] if 0 <= n < len(names) else f"number {n}" for n in np.unique(tasks[rows])]
+        known = list(table["tasks"][episode])
+        problem = None
+        if len(present) > 1:
+            problem = (
+                f"it has several tasks, {present}, but a demonstration shows one. Split it into one for each"
             )
-        present = np.unique(tasks[first : last + 1]).tolist()
-        if not 0 <= present[0] <= present[-1] < len(names):
-            disagree(episode, f"its `task_index` is {present}, but there are {len(names)} tasks")
-        own_tasks = [names[task] for task in present]
-        if len(own_tasks) > 1:
-            disagree(
-                episode,
-                f"it has several tasks, {own_tasks}, but a demonstration shows one. Split it into one for "
-                "each task",
+        elif present != known:
+            problem = f"its task is {present}, but {known} by the table"
+        elif (table["episode_index"][episode], table["length"][episode]) != (episode, stop - start):
+            problem = "the table contradicts itself"
+        elif not (
+            np.array_equal(index[rows], np.arange(start, stop))
+            and np.array_equal(frame_index[rows], np.arange(stop - start))
+        ):
+            problem = f"its frames are not those with the indices {start} to {stop - 1}, as in the table"
+        if problem is not None:
+            raise ValueError(
+                f"Episode {episode} of {dataset.repo_id}: {problem} (frames: "
+                f"{meta.root / meta.get_data_file_path(episode)}; table: {meta.root / 'meta/episodes'}). "
+                "Convert or record the dataset again, or leave out the episode with --dataset.episodes."
             )
-        if list(table["tasks"][episode]) != own_tasks:
-            disagree(episode, f"its task is {own_tasks}, but {list(table['tasks'][episode])} by the table")
 
 
 def _check_numbers(dataset: LeRobotDataset, name: str, stats: dict[str, Any]) -> None:

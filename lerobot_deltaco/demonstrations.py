@@ -24,6 +24,7 @@ from lerobot_deltaco.dataset_reading import (
     column,
     episode_spans,
     read_frame,
+    shortened,
     source_of,
 )
 
@@ -91,8 +92,9 @@ class DemonstrationBank(torch.nn.Module):
     first_images: Tensor | None
     pick_states: Tensor | None
     features: Tensor | None
-    _order: Tensor
-    _start: Tensor
+    _members: Tensor
+    _count: Tensor
+    _group: Tensor
     _place: Tensor
     _ascending: Tensor
     _row_of_place: Tensor
@@ -111,14 +113,11 @@ class DemonstrationBank(torch.nn.Module):
         self.rows: dict[str, list[int]] = {}
         for row, task in enumerate(self.tasks):
             self.rows.setdefault(task, []).append(row)
-        # For each row: where the rows of its task begin in `order`, its position among them, and their
-        # number.
-        order = [row for rows in self.rows.values() for row in rows]
-        place = {row: (n, len(rows)) for rows in self.rows.values() for n, row in enumerate(rows)}
-        starts, start = {}, 0
-        for task, rows in self.rows.items():
-            starts[task] = start
-            start += len(rows)
+        members = [torch.tensor(rows) for rows in self.rows.values()]
+        group = {task: n for n, task in enumerate(self.rows)}
+        place = torch.empty(len(self.tasks), dtype=torch.int64)  # of each row among those of its task
+        for rows in members:
+            place[rows] = torch.arange(len(rows))
         # Sorted, since a table by episode could be far larger than the bank.
         ascending, row_of_place = torch.as_tensor(episodes).sort()
         for name, tensor in (
@@ -127,9 +126,10 @@ class DemonstrationBank(torch.nn.Module):
             ("first_images", first_images),
             ("pick_states", None),
             ("features", None),
-            ("_order", torch.tensor(order)),
-            ("_start", torch.tensor([starts[task] for task in self.tasks])),
-            ("_place", torch.tensor([place[row] for row in range(len(self.tasks))])),
+            ("_members", torch.nn.utils.rnn.pad_sequence(members, batch_first=True)),
+            ("_count", torch.tensor([len(rows) for rows in members])),
+            ("_group", torch.tensor([group[task] for task in self.tasks])),
+            ("_place", place),
             ("_ascending", ascending),
             ("_row_of_place", row_of_place),
         ):
@@ -187,7 +187,7 @@ class DemonstrationBank(torch.nn.Module):
         if not found:
             raise ValueError(
                 f"`demo_episode` is {episode}, which is not among the demonstrations. They are the episodes "
-                f"{_shortened(self.episodes.tolist())}."
+                f"{shortened(self.episodes.tolist())}."
             )
         return self[found[0]]
 
@@ -218,11 +218,12 @@ class DemonstrationBank(torch.nn.Module):
         held_back = rows < 0
         if held_back.any():
             rows = torch.where(held_back, self._first_rows(tasks, held_back), rows)
-        own, count = self._place[rows].unbind(dim=1)
+        group, own = self._group[rows], self._place[rows]
+        count = self._count[group]
         place = (draws * (count - 1)).long()  # one of the count - 1 others
         place = torch.where(count > 1, place + (place >= own), own)
         place = torch.where(held_back, (draws * count).long(), place)
-        return self._order[self._start[rows] + place]
+        return self._members[group, place]
 
     def _first_rows(self, tasks: Sequence[str], wanted: Tensor) -> Tensor:
         """Returns a row of each sample's task, (batch,); -1 where none is wanted."""
@@ -371,9 +372,3 @@ def resize_images(images: Tensor, size: int) -> Tensor:
         for part in flat.split(_RESIZED_AT_A_TIME)
     ]
     return torch.cat([part.to(torch.uint8) for part in resized]).view(*images.shape[:-2], size, size)
-
-
-def _shortened(numbers: Sequence[int], n_shown: int = 10) -> str:
-    """Returns the first of some numbers as text."""
-    text = ", ".join(map(str, numbers[:n_shown]))
-    return f"{text}, ..." if len(numbers) > n_shown else text or "none"

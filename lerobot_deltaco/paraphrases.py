@@ -8,7 +8,7 @@ so the project does not ship them: `curl -LO https://deltaco-robot.github.io/fil
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import get_args
@@ -47,7 +47,10 @@ def read_paraphrases(
     Raises:
         ValueError: The split is unknown, or the file is missing or invalid; the message names the line.
     """
-    _check_split(split)
+    if split not in PARAPHRASES_SPLITS:
+        raise ValueError(
+            f"`paraphrases_split` must be one of {', '.join(PARAPHRASES_SPLITS)}. Got {split!r}."
+        )
     if path == GRAMMAR:
         if task_ids is None:
             task_ids = (task.index for task in (*TASKS, *COLOR_SHAPE_TASKS))
@@ -89,7 +92,6 @@ def choose_instructions(
         ValueError: Both a file and a sentence are given, the sentence is empty, or the file is invalid or
             lacks a task.
     """
-    _check_split(split)
     if instruction is not None:
         if paraphrases is not None:
             raise ValueError("Give either `paraphrases` (a file) or `instruction` (a sentence), not both.")
@@ -99,7 +101,13 @@ def choose_instructions(
     if paraphrases is None:
         return None
     sentences = read_paraphrases(paraphrases, split, task_ids)
-    _check_complete(sentences, task_ids, f"{paraphrases} (split {split!r})")
+    missing = [task_id for task_id in task_ids if task_id not in sentences]
+    if missing:
+        more = f" and {len(missing) - 1} more tasks" if len(missing) > 1 else ""
+        raise ValueError(
+            f"{paraphrases} (split {split!r}) has no instruction for task {missing[0]} "
+            f"({get_task(missing[0]).instruction!r}){more}. Add some, or choose other tasks."
+        )
     return {task_id: sentences[task_id] for task_id in task_ids}
 
 
@@ -112,23 +120,6 @@ def _from_grammar(task_id: int, split: str) -> tuple[str, ...]:
             sentences = [paraphrase(get_task(task_id), own, rng) for _ in range(_N_FROM_GRAMMAR)]
             found += dict.fromkeys(sentences)
     return tuple(found)
-
-
-def _check_split(split: str) -> None:
-    if split not in PARAPHRASES_SPLITS:
-        raise ValueError(
-            f"`paraphrases_split` must be one of {', '.join(PARAPHRASES_SPLITS)}. Got {split!r}."
-        )
-
-
-def _check_complete(sentences: Mapping[int, object], task_ids: Sequence[int], source: str) -> None:
-    missing = [task_id for task_id in task_ids if task_id not in sentences]
-    if missing:
-        more = f" and {len(missing) - 1} more tasks" if len(missing) > 1 else ""
-        raise ValueError(
-            f"{source} has no instruction for task {missing[0]} ({get_task(missing[0]).instruction!r})"
-            f"{more}. Add some, or choose other tasks."
-        )
 
 
 def _read_rows(path: str | Path) -> list[tuple[int, str]]:

@@ -42,7 +42,6 @@ PROCESSORS = "processors and statistics"
 _HUB_OPTIONS = ("revision", "cache_dir", "token", "local_files_only", "force_download")
 # A single key: safetensors writes several in a random order, and equal banks would be unequal files.
 _KEY = "deltaco_tasks"
-_FEATURES = ("input_features", "output_features")
 _OPTIONS = (
     "gripper",
     "gripper_closed",
@@ -54,10 +53,6 @@ _OPTIONS = (
     "language_encoder",
 )
 _OF_THE_MACHINE = ("device", "rename_map")  # options of processor steps, which may differ
-
-
-class TaskBankError(ValueError):
-    """Raised when a task bank cannot be used; the message says why."""
 
 
 def write_task_bank(
@@ -136,8 +131,7 @@ def read_task_bank(
         if found != saved_with.get(name):
             raise _error(path, f"it was not saved with this checkpoint's {name}")
     if instructions is not None:
-        new = [n for n, name in enumerate(texts["instructions"]) if name not in instructions.rows]
-        instructions.put([texts["instructions"][n] for n in new], tensors["embeddings"][new])
+        instructions.put(texts["instructions"], tensors["embeddings"])
     if "frames" not in tensors:
         return None, saved_with
     bank = DemonstrationBank(
@@ -153,8 +147,8 @@ def read_task_bank(
     return bank, saved_with
 
 
-def _error(path: Path, reason: str) -> TaskBankError:
-    return TaskBankError(
+def _error(path: Path, reason: str) -> ValueError:
+    return ValueError(
         f"The task bank {path} cannot be used: {reason}. Fetch or copy all files of the checkpoint again, or "
         "save it again."
     )
@@ -166,12 +160,10 @@ def _error(path: Path, reason: str) -> TaskBankError:
 def configuration_digests(config: PreTrainedConfig) -> dict[str, str]:
     """Returns a digest of each option that says what the numbers of observations and actions mean."""
     options = {name: getattr(config, name) for name in _OPTIONS if hasattr(config, name)}
-    for name in _FEATURES:
+    for name in ("input_features", "output_features"):
         features = (getattr(config, name) or {}).items()
         options[name] = [[key, feature.type.name, list(feature.shape)] for key, feature in features]
-    options["normalization_mapping"] = {
-        kind: mode.name for kind, mode in config.normalization_mapping.items()
-    }
+    options["normalization_mapping"] = {key: mode.name for key, mode in config.normalization_mapping.items()}
     return {name: _digest(value, {}) for name, value in options.items()}
 
 

@@ -7,8 +7,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-_FRACTION_TOLERANCE = 1e-3  # in tasks: a third may be written as 0.3333
-
 
 class TaskBatchSampler:
     """Frames in an order whose successive batches hold the same number of samples of each of a few tasks.
@@ -23,7 +21,7 @@ class TaskBatchSampler:
         batch_size: Number of samples in a batch, a multiple of `tasks_per_batch`.
         tasks_per_batch: Number of distinct tasks in a batch, k.
         upsampled: Tasks that get a fraction of each batch; none by default.
-        upsampled_fraction: That fraction of `tasks_per_batch`, which must be a whole number of tasks.
+        upsampled_fraction: That fraction of `tasks_per_batch`, rounded to whole tasks.
         seed: Seed of the order.
         use: Whether each frame may be drawn, (frames,) bool; all by default.
 
@@ -64,7 +62,12 @@ class TaskBatchSampler:
         present = list(self._frames_of)
         groups = [(present, tasks_per_batch)]
         if upsampled:
-            n_upsampled = _count_upsampled_tasks(fraction, tasks_per_batch)
+            n_upsampled = round(fraction * tasks_per_batch)
+            if not 0 < n_upsampled < tasks_per_batch:
+                raise ValueError(
+                    "`upsampled_fraction` must leave at least one of the tasks of a batch to the upsampled "
+                    f"ones, and one to the others. Got {fraction} of {tasks_per_batch} tasks."
+                )
             groups = [
                 ([task for task in present if task in upsampled], n_upsampled),
                 ([task for task in present if task not in upsampled], tasks_per_batch - n_upsampled),
@@ -130,21 +133,3 @@ def _rounds(
         turns.append(np.concatenate([turn[first], np.delete(turn, first)]))
         n_drawn += len(members)
     return np.concatenate(turns)[:n_chosen].reshape(n_batches, per_batch)
-
-
-def _count_upsampled_tasks(fraction: float, tasks_per_batch: int) -> int:
-    """Returns the number of upsampled tasks in a batch.
-
-    Raises:
-        ValueError: It is not a whole number, or no other task is left.
-    """
-    n_tasks = round(fraction * tasks_per_batch)
-    if abs(n_tasks - fraction * tasks_per_batch) > _FRACTION_TOLERANCE or not 0 < n_tasks < tasks_per_batch:
-        nearest = min(max(n_tasks, 1), tasks_per_batch - 1)
-        raise ValueError(
-            "`upsampled_fraction` must be the fraction of a whole number of tasks, 1 to "
-            f"{tasks_per_batch - 1} of the {tasks_per_batch} in a batch, such as "
-            f"{nearest / tasks_per_batch:g} for {nearest}. Got {fraction}, which is "
-            f"{fraction * tasks_per_batch:g} tasks."
-        )
-    return n_tasks

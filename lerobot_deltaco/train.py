@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from contextlib import ExitStack
 from typing import Any
 from unittest.mock import patch
 
@@ -35,12 +34,10 @@ def train() -> None:
     """Trains as the command line says, with the arguments of `lerobot-train`."""
     keep_freed_memory()
     training = _InMemoryTraining()
-    with ExitStack() as stack:
-        for name, replacement in (
-            ("make_train_eval_datasets", training.make_datasets),
-            ("EpisodeAwareSampler", training.make_sampler),
-        ):
-            stack.enter_context(patch.object(lerobot_train, name, replacement))
+    with (
+        patch.object(lerobot_train, "make_train_eval_datasets", training.make_datasets),
+        patch.object(lerobot_train, "EpisodeAwareSampler", training.make_sampler),
+    ):
         lerobot_train.main()
 
 
@@ -53,12 +50,7 @@ class _InMemoryTraining:
         self._frames: FramesInMemory | None = None
 
     def make_datasets(self, config: TrainPipelineConfig) -> tuple[FramesInMemory, LeRobotDataset | None]:
-        """Makes LeRobot's datasets, the first of them in memory.
-
-        Raises:
-            ValueError: No policy is trained, or the data cannot be held in memory.
-            MemoryError: They do not fit.
-        """
+        """Makes LeRobot's datasets, the first of them in memory."""
         policy = config.policy
         if policy is None or config.dataset.streaming:
             raise ValueError(
@@ -79,11 +71,7 @@ class _InMemoryTraining:
         return self._frames, held_back
 
     def make_sampler(self, *arguments: Any, **options: Any) -> EpisodeAwareSampler | TaskBatchSampler:
-        """Makes a sampler of batches of tasks if the policy wants them, else LeRobot's.
-
-        Raises:
-            ValueError: There are no such batches.
-        """
+        """Makes a sampler of batches of tasks if the policy wants them, else LeRobot's."""
         assert self._config is not None
         assert self._frames is not None
         stock = _ResumableSampler(*arguments, **options)
@@ -163,11 +151,7 @@ def _tasks_per_batch(wanted: int, batch_size: int, n_tasks: int) -> int:
 
 
 def _upsampled(pattern: str | None, task_names: Sequence[str], present: set[int]) -> list[int]:
-    """Returns the tasks whose instructions match a regular expression.
-
-    Raises:
-        ValueError: None does.
-    """
+    """Returns the tasks whose instructions match a regular expression."""
     if pattern is None:
         return []
     found = [n for n, name in enumerate(task_names) if n in present and re.search(pattern, name)]

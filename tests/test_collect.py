@@ -15,7 +15,6 @@ import numpy as np
 import psutil
 import pyarrow.parquet as pq
 import pytest
-from lerobot.datasets import LeRobotDataset
 from PIL import Image
 
 from gym_deltaco import EPISODE_STEPS
@@ -26,7 +25,6 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import TASKS
 from lerobot_deltaco import collect as collect_module
 from lerobot_deltaco.collect import (
-    DESCRIPTION_FILE,
     CollectionError,
     CollectionPlan,
     collect,
@@ -117,22 +115,6 @@ def test_replayed_episodes_are_identical(finished, env):
         assert info["is_success"]
 
 
-def test_episodes_are_numbered_through_all_shards(finished):
-    frames = read_frames(finished)
-    n_frames = PLAN.n_episodes * EPISODE_STEPS
-    np.testing.assert_array_equal(frames["index"], np.arange(n_frames))
-    np.testing.assert_array_equal(frames["episode_index"], np.arange(n_frames) // EPISODE_STEPS)
-    np.testing.assert_array_equal(frames["benchmark.task_id"], np.repeat([90, 4], n_frames // 2))
-    np.testing.assert_array_equal(frames["task_index"], np.repeat([0, 1], n_frames // 2))
-    last = frames["frame_index"] == EPISODE_STEPS - 1
-    assert frames["next.success"][last].all()
-    np.testing.assert_array_equal(frames["next.done"], last)
-    dataset = LeRobotDataset("user/deltaco", root=finished)
-    assert len(dataset) == n_frames
-    assert dataset.meta.tasks.index.to_list() == [TASKS[90].instruction, TASKS[4].instruction]
-    assert dataset[n_frames - 1]["task"] == TASKS[4].instruction
-
-
 def test_seeds_are_those_of_the_first_successful_attempts(tmp_path, env):
     plan = CollectionPlan("4,32", 2, noise=0.3)
     summary = collect(tmp_path, plan)
@@ -166,19 +148,6 @@ def test_scene_settings_reach_the_scenes_and_the_features(tmp_path):
     assert read_plan(tmp_path) == plan
 
 
-def test_held_out_objects_stand_in_no_scene(tmp_path):
-    plan = CollectionPlan("4", 1, scene=SceneConfig(objects="fold_0:100"))  # task 0 is held out
-    assert "1 episodes" in collect(tmp_path, plan)
-
-
-def test_shards_cover_all_episodes_once():
-    for episodes_per_task in (1, 11, 15, 500, 16000):
-        plan = CollectionPlan("4", episodes_per_task)
-        assert [index for shard in plan.shards for index in shard] == list(range(plan.n_episodes))
-        assert max(map(len, plan.shards)) <= 100
-    assert len(CollectionPlan("scenario_a_train", 4).shards) > 32
-
-
 # Plans
 
 
@@ -194,22 +163,14 @@ def test_held_out_tasks_are_for_validation():
     ("arguments", "message"),
     [
         ({"tasks": "scenario_c"}, "Valid are the task sets all, scenario_a_train"),
-        ({"tasks": "300"}, "from 0 to 299"),
         ({"tasks": "24", "scene": SceneConfig(objects="scenario_a_train")}, "Task 24 asks for"),
         ({"episodes_per_task": 0}, "`episodes_per_task` must be at least 1. Got 0"),
-        ({"seed": -1}, "`seed` must be at least 0"),
         ({"noise": float("nan")}, "`noise` must be at least 0. Got nan"),
     ],
 )
 def test_invalid_plans_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         CollectionPlan(**{"tasks": "4", "episodes_per_task": 1, **arguments})
-
-
-def test_collecting_imports_neither_torch_nor_the_simulator():
-    program = "import sys, lerobot_deltaco.collect; print(*sys.modules)"
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert not {"torch", "lerobot", "huggingface_hub", "pybullet"} & set(result.stdout.split())
 
 
 # Interruptions
@@ -320,25 +281,13 @@ def test_finished_dataset_of_the_same_plan_is_left_alone(finished, collected, mo
 def test_another_plan_is_refused(finished, collected):
     changes = {
         "tasks: 90,4 there, 4,90 now": {"tasks": "4,90"},
-        "episodes_per_task: 20 there, 3 now": {"episodes_per_task": 3},
-        "seed: 0 there, 1 now": {"seed": 1},
-        "split: train there, validation now": {"split": "validation"},
         "noise: 0.1 there, 0.2 now": {"noise": 0.2},
-        "ambiguity: container there, object now": {"scene": SceneConfig(ambiguity="object")},
         "image_size: 48 there, 32 now": {"scene": SceneConfig(image_size=32)},
     }
     for message, change in changes.items():
         with pytest.raises(CollectionError, match=re.escape(f"another plan ({message})")):
             collect(finished, replace(PLAN, **change))
     assert not collected
-
-
-def test_unfinished_collection_with_another_renderer_is_refused(tmp_path, collected, monkeypatch):
-    (tmp_path / "meta").mkdir()
-    description = collect_module._description(PLAN)
-    (tmp_path / DESCRIPTION_FILE).write_text(json.dumps({**description, "renderer": "another one"}))
-    with pytest.raises(CollectionError, match="renderer: another one there"):
-        collect(tmp_path, PLAN)
 
 
 def test_folder_with_something_else_is_refused(tmp_path, collected):

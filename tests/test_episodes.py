@@ -133,7 +133,7 @@ def test_draws_are_a_function_of_the_seed_and_the_step(make, dataset):
 
 @pytest.mark.parametrize("options", [{}, {"demo_encoder": "attention", "num_mixture_components": 3}], ids=str)
 def test_one_batch_can_be_overfitted(make, dataset, options):
-    policy, before, _ = make(shift_padding=0, initial_weights="torch", **options)
+    policy, before, _ = make(shift_padding=0, **options)
     batch = before(batch_of(dataset, [1, 6, 11, 16, 21, 26]))
     optimizer = torch.optim.Adam(policy.get_optim_params(), lr=1e-3)
     first = policy(batch)[1]

@@ -303,7 +303,7 @@ def test_a_gripper_and_a_state_are_needed(table):
         ({"n_demonstrations": 0}, "`n_demonstrations` must be from 1"),
         ({"n_demonstrations": 5, "demo_episode": 0}, "names a single demonstration, but .* is 5"),
         ({"grasp_height_bias": float("nan")}, "`grasp_height_bias` must be from -10 to 10"),
-        ({"frames_after_release": -1}, "`frames_after_release` must be at least 0"),
+        ({"frames_after_release": -1}, "`frames_after_release` must be from 0"),
     ],
 )
 def test_invalid_options_say_what_is_valid(options, message):

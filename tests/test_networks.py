@@ -21,9 +21,7 @@ from lerobot_deltaco.networks import (
     BACKBONES,
     INITIAL_LOG_STD,
     ActionDistribution,
-    Film,
     PolicyNetwork,
-    UnitHead,
     features_at,
     fuse_batch_norms,
     gaussian_maps,
@@ -78,12 +76,6 @@ def test_join_action_reverts_split_action(gripper_index):
 
 
 # The policy network
-
-
-def test_film_begins_close_to_the_identity():
-    film, x = Film(32, 8), torch.randn(4, 8, 5, 5)
-    embedding = F.normalize(torch.randn(4, 32), dim=-1)
-    torch.testing.assert_close(film(x, embedding), x, atol=0.02, rtol=0)
 
 
 def test_paper_networks_have_the_sizes_of_the_paper():
@@ -177,29 +169,6 @@ def test_demonstrations_of_any_size_become_unit_vectors(height, width, rows, str
     frames = torch.rand(2, rows * 2, 3, height, width)
     for encoder in (FrameGridEncoder(height, width, rows, 2, 12, stride), AttentionEncoder(rows * 2, 12)):
         torch.testing.assert_close(encoder(frames).norm(dim=-1), torch.ones(2))
-
-
-def test_attention_reads_the_same_at_every_location():
-    encoder = AttentionEncoder(2, 12).eval()
-    frames = torch.zeros(1, 2, 3, 48, 48)
-    frames[:, 0, 0, 16:20, 16:20] = 1  # an object that is gone in the second frame
-    # The last of the features are the locations.
-    positions = torch.zeros(encoder.layers[0].in_features)
-    positions[-16:] = 1
-    with torch.no_grad():
-        encoder.layers[0].weight.mul_(1 - positions)
-        shifted = (encoder(frames.roll((8, 8), dims=(-2, -1))) - encoder(frames)).abs().max()
-        other_color = (encoder(frames.flip(2)) - encoder(frames)).abs().max()
-    assert shifted < 1e-6
-    assert other_color > 1e-4
-
-
-def test_head_without_layers_normalizes_the_features():
-    features = torch.randn(4, 6)
-    torch.testing.assert_close(UnitHead(6, None, 6)(features), F.normalize(features))
-    head = UnitHead(6, [5], 3)
-    assert [tuple(parameter.shape) for parameter in head.parameters()] == [(5, 6), (5,), (3, 5), (3,)]
-    torch.testing.assert_close(head(features).norm(dim=1), torch.ones(4))
 
 
 # Images and maps

@@ -25,7 +25,7 @@ OPTIONS = {
         "concat": [None, "none", "demo", "language"],
         "encoder_loss": [None, "contrastive", "cosine", "none"],
         "demo_encoder": ["cnn", "attention", "vit"],
-        "demo_columns": [2, 3, 1],
+        "demo_rows": [1, 2, 0],
         "gripper_loss": ["squared_error", "cross_entropy"],
         "shift_padding": [0, 4, -1],
         "language_head": [None, [8], [0]],

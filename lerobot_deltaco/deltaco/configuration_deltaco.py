@@ -40,15 +40,7 @@ METHODS = MappingProxyType(
 INPUTS = ("none", "demo", "language", "demo+language")
 ENCODER_LOSSES = ("contrastive", "cosine", "none")
 DEMO_ENCODERS = ("cnn", "attention", "pretrained")
-# Options that have an effect only with `demo_encoder=pretrained`.
-_PRETRAINED_OPTIONS = (
-    "vision_encoder",
-    "vision_encoder_weights",
-    "vision_image_size",
-    "vision_input",
-    "demo_variants",
-    "demo_head",
-)
+DEMO_COLUMNS = 2  # of the grid of a demonstration's frames, n in the paper
 
 
 @PreTrainedConfig.register_subclass("deltaco")
@@ -75,10 +67,8 @@ class DeltacoConfig(TaskConditionedConfig):
             [384], as in the authors' code.
         demo_encoder: Encoder of demonstrations: cnn, the paper's; attention, this project's, which compares
             the frames at each location and attends to a few locations; or pretrained, a frozen image encoder.
-        vision_encoder: Frozen image encoder for `demo_encoder=pretrained`: clip-vit-base-patch32,
-            r3m-resnet18, r3m-resnet34, r3m-resnet50, dinov2-small, siglip2-base, efficientnet-lite0, a folder
-            with an image model of transformers, or its name on the Hub.
-        vision_encoder_weights: File with R3M's weights, which are otherwise downloaded.
+        vision_encoder: Frozen image encoder for `demo_encoder=pretrained`: efficientnet-lite0; or
+            clip-vit-base-patch32 or r3m-resnet18, which are downloaded.
         vision_image_size: Height and width to which the grid of a demonstration's frames is scaled for that
             encoder; by default, the size of the images that it was trained on.
         vision_input: Format of R3M's images: published, that of R3M; or authors, as in the authors' code, in
@@ -87,18 +77,14 @@ class DeltacoConfig(TaskConditionedConfig):
             ends) that a pretrained encoder encodes before training; each sample gets one of them.
         demo_head: Sizes of the hidden layers of fully connected layers after a pretrained encoder, such as
             [256]; by default, there are no layers at all.
-        demo_rows: Number of rows of the grid of a demonstration's frames, m in the paper.
-        demo_columns: Number of columns of that grid, n in the paper. Its m n frames are the first, the last,
-            and random ones between them; `attention` takes as many frames, without a grid.
+        demo_rows: Number of rows of the grid of a demonstration's frames, m in the paper; it has two columns.
+            The frames are the first, the last, and random ones between them; `attention` takes as many,
+            without a grid.
         backbone: Convolutional network: paper or strided.
         gripper_loss: Loss of the gripper: squared_error, the paper's; or cross_entropy.
-        encoder_loss_weight: Weight of the encoder loss, alpha_d in the paper's equation 3.
-        temperature: Temperature of the contrastive loss.
         shift_padding: Largest random shift of observations in training, px; 0 for none.
         demo_shift_padding: Largest random shift of demonstrations in training, px; 0 for none.
         drop_n_last_frames: Number of frames at the end of each episode that are left out of training.
-        initial_weights: Initial weights of the networks: authors, as in the authors' code; or torch,
-            PyTorch's. By default, the authors' for the paper's backbone.
         scheduler_name: Schedule of the learning rate: constant, or cosine, which decays to 0.
     """
 
@@ -110,34 +96,19 @@ class DeltacoConfig(TaskConditionedConfig):
     language_head: list[int] | None = None
     demo_encoder: str = "cnn"
     vision_encoder: str = "clip-vit-base-patch32"
-    vision_encoder_weights: str | None = None
     vision_image_size: int | None = None
     vision_input: str = "published"
     demo_variants: int = 8
     demo_head: list[int] | None = None
     demo_rows: int = 1
-    demo_columns: int = 2
     backbone: str = "paper"
     gripper_loss: str = "squared_error"
-    encoder_loss_weight: float = 10.0
-    temperature: float = 0.1
     shift_padding: int = 4
     demo_shift_padding: int = 4
     drop_n_last_frames: int = 0
-    initial_weights: str | None = None
     scheduler_name: str = "constant"
-    # Filled in by the pretrained image encoder: the size of its features.
-    demo_feature_dim: int | None = None
     # The tasks known to a one-hot policy.
     one_hot_tasks: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        if self.initial_weights is None:
-            self.initial_weights = "authors" if self.backbone == "paper" else "torch"
-        if self.demo_encoder == "pretrained" and self.demo_feature_dim is None:
-            spec = VISION_ENCODERS.get(self.vision_encoder)
-            self.demo_feature_dim = None if spec is None else spec.feature_dim
-        super().__post_init__()
 
     def check(self) -> None:
         """Checks the options.
@@ -153,60 +124,29 @@ class DeltacoConfig(TaskConditionedConfig):
             concat=(None, *INPUTS),
             encoder_loss=(None, *ENCODER_LOSSES),
             demo_encoder=DEMO_ENCODERS,
+            vision_encoder=VISION_ENCODERS,
             vision_input=VISION_INPUTS,
             backbone=BACKBONES,
             gripper_loss=GRIPPER_LOSSES,
-            initial_weights=("authors", "torch"),
             scheduler_name=("constant", "cosine"),
         )
         self.check_ranges(
-            demo_variants=(1, 1000),
-            demo_rows=(1, 64),
-            demo_columns=(1, 64),
-            encoder_loss_weight=(0, 1e6),
-            temperature=(1e-3, 1e3),
-            shift_padding=(0, 1024),
-            demo_shift_padding=(0, 1024),
-            drop_n_last_frames=(0, 1_000_000),
+            demo_variants=(1, 1000), demo_rows=(1, 64), shift_padding=(0, 1024), demo_shift_padding=(0, 1024)
         )
-        if self.n_demo_frames < 2:
-            raise ValueError(
-                "A demonstration has its first and its last frame: `demo_rows` * `demo_columns` must be "
-                f"at least 2. Got {self.n_demo_frames}."
-            )
-        for name in ("language_head", "demo_head"):
-            if not all(size >= 1 for size in getattr(self, name) or []):
-                raise ValueError(f"`{name}` must be sizes of layers. Got {getattr(self, name)}.")
-        if self.demo_encoder != "pretrained":
-            for name in _PRETRAINED_OPTIONS:
-                if getattr(self, name) != getattr(type(self), name, None):
-                    raise ValueError(
-                        f"`{name}` has no effect with `demo_encoder={self.demo_encoder}`. Leave it out, or "
-                        "set `demo_encoder` to 'pretrained'."
-                    )
         self._check_conditioning()
-        self.check_demo_dim()
 
     def _check_conditioning(self) -> None:
         overridden = [name for name in ("film", "concat", "encoder_loss") if getattr(self, name) is not None]
         if overridden and self.method in ("one_hot", "mcil"):
             raise ValueError(f"`{overridden[0]}` cannot be changed in the method {self.method!r}.")
-        film, concat, encoder_loss = self.conditioning
+        encoder_loss = self.conditioning.encoder_loss
         if encoder_loss != "none" and not self.uses_demonstrations:
             raise ValueError(
                 f"`encoder_loss` is {encoder_loss!r}, but no demonstration is used. Set it to 'none', or use "
                 "one in `film` or `concat`."
             )
-
-    def check_demo_dim(self) -> None:
-        """Checks that embeddings of demonstrations have the size that the method needs.
-
-        Raises:
-            ValueError: They are compared with embeddings of instructions, which have another size.
-        """
-        if not self.uses_demonstrations or self.demo_dim in (None, self.embedding_dim):
-            return
-        if self.conditioning.encoder_loss != "none" or self.method == "mcil":
+        is_compared = encoder_loss != "none" or self.method == "mcil"
+        if is_compared and self.demo_dim != self.embedding_dim:
             raise ValueError(
                 f"The demonstrations' embeddings, of {self.vision_encoder!r}, have {self.demo_dim} numbers, "
                 f"and the instructions' have {self.embedding_dim}. To compare them, give `demo_head` layers, "
@@ -240,13 +180,13 @@ class DeltacoConfig(TaskConditionedConfig):
     @property
     def n_demo_frames(self) -> int:
         """Number of frames of a demonstration."""
-        return self.demo_rows * self.demo_columns
+        return self.demo_rows * DEMO_COLUMNS
 
     @property
-    def demo_dim(self) -> int | None:
-        """Size of a demonstration's embedding; None until a pretrained encoder has been loaded."""
+    def demo_dim(self) -> int:
+        """Size of a demonstration's embedding."""
         if self.demo_encoder == "pretrained" and self.demo_head is None:
-            return self.demo_feature_dim
+            return VISION_ENCODERS[self.vision_encoder]
         return self.embedding_dim
 
     def get_scheduler_preset(self) -> CosineSchedulerConfig | None:

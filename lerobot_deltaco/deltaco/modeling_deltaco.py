@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.dataset_reading import warn_of_equal_instructions
-from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
+from lerobot_deltaco.deltaco.configuration_deltaco import DEMO_COLUMNS, DeltacoConfig
 from lerobot_deltaco.deltaco.demo_encoders import (
     AttentionEncoder,
     FrameGridEncoder,
@@ -36,13 +36,14 @@ from lerobot_deltaco.networks import (
     BACKBONES,
     PolicyNetwork,
     UnitHead,
-    fuse_batch_norms,
     initialize_as_authors,
     random_shift,
     uniform_linear_layers,
 )
-from lerobot_deltaco.vision import VisionEncoder, load_vision_encoder
+from lerobot_deltaco.vision import VISION_ENCODERS, load_vision_encoder
 
+# The paper's alpha_d (equation 3) and temperature of the contrastive loss.
+_ENCODER_LOSS_WEIGHT, _TEMPERATURE = 10.0, 0.1
 _AUTHORS_ENCODER_BOUND = 1e-4  # of the initial weights of the paper's demonstration encoder
 
 
@@ -74,18 +75,14 @@ class DeltacoPolicy(TaskConditionedPolicy):
     ) -> None:
         super().__init__(config, dataset_stats, dataset_meta)
         self.instructions: InstructionEmbeddings = InstructionEmbeddings(config.language_encoder)
-        self._are_instructions_compared = False
         self.config: DeltacoConfig = config
         if config.method == "one_hot" and not config.one_hot_tasks:
-            config.one_hot_tasks = known_tasks(dataset_meta)
-        is_pretrained = config.demo_encoder == "pretrained" and config.uses_demonstrations
-        if is_pretrained and config.demo_feature_dim is None:
-            config.demo_feature_dim = self._load_vision_encoder().feature_dim
-            config.check_demo_dim()
+            assert dataset_meta is not None
+            config.one_hot_tasks = list(dataset_meta.tasks.index)
         self.model = _make_network(config)
         self.demo_encoder = _make_demo_encoder(config)
         self.language_head = _make_language_head(config)
-        if config.initial_weights == "authors":
+        if config.backbone == "paper":
             initialize_as_authors(self.model)
             if isinstance(self.demo_encoder, FrameGridEncoder):
                 uniform_linear_layers(self.demo_encoder, _AUTHORS_ENCODER_BOUND)
@@ -130,7 +127,8 @@ class DeltacoPolicy(TaskConditionedPolicy):
         if config.uses_demonstrations:
             demo = self._embed_training_demonstrations(batch["episode_index"], tasks, generator)
         if config.uses_language:
-            self._compare_instructions(images.device)
+            if self._meta is not None and self.paraphrases is None:
+                self._embed_all_tasks(list(self._meta.tasks.index), images.device)
             # With paraphrases, one sentence is drawn for each task, and one for each sample.
             known = self._embed_instructions(
                 self._draw_instructions(list(distinct), generator), images.device
@@ -150,12 +148,12 @@ class DeltacoPolicy(TaskConditionedPolicy):
             assert demo is not None
             assert language is not None
             assert known is not None
-            logits = contrastive_logits(demo.float(), known, config.temperature)  # (batch, distinct)
+            logits = contrastive_logits(demo.float(), known, _TEMPERATURE)  # (batch, distinct)
             if config.conditioning.encoder_loss == "contrastive":
                 encoder_loss = contrastive_loss(logits, column)
             else:
                 encoder_loss = cosine_loss(demo.float(), language)
-            loss = loss + config.encoder_loss_weight * encoder_loss
+            loss = loss + _ENCODER_LOSS_WEIGHT * encoder_loss
             logged["encoder_loss"] = encoder_loss.mean()
             logged["demo_accuracy"] = (logits.argmax(dim=1) == column).float().mean()
         return loss, logged
@@ -186,72 +184,63 @@ class DeltacoPolicy(TaskConditionedPolicy):
         device: torch.device,
     ) -> Episode:
         """Encodes the instructions and demonstrations of an episode."""
+        config = self.config
         demo: Tensor | None = None
         language: Tensor | None = None
-        if self.config.uses_demonstrations and demonstrations is None:
+        if config.uses_demonstrations and demonstrations is None:
             demonstrations = self.banked_demonstrations(instructions)
         self._check_given(instructions, demonstrations)
-        if self.config.uses_demonstrations and demonstrations is not None:
+        if config.uses_demonstrations and demonstrations is not None:
             demo = self._embed_demonstrations(demonstrations, device)
-        if self.config.method == "mcil":
-            # The samples of a batch use the instruction and the demonstration in turn, if both are there.
+        if any("language" in part for part in config.conditioning[:2]):
             language = self._embed_instructions(instructions, device)
+        film: Tensor | None
+        concat: Tensor | None = None
+        if config.method == "mcil":
+            # The samples of a batch use the instruction and the demonstration in turn, if both are there.
             by_language = [
                 bool(text) and (not own or n % 2 == 0)
                 for n, (text, own) in enumerate(zip(instructions, demonstrations or (), strict=True))
             ]
             assert demo is not None
-            mixed = torch.where(torch.tensor(by_language, device=device)[:, None], language, demo)
-            return Episode(instructions, mixed, None, self._acting_network())
-        if any("language" in part for part in self.config.conditioning[:2]):
-            language = self._embed_instructions(instructions, device)
-        film, concat = self._conditioning_inputs(instructions, demo, language, device)
+            assert language is not None
+            film = torch.where(torch.tensor(by_language, device=device)[:, None], language, demo)
+        else:
+            film, concat = self._conditioning_inputs(instructions, demo, language, device)
         return Episode(instructions, film, concat, self._acting_network())
 
     def _check_given(self, instructions: Sequence[str], demonstrations: DemonstrationsOfTasks | None) -> None:
-        """Checks that no input of the method is left out; MCIL needs only one of the two.
-
-        Raises:
-            ValueError: An input is missing.
-        """
-        lacks_instruction = [not text for text in instructions]
-        lacks_demonstration = [not own for own in demonstrations or ()]
+        """Checks that no input of the method is left out; MCIL needs only one of the two."""
         if self.config.method == "mcil":
-            missing = any(map(all, zip(lacks_instruction, lacks_demonstration, strict=True)))
+            missing = not all(map(any, zip(instructions, demonstrations or (), strict=True)))
         else:
             film, concat, _ = self.config.conditioning
             needs_instruction = any("language" in part or part == "one_hot" for part in (film, concat))
-            missing = needs_instruction and any(lacks_instruction)
-            missing |= self.config.uses_demonstrations and any(lacks_demonstration)
+            missing = needs_instruction and not all(instructions)
+            missing |= self.config.uses_demonstrations and not all(demonstrations or ())
         if missing:
             raise ValueError(
                 f"The method {self.config.method!r} is missing an input. Pass an instruction and a "
                 "demonstration of each sample's task, whichever the method takes."
             )
 
-    def _acting_network(self) -> PolicyNetwork:
-        """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
-        return self.model if self.training else fuse_batch_norms(self.model)
-
     # Embeddings
+
+    def _embed_all_tasks(self, tasks: list[str], device: torch.device) -> None:
+        """Embeds the tasks of the training dataset once, for the checkpoint, and warns of equal ones."""
+        if not self.instructions.rows.keys() >= set(tasks):
+            warn_of_equal_instructions(tasks, self.instructions(tasks, device))
 
     def _embed_instructions(self, instructions: Sequence[str], device: torch.device) -> Tensor:
         """Returns embeddings of instructions, (instructions, embedding)."""
         embeddings = self.instructions(instructions, device)
         return embeddings if self.language_head is None else self.language_head(embeddings)
 
-    def _compare_instructions(self, device: torch.device) -> None:
-        """Warns once if instructions of the training dataset have equal embeddings."""
-        if self._meta is not None and self.paraphrases is None and not self._are_instructions_compared:
-            self._are_instructions_compared = True
-            tasks = list(self._meta.tasks.index)
-            warn_of_equal_instructions(tasks, self.instructions(tasks, device))
-
     def _embed_demonstrations(self, demonstrations: DemonstrationsOfTasks, device: torch.device) -> Tensor:
         """Returns embeddings of the first demonstration of each sample, (batch, embedding)."""
         assert self.demo_encoder is not None
         present = [own[0] for own in demonstrations if own]
-        embeddings = torch.zeros(len(demonstrations), self.config.demo_dim or 0, device=device)
+        embeddings = torch.zeros(len(demonstrations), self.config.demo_dim, device=device)
         if not present:
             return embeddings
         if self.config.demo_encoder == "pretrained":
@@ -296,26 +285,15 @@ class DeltacoPolicy(TaskConditionedPolicy):
 
     def _encode_bank(self, bank: DemonstrationBank, n_variants: int) -> Tensor:
         config = self.config
-        encoder = self._load_vision_encoder()
+        encoder = load_vision_encoder(config.vision_encoder, config.vision_image_size, config.vision_input)
         padding, frames, rows = config.demo_shift_padding, config.n_demo_frames, config.demo_rows
         # The features do not depend on the precision of the training.
         with torch.autocast(bank.frames.device.type, enabled=False):
             return encode_bank(bank, encoder, frames, rows, n_variants, padding, config.seed)
 
-    def _load_vision_encoder(self) -> VisionEncoder:
-        config = self.config
-        return load_vision_encoder(
-            config.vision_encoder,
-            config.vision_encoder_weights,
-            config.vision_image_size,
-            config.vision_input,
-        )
-
-    def _read_evaluation_bank(self) -> DemonstrationBank | None:
-        bank = super()._read_evaluation_bank()
-        if bank is not None and self.config.demo_encoder == "pretrained":
+    def _complete_bank(self, bank: DemonstrationBank, dataset: LeRobotDataset) -> None:
+        if self.config.demo_encoder == "pretrained":
             bank.features = self._encode_bank(bank, n_variants=0)
-        return bank
 
     def _conditioning_inputs(
         self, tasks: Sequence[str], demo: Tensor | None, language: Tensor | None, device: torch.device
@@ -327,9 +305,6 @@ class DeltacoPolicy(TaskConditionedPolicy):
             demo: Embeddings of demonstrations, (batch, embedding); None if they are not used.
             language: Embeddings of instructions, (batch, embedding); None if they are not used.
             device: Device of one-hot tasks.
-
-        Raises:
-            ValueError: A one-hot policy does not know a task.
         """
 
         def source(name: str) -> Tensor | None:
@@ -353,12 +328,11 @@ class DeltacoPolicy(TaskConditionedPolicy):
 
 def _make_network(config: DeltacoConfig) -> PolicyNetwork:
     film, concat, _ = config.conditioning
-    demo_dim = config.demo_dim or 0
     dims = {
         "none": 0,
-        "demo": demo_dim,
+        "demo": config.demo_dim,
         "language": config.embedding_dim,
-        "demo+language": demo_dim + config.embedding_dim,
+        "demo+language": config.demo_dim + config.embedding_dim,
         "language_or_demo": config.embedding_dim,
         "one_hot": len(config.one_hot_tasks),
     }
@@ -381,13 +355,11 @@ def _make_demo_encoder(config: DeltacoConfig) -> FrameGridEncoder | AttentionEnc
     if not config.uses_demonstrations:
         return None
     if config.demo_encoder == "pretrained":
-        assert config.demo_feature_dim is not None
-        assert config.demo_dim is not None
-        return UnitHead(config.demo_feature_dim, config.demo_head, config.demo_dim)
+        return UnitHead(VISION_ENCODERS[config.vision_encoder], config.demo_head, config.demo_dim)
     if config.demo_encoder == "attention":
         return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
     size, stride = config.image_size, BACKBONES[config.backbone].demo_stride
-    return FrameGridEncoder(size, size, config.demo_rows, config.demo_columns, config.embedding_dim, stride)
+    return FrameGridEncoder(size, size, config.demo_rows, DEMO_COLUMNS, config.embedding_dim, stride)
 
 
 def _make_language_head(config: DeltacoConfig) -> UnitHead | None:
@@ -414,16 +386,3 @@ def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) ->
         )
     index = {task: n for n, task in enumerate(known)}
     return F.one_hot(torch.tensor([index[task] for task in tasks], device=device), len(known)).float()
-
-
-def known_tasks(meta: LeRobotDatasetMetadata | None) -> list[str]:
-    """Returns the task strings of the training dataset, for a one-hot policy.
-
-    Raises:
-        ValueError: There are no metadata.
-    """
-    if meta is None:
-        raise ValueError(
-            "A one-hot policy knows the tasks of its dataset. Pass the metadata as `dataset_meta`."
-        )
-    return list(meta.tasks.index)

@@ -59,9 +59,8 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             n_demonstrations=(1, 1000),
             grasp_height_bias=(-10, 10),
             p_hue_augmentation=(0, 1),
+            frames_after_release=(0, 1_000_000),
         )
-        if self.frames_after_release is not None and self.frames_after_release < 0:
-            raise ValueError(f"`frames_after_release` must be at least 0. Got {self.frames_after_release}.")
         if self.n_demonstrations > 1 and self.demo_episode is not None:
             raise ValueError(
                 "`demo_episode` names a single demonstration, but `n_demonstrations` is "
@@ -81,8 +80,3 @@ class DeltacoMatchConfig(TaskConditionedConfig):
                 "the feature 'observation.state' and a gripper among the action's dimensions, which "
                 "`gripper` names. Without them, train --policy.type=deltaco."
             )
-
-    @property
-    def uses_demonstrations(self) -> bool:
-        """Whether the policy takes demonstrations."""
-        return True

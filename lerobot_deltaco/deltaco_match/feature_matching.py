@@ -162,15 +162,12 @@ class FeatureMatching(nn.Module):
     @torch.no_grad()
     def understood(self, instruction: str) -> list[tuple[str, str]]:
         """Returns the words of an instruction that describe the object, and what each is understood as."""
-        said, vocabulary = words_of(instruction), self.vocabulary
-        if not said:
-            return []
-        device = self.fitted.device
-        weights = self.word_weights(encode_words([instruction], vocabulary).to(device))[0].tolist()
-        known = understand(instruction, vocabulary)
+        said = encode_words([instruction], self.vocabulary).to(self.fitted.device)
+        known = zip(words_of(instruction), understand(instruction, self.vocabulary), strict=True)
+        weights = self.word_weights(said)[0].tolist()
         return [
             (word, meant)
-            for word, meant, weight in zip(said, known, weights, strict=True)
+            for (word, meant), weight in zip(known, weights, strict=False)
             if meant is not None and weight > _COUNTS
         ]
 
@@ -241,7 +238,9 @@ class FeatureMatching(nn.Module):
         _Pairs([tasks[row] for row in drawn.tolist()])  # fails before the slow part
         with torch.random.fork_rng(devices=[]), torch.enable_grad():
             torch.manual_seed(seed)
-            self._initialize()
+            for layer in self.modules():
+                if isinstance(layer, (nn.Conv2d, nn.Linear, nn.BatchNorm2d)):
+                    layer.reset_parameters()
             self.requires_grad_(True)
             with torch.autocast(device.type, enabled=False):
                 known = grasps.to(device)
@@ -257,12 +256,6 @@ class FeatureMatching(nn.Module):
             weights.grad = None
         self.eval()
         self.fitted.fill_(True)
-
-    def _initialize(self) -> None:
-        """Draws initial weights."""
-        for layer in self.modules():
-            if isinstance(layer, (nn.Conv2d, nn.Linear, nn.BatchNorm2d)):
-                layer.reset_parameters()
 
     @torch.no_grad()
     def _crops_of_proposals(
@@ -502,9 +495,6 @@ class _Pairs:
 
     Args:
         tasks: Task of each episode; all have a grasp.
-
-    Raises:
-        ValueError: No task has two episodes with a grasp.
     """
 
     def __init__(self, tasks: Sequence[str]) -> None:

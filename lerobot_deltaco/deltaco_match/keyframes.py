@@ -118,22 +118,6 @@ def _warn_of_missing(found: Sequence[Grasp | str], episodes: Sequence[int]) -> N
         )
 
 
-def grasp_frames(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[tuple[int, int] | None]:
-    """Finds the frames in which the gripper has closed around an object, and in which it opens again.
-
-    Args:
-        gripper: Commands to the gripper in all frames, greater for more open, (frames,).
-        spans: First and last frame of each episode.
-
-    Returns:
-        Frame of the grasp and of the release of each episode; None where there is no grasp.
-    """
-    return [
-        None if isinstance(found, str) else (found.grasp, found.release)
-        for found in find_grasps(gripper, spans)
-    ]
-
-
 def find_grasps(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[Grasp | str]:
     """Finds the last grasp of each episode that is released.
 

@@ -21,18 +21,18 @@ have to wait for the place network, which learns beside it.
 
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
-from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_transition
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
-from lerobot_deltaco.dataset_reading import open_dataset, warn_of_equal_instructions
+from lerobot_deltaco.dataset_reading import warn_of_equal_instructions
 from lerobot_deltaco.deltaco_match.calibration import MIN_EPISODES
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
@@ -52,12 +52,11 @@ from lerobot_deltaco.deltaco_match.words import (
     encode_words,
     vocabulary_of,
 )
-from lerobot_deltaco.demonstrations import DemonstrationBank, RobotData, read_robot_data
+from lerobot_deltaco.demonstrations import Demonstration, DemonstrationBank, RobotData, read_robot_data
 from lerobot_deltaco.losses import location_loss
 from lerobot_deltaco.networks import (
     BACKBONES,
     PolicyNetwork,
-    fuse_batch_norms,
     random_shifts,
     shift_images,
 )
@@ -331,8 +330,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             if demonstrations is None:
                 demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
             found = self._find(batch, instructions, demonstrations)
-            network = self.model if self.training else fuse_batch_norms(self.model)
-            self._start(Episode(instructions, found, network))
+            self._start(Episode(instructions, found, self._acting_network()))
         episode: Episode = self._episode
         locations, heights = episode.found.locations, episode.found.heights
         concat = self._concatenated(batch, locations, heights)
@@ -362,9 +360,6 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             instructions: Instruction of each sample; an empty string leaves it out.
             demonstrations: Demonstrations of each sample, the same number for each; an empty list leaves them
                 out.
-
-        Raises:
-            ValueError: A sample has neither an instruction nor a demonstration.
         """
         camera = self.config.cameras[0]
         scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
@@ -400,11 +395,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     def _stacked(
         self, demonstrations: DemonstrationsOfTasks, device: torch.device
     ) -> StackedDemonstrations | None:
-        """Stacks the demonstrations of a batch; None if they are left out.
-
-        Raises:
-            ValueError: The samples have different numbers of demonstrations.
-        """
+        """Stacks the demonstrations of a batch; None if they are left out."""
         counts = {len(own) for own in demonstrations}
         if len(counts) != 1:
             raise ValueError(
@@ -413,21 +404,15 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if counts == {0}:
             return None
         unknown = torch.full((self.config.state_dim,), torch.nan)
-        ends, native, states = [], [], []
-        for own in demonstrations:
-            ends.append(torch.stack([each.frames[[0, -1]] for each in own]))
-            native.append(
-                torch.stack(
-                    [each.frames[0] if each.first_image is None else each.first_image for each in own]
-                )
-            )
-            states.append(
-                torch.stack([unknown if each.pick_state is None else each.pick_state.cpu() for each in own])
-            )
+
+        def stacked(part: Callable[[Demonstration], Tensor]) -> Tensor:
+            rows = [torch.stack([part(each) for each in own]) for own in demonstrations]
+            return torch.stack(rows).to(device)
+
         return StackedDemonstrations(
-            torch.stack(ends).to(device).float() / 255,
-            torch.stack(native).to(device),
-            torch.stack(states).to(device),
+            stacked(lambda each: each.frames[[0, -1]]).float() / 255,
+            stacked(lambda each: each.frames[0] if each.first_image is None else each.first_image),
+            stacked(lambda each: unknown if each.pick_state is None else each.pick_state.cpu()),
         )
 
     def _concatenated(
@@ -515,23 +500,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         normalized = step(create_transition(observation={OBS_STATE: states}))
         return normalized[TransitionKey.OBSERVATION][OBS_STATE] * self.state_limits.scale.cpu()
 
-    def _read_evaluation_bank(self) -> DemonstrationBank | None:
-        bank = super()._read_evaluation_bank()
-        repo_id = self.config.demo_repo_id
-        if bank is not None and repo_id is not None:
-            dataset = open_dataset("--policy.demo_root", repo_id, self.config.demo_root)
-            data = read_robot_data(dataset, bank.episodes.tolist())
-            self._check_robot(data)
-            gripper = self.config.gripper_opening(data.actions)
-            bank.pick_states = find_keyframes(data.states, gripper, data.spans).pick_states
-        return bank
-
-    def _check_robot(self, data: RobotData) -> None:
-        """Checks that demonstrations are from the policy's robot.
-
-        Raises:
-            ValueError: Their states or actions have another size.
-        """
+    def _complete_bank(self, bank: DemonstrationBank, dataset: LeRobotDataset) -> None:
+        data = read_robot_data(dataset, bank.episodes.tolist())
         assert self.config.action_feature is not None
         sizes = (data.states.shape[1], data.actions.shape[1])
         expected = (self.config.state_dim, self.config.action_feature.shape[0])
@@ -541,6 +511,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 f"actions have {sizes[0]} and {sizes[1]} numbers, those of the policy {expected[0]} and "
                 f"{expected[1]}. Name a dataset of the policy's robot."
             )
+        gripper = self.config.gripper_opening(data.actions)
+        bank.pick_states = find_keyframes(data.states, gripper, data.spans).pick_states
 
 
 def _shifted(images: Tensor, locations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
