@@ -19,7 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-N_TASKS = 16  # of made-up datasets
+N_TASKS = 16  # of the datasets that are collected for training
 
 
 def main() -> None:
@@ -124,32 +124,11 @@ def train(
     return results
 
 
-def make_dataset(root: Path, n_episodes: int = 12 * N_TASKS) -> None:
-    """Writes a dataset with the benchmark's features; noise, so that images are as large as they get."""
-    from lerobot.datasets import LeRobotDataset
+def make_dataset(root: Path, episodes_per_task: int = 12) -> None:
+    """Collects episodes of some tasks."""
+    from lerobot_deltaco.collect import CollectionPlan, collect
 
-    names = ["delta_x", "delta_y", "delta_z", "gripper"]
-    axes = ["height", "width", "channels"]
-    features = {
-        "observation.image": {"dtype": "image", "shape": (48, 48, 3), "names": axes},
-        "observation.state": {"dtype": "float32", "shape": (10,), "names": None},
-        "action": {"dtype": "float32", "shape": (4,), "names": names},
-    }
-    dataset = LeRobotDataset.create("benchmark/noise", 24, features, root=root, use_videos=False)
-    rng = np.random.default_rng(0)
-    for episode in range(n_episodes):
-        for step in range(30):
-            gripper = -1.0 if 10 <= step < 20 else 1.0
-            dataset.add_frame(
-                {
-                    "observation.image": rng.integers(0, 256, (48, 48, 3), dtype=np.uint8),
-                    "observation.state": rng.normal(size=10).astype(np.float32),
-                    "action": np.array([*rng.uniform(-1, 1, 3), gripper], np.float32),
-                    "task": f"task {episode % N_TASKS}",
-                }
-            )
-        dataset.save_episode()
-    dataset.finalize()
+    collect(root, CollectionPlan(f"0-{N_TASKS - 1}", episodes_per_task))
 
 
 def _data_rate(root: Path, in_memory: bool, batch_size: int) -> float:
@@ -159,7 +138,7 @@ def _data_rate(root: Path, in_memory: bool, batch_size: int) -> float:
 
     from lerobot_deltaco.frames import FramesInMemory
 
-    dataset = LeRobotDataset("benchmark/noise", root=root, return_uint8=True)
+    dataset = LeRobotDataset("benchmark/data", root=root, return_uint8=True)
     bounds = dataset.meta.episodes["dataset_from_index"], dataset.meta.episodes["dataset_to_index"]
     loader = DataLoader(
         FramesInMemory(dataset) if in_memory else dataset,
@@ -185,7 +164,7 @@ def _training_rate(root: Path, in_memory: bool, options: dict[str, Any]) -> floa
 
     words = {
         "policy.device": "cuda" if torch.cuda.is_available() else "cpu",
-        "dataset.repo_id": "benchmark/noise",
+        "dataset.repo_id": "benchmark/data",
         "dataset.root": root,
         "num_workers": 0 if in_memory else 2,
         "save_checkpoint": "false",
@@ -231,7 +210,7 @@ def policy(batch_size: int = 128, seconds: float = 5.0) -> dict[str, float]:
     n_threads = torch.get_num_threads()
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "dataset"
-        make_dataset(root, 3 * N_TASKS)
+        make_dataset(root, 3)
         for device, (name, options) in itertools.product(devices, variants.items()):
             for dtype in ("float32", "bfloat16"):
                 label = f"{name}, {device}, {dtype}"
@@ -258,7 +237,7 @@ def _policy_actions(
 
     import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
 
-    dataset = LeRobotDataset("benchmark/noise", root=root)
+    dataset = LeRobotDataset("benchmark/data", root=root)
     config = make_policy_config(options.pop("type"), **options)
     made: Any = make_policy(config, ds_meta=dataset.meta)
     before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)

@@ -185,16 +185,16 @@ def record_scene(checkpoint: Path, seed: int) -> list[dict[str, Any]]:
     from PIL import Image
 
     from lerobot_deltaco.pictures import demonstration_ends, draw_found, encode_video
-    from lerobot_deltaco.recording import benchmark_scene, load_conditioned, record_episode
+    from lerobot_deltaco.recording import benchmark_env, load_conditioned, record_episode
 
     loaded = load_conditioned(checkpoint)
-    scene = benchmark_scene(loaded.policy.config)
+    env = benchmark_env(loaded.policy.config, VIDEO_SIZE)
     rows = []
     for name, (task_id, index) in DEMONSTRATION_TASKS.items():
         given = loaded.policy.demonstrations.of_task(get_task(task_id).instruction)[:1]
         ends, episodes = demonstration_ends(given[0]), []
         for container, sentence in enumerate(SENTENCES):
-            recording = record_episode(loaded, SCENE_TASK, seed, sentence, given, scene, VIDEO_SIZE)
+            recording = record_episode(loaded, env, SCENE_TASK, seed, sentence, given)
             assert recording.found is not None
             episodes.append(
                 {

@@ -13,8 +13,8 @@ import tyro
 from huggingface_hub import HfApi
 from huggingface_hub.errors import HFValidationError, RevisionNotFoundError
 
+from lerobot_deltaco.cards import write_dataset_card
 from lerobot_deltaco.collect import CollectionPlan, collect
-from lerobot_deltaco.dataset_card import write_dataset_card
 from lerobot_deltaco.dataset_writer import CODEBASE_VERSION
 
 

@@ -20,7 +20,6 @@ from lerobot_deltaco.dataset_reading import open_folder_or_hub
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, Found
 from lerobot_deltaco.demonstrations import as_uint8, read_demonstrations, read_robot_data
-from lerobot_deltaco.evaluate import Simulators
 from lerobot_deltaco.pages import data_uri, picture_uri, write_page
 from lerobot_deltaco.pictures import (
     MIN_SIDE,
@@ -30,7 +29,7 @@ from lerobot_deltaco.pictures import (
     draw_found,
     encode_video,
 )
-from lerobot_deltaco.recording import benchmark_scene, find_demonstration, load_conditioned, record_episode
+from lerobot_deltaco.recording import benchmark_env, find_demonstration, load_conditioned, record_episode
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -106,15 +105,15 @@ def look(arguments: LookArguments) -> str:
 
 def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[View]:
     """Runs episodes of the benchmark's test tasks."""
-    policy, scene = loaded.policy, benchmark_scene(loaded.policy.config)
-    task_ids, simulators = select_tasks(_BENCHMARK_TASKS), Simulators(scene, MIN_SIDE)
+    policy, env = loaded.policy, benchmark_env(loaded.policy.config, MIN_SIDE)
+    task_ids = select_tasks(_BENCHMARK_TASKS)
     for index in _spread(len(task_ids), n_episodes):
         task = get_task(task_ids[index])
-        shown = [find_demonstration(policy, task, scene)] if policy.config.uses_demonstrations else []
-        seed = episode_seed(0, "evaluation", task.index, 0, _BENCHMARK_SEED)
-        recording = record_episode(
-            loaded, task.index, seed, task.instruction, shown, scene, MIN_SIDE, simulators=simulators
+        shown = (
+            [find_demonstration(policy, task, env.scene_config)] if policy.config.uses_demonstrations else []
         )
+        seed = episode_seed(0, "evaluation", task.index, 0, _BENCHMARK_SEED)
+        recording = record_episode(loaded, env, task.index, seed, task.instruction, shown)
         assert recording.found is not None
         ends = demonstration_ends(shown[0]) if shown else None
         picture = picture_uri(draw_found(recording.frames[0], ends, recording.found))
@@ -123,7 +122,7 @@ def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[View]:
         text = f"Task {task.index}: {'success' if is_success else 'failure'}"
         text += _how_sure(policy, task.instruction, recording.found)
         yield View(task.instruction, picture, text, (is_success,), video)
-    simulators.close()
+    env.close()
 
 
 def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int) -> Iterator[View]:

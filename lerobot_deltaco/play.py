@@ -18,10 +18,9 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import N_ROWS, TASKS, ContainerWord, get_task, select_tasks
 from lerobot_deltaco.arguments import PlayArguments
 from lerobot_deltaco.demonstrations import Demonstration
-from lerobot_deltaco.evaluate import Simulators
 from lerobot_deltaco.pages import data_uri, picture_uri, render
 from lerobot_deltaco.pictures import demonstration_ends, draw_found, encode_video
-from lerobot_deltaco.recording import benchmark_scene, find_demonstration, load_conditioned, record_episode
+from lerobot_deltaco.recording import benchmark_env, find_demonstration, load_conditioned, record_episode
 from lerobot_deltaco.verdict import Verdict, judge, object_name, parse_instruction
 
 # Before Gradio is imported: the page loads nothing from other servers and reports to none.
@@ -113,11 +112,10 @@ class Player:
 
     def __init__(self, checkpoint: str | Path) -> None:
         self._loaded = load_conditioned(checkpoint)
-        self._scene = benchmark_scene(self._loaded.policy.config)
-        self._simulators = Simulators(self._scene, _RENDER_SIZE)
+        self._env = benchmark_env(self._loaded.policy.config, _RENDER_SIZE)
         self._demonstrations: dict[tuple[int, int], Demonstration] = {}
         self.uses = _possible_uses(self._loaded.policy.config)
-        self.n_steps = self._scene.n_steps
+        self.n_steps = self._env.scene_config.n_steps
 
     def default_choice(self, task_id: int, seed: int) -> Choice:
         """Returns a scene with a demonstration and an instruction that fit it."""
@@ -142,11 +140,10 @@ class Player:
 
     def show_scene(self, choice: Choice) -> tuple[np.ndarray, Layout]:
         """Returns an image of a scene, and its objects and containers."""
-        (env,) = self._simulators.take(1, choice.task_id)
-        env.reset(seed=_scene_seed(choice), options={"task_id": choice.task_id})
-        image = env.render()
+        self._env.reset(seed=_scene_seed(choice), options={"task_id": choice.task_id})
+        image = self._env.render()
         assert image is not None
-        return image, env.scene.layout
+        return image, self._env.scene.layout
 
     def demonstration(self, choice: Choice) -> Demonstration:
         """Returns the demonstration of a choice; one that the checkpoint lacks is recorded by the expert."""
@@ -154,7 +151,7 @@ class Player:
         if key not in self._demonstrations:
             task = get_task(choice.demonstrated)
             self._demonstrations[key] = find_demonstration(
-                self._loaded.policy, task, self._scene, choice.recorded
+                self._loaded.policy, task, self._env.scene_config, choice.recorded
             )
         return self._demonstrations[key]
 
@@ -174,15 +171,7 @@ class Player:
         demonstration = self.demonstration(choice)
         shown = [] if choice.use == INSTRUCTION else [demonstration]
         recording = record_episode(
-            self._loaded,
-            choice.task_id,
-            _scene_seed(choice),
-            sentence,
-            shown,
-            self._scene,
-            _RENDER_SIZE,
-            on_step,
-            self._simulators,
+            self._loaded, self._env, choice.task_id, _scene_seed(choice), sentence, shown, on_step
         )
         picture, confidence = None, ""
         if recording.found is not None:

@@ -149,8 +149,8 @@ def test_a_bug_shows_its_traceback(monkeypatch):
 
 @pytest.mark.slow
 def test_act_is_trained_and_evaluated_by_the_command_of_a_datasets_card(tmp_path):
+    from lerobot_deltaco.cards import dataset_card
     from lerobot_deltaco.collect import CollectionPlan, collect
-    from lerobot_deltaco.dataset_card import dataset_card
 
     root = tmp_path / "data"
     collect(root, CollectionPlan("4", 2))

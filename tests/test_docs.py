@@ -88,7 +88,6 @@ def parse_lerobot(command: str, arguments: list[str], monkeypatch: pytest.Monkey
     """Parses a command's configuration with draccus, as LeRobot does, but reads no checkpoint."""
     from lerobot.configs import PreTrainedConfig
 
-    monkeypatch.syspath_prepend(ROOT / "examples")
     own = ("lerobot_policy_deltaco", "lerobot_policy_example", "other_environments")
     for module in ("lerobot.policies", "lerobot.envs", *own):
         importlib.import_module(module)

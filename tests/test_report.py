@@ -1,13 +1,12 @@
 """Reports: statistics against numbers worked by hand, rows by settings, and the committed results."""
 
 import re
-import sys
 from collections import defaultdict
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import update_docs
 from example_records import make_record
 
 from gym_deltaco.tasks import TASKS, get_task
@@ -35,9 +34,6 @@ from lerobot_deltaco.statistics import (
     task_rates,
     wilson_interval,
 )
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-import update_docs
 
 RESULTS = update_docs.ROOT / "results"
 

@@ -22,9 +22,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from gym_deltaco import pybullet_import as pybullet
 from gym_deltaco.camera import Camera, HandCamera
 from gym_deltaco.solids import Mesh
+
+# Optional, because many systems have to compile it: tasks, layouts, datasets and policies do not need it.
+_import_error: ImportError | None = None
+try:
+    import pybullet
+except ImportError as error:
+    _import_error = error
 
 TIME_STEP = 1 / 240  # s
 GRAVITY = -10.0  # m/s²
@@ -107,6 +113,20 @@ class Link:
 
 
 _Matrices = tuple[Sequence[float], Sequence[float]]  # view and projection
+
+
+def check_simulator() -> None:
+    """Checks that PyBullet is installed.
+
+    Raises:
+        ImportError: It is not; the message says what to install.
+    """
+    if _import_error is not None:
+        raise ImportError(
+            f"The environment needs PyBullet, which cannot be imported: {_import_error}. Install it with "
+            '`pip install "lerobot_policy_deltaco[sim]"`; it needs a C++ compiler where there is no wheel.',
+            name="pybullet",
+        ) from _import_error
 
 
 @functools.cache
