@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import NamedTuple
@@ -25,13 +25,12 @@ from torch import Tensor
 from torch.utils.data import default_collate
 from tqdm import tqdm
 
+from gym_deltaco.atomic_files import write_text
 from lerobot_deltaco.arguments import CheckArguments
 from lerobot_deltaco.base_config import dimension_names
 from lerobot_deltaco.dataset_reading import open_folder_or_hub
-from lerobot_deltaco.deltaco_match import feature_matching, proposals
+from lerobot_deltaco.deltaco_match import feature_matching
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM
-from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
 from lerobot_deltaco.deltaco_match.keyframes import Grasp, find_grasps
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.demonstrations import (
@@ -42,7 +41,7 @@ from lerobot_deltaco.demonstrations import (
     resize_images,
 )
 from lerobot_deltaco.frames import memory_for_frames
-from lerobot_deltaco.pages import picture_uri, write_page
+from lerobot_deltaco.pages import picture_uri, render
 from lerobot_deltaco.pauses import paused_frames
 from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.train import image_size_in_memory
@@ -148,9 +147,8 @@ def check(arguments: CheckArguments) -> str:
     )
     counts = [(task, n, found[task]) for task, n in Counter(tasks).items()]
     page = arguments.out / "index.html"
-    write_page(
+    content = render(
         "check.html",
-        page,
         source=arguments.dataset,
         refusal=start.refusal,
         warnings=warnings,
@@ -161,6 +159,7 @@ def check(arguments: CheckArguments) -> str:
         n_episodes=meta.total_episodes,
         has_locations=start.locations is not None,
     )
+    write_text(page, content)
     lines = [
         *(f"{name + ':':15} {text}" for name, text in facts),
         *(f"task:           {n} episodes, {n_found} with a grasp: {task}" for task, n, n_found in counts),
@@ -335,66 +334,33 @@ def _advice(start: TrainingStart, staying: dict[str, float]) -> list[str]:
 
 def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[str, str]]:
     """Measures a few steps of training, and returns what all of it would take."""
-    dataset, config, policy, bank = start.dataset, start.config, start.policy, start.bank
+    dataset, config, policy = start.dataset, start.config, start.policy
     assert policy is not None
-    assert bank is not None
     windows = resolve_delta_timestamps(config, dataset.meta)
     timed = LeRobotDataset(dataset.repo_id, dataset.root, delta_timestamps=windows, return_uint8=True)
-    some = range(min(_TIMED_FRAMES, len(dataset)))
-    reading = _seconds(lambda: [dataset[n] for n in some], 1) / len(some) * len(dataset)
+    began, n_read = time.perf_counter(), min(_TIMED_FRAMES, len(dataset))
+    for n in range(n_read):
+        dataset[n]
+    reading = (time.perf_counter() - began) / n_read * len(dataset)
     batch = default_collate([timed[n % len(timed)] for n in range(batch_size)])
     for camera in dataset.meta.camera_keys:
         batch[camera] = resize_images(batch[camera], config.image_size).float() / 255
     batch = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)[0](batch)
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
-
-    def step() -> None:
+    for n in range(1 + _TIMED_STEPS):
+        if n == 1:  # the first step is slower
+            began = time.perf_counter()
         policy.forward(batch)[0].backward()
         optimizer.step()
         optimizer.zero_grad()
-
-    step()  # the first one is slower
-    per_step, fit = _seconds(step), _seconds_of_fit(bank, policy)
-    total = reading + fit + steps * per_step
+    per_step = (time.perf_counter() - began) / _TIMED_STEPS
     memory = start.bytes + psutil.Process().memory_info().rss
     return [
         (
             "time",
-            f"about {total / 60:.0f} minutes on this machine ({config.device}) for {steps:,} steps of "
-            f"{batch_size}: {reading / 60:.1f} to read the frames, {fit / 60:.1f} to fit feature matching, "
-            f"{1000 * per_step:.0f} ms a step",
+            f"about {(reading + steps * per_step) / 60:.0f} minutes on this machine ({config.device}) for "
+            f"{steps:,} steps of {batch_size}, and several more to fit the feature matching: "
+            f"{reading / 60:.1f} to read the frames, {1000 * per_step:.0f} ms a step",
         ),
         ("memory", f"about {memory / 1e9:.1f} GB, of which the frames take {start.bytes / 1e9:.2f}"),
     ]
-
-
-def _seconds_of_fit(bank: DemonstrationBank, policy: DeltacoMatchPolicy) -> float:
-    """Returns the time that the fit of feature matching takes, from the time of its parts."""
-    known = policy.training_locations
-    assert known is not None
-    matching = FeatureMatching(policy.config.known_words, policy.config.crop_size).to(bank.frames.device)
-    rows = known.found.nonzero().flatten()
-    images, picks, generator = bank.frames[rows, 0], known.locations[rows, 0], torch.Generator()
-    native = images if bank.first_images is None else bank.first_images[rows]
-    matching.requires_grad_(True)
-    n_timed = 2 * _TIMED_STEPS
-    propose = _seconds(lambda: matching.propose.fit(images, picks, generator, n_timed), 1) / n_timed
-    crops = torch.rand(64, 1 + proposals.N_PROPOSALS, FEATURE_DIM, device=images.device)
-    compare = _seconds(lambda: sum(part.sum() for part in matching.compare(crops, generator)).backward())
-    some = slice(0, 16)
-    small = images[some].float() / 255
-    describe = _seconds(lambda: matching.describe(small, native[some], picks[some], picks[some])) / len(small)
-    n_scenes = min(len(rows), feature_matching._MAX_EPISODES)
-    return (
-        proposals.FIT_STEPS * propose
-        + feature_matching.FIT_STEPS * compare
-        + n_scenes * proposals.N_PROPOSALS * describe
-    )
-
-
-def _seconds(function: Callable[[], object], n_calls: int = _TIMED_STEPS) -> float:
-    """Returns the time of a call, in seconds, as the mean of some calls."""
-    began = time.perf_counter()
-    for _ in range(n_calls):
-        function()
-    return (time.perf_counter() - began) / n_calls

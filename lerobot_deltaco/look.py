@@ -11,6 +11,7 @@ from lerobot.utils.constants import ACTION
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from gym_deltaco.atomic_files import write_text
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.arguments import LookArguments
@@ -20,7 +21,7 @@ from lerobot_deltaco.dataset_reading import open_folder_or_hub
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, Found
 from lerobot_deltaco.demonstrations import as_uint8, read_demonstrations, read_robot_data
-from lerobot_deltaco.pages import data_uri, picture_uri, write_page
+from lerobot_deltaco.pages import data_uri, picture_uri, render
 from lerobot_deltaco.pictures import (
     MIN_SIDE,
     PICK_COLOR,
@@ -89,9 +90,8 @@ def look(arguments: LookArguments) -> str:
         known = [view.right[n] for view in shown if view.right[n] is not None]
         rates += [(text, sum(known), len(known))] if known else []
     page = arguments.out / "index.html"
-    write_page(
+    content = render(
         "look.html",
-        page,
         checkpoint=checkpoint,
         source=dataset or "scenes of the benchmark",
         views=shown,
@@ -100,6 +100,7 @@ def look(arguments: LookArguments) -> str:
         pick_color=f"rgb{PICK_COLOR}",
         place_color=f"rgb{PLACE_COLOR}",
     )
+    write_text(page, content)
     return "\n".join([*(f"{text}: {n_right} of {n}" for text, n_right, n in rates), f"See {page}."])
 
 

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
     "words",
     [
         ["env", "--episodes", "2", "--seconds", "0.01"],
-        ["train", "--batch-size", "16", "--steps", "3", "--options", "backbone=strided"],
+        ["train", "--batch-size", "16", "--steps", "3"],
         ["policy", "--batch-size", "16", "--seconds", "0.01"],
     ],
     ids=lambda words: words[0],
@@ -25,8 +25,8 @@ def test_a_benchmark_prints_a_table(words, monkeypatch, capsys):
     benchmark.main()
     lines = [line.rsplit(maxsplit=1) for line in capsys.readouterr().out.splitlines() if "  " in line]
     figures = {name.strip(): float(figure) for name, figure in lines if figure.replace(".", "").isdigit()}
-    assert len(figures) > 3
-    assert all(figure >= 0 for figure in figures.values())
+    assert len(figures) > 1
+    assert min(figures.values()) > 0
 
 
 def test_the_images_of_the_documentation_are_drawn(tmp_path, monkeypatch):
