@@ -147,6 +147,11 @@ class Evaluation:
         task = get_task(episode.demonstration_task)
         known = self._bank.of_task(task.instruction, task.target_object)
         n_each = self.plan.n_demonstrations
+        if len(known) < n_each:
+            raise ValueError(
+                f"`n_demonstrations` is {n_each}, but the task {task.instruction!r} has {len(known)}. "
+                "Collect more and name them with --demo-repo-id and --demo-root."
+            )
         return [known[(episode.trial * n_each + n) % len(known)] for n in range(n_each)]
 
     @contextmanager
@@ -312,19 +317,10 @@ def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | ExpertBa
         raise ValueError(
             "The policy has no demonstrations. Name a dataset of them with --demo-repo-id and --demo-root."
         )
-    if plan.n_demonstrations > 1:
-        if not hasattr(policy.config, "n_demonstrations"):
-            raise ValueError(
-                f"`n_demonstrations` is {plan.n_demonstrations}, but this policy does not combine any."
-            )
-        for task_id in plan.task_ids:
-            task = get_task(task_id).instruction
-            n_known = len(bank.rows.get(task, ()))
-            if 0 < n_known < plan.n_demonstrations:
-                raise ValueError(
-                    f"`n_demonstrations` is {plan.n_demonstrations}, but the task {task!r} has {n_known}. "
-                    "Collect more and name them with --demo-repo-id and --demo-root."
-                )
+    if plan.n_demonstrations > 1 and not hasattr(policy.config, "n_demonstrations"):
+        raise ValueError(
+            f"`n_demonstrations` is {plan.n_demonstrations}, but this policy does not combine any."
+        )
     return bank
 
 

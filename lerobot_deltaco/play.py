@@ -104,7 +104,6 @@ class Player:
 
     Attributes:
         uses: What the policy may receive, of `BOTH`, `DEMONSTRATION` and `INSTRUCTION`.
-        n_steps: Number of steps of an episode.
 
     Raises:
         ValueError: There is no checkpoint, or its policy is not one for the benchmark.
@@ -115,7 +114,6 @@ class Player:
         self._env = benchmark_env(self._loaded.policy.config, _RENDER_SIZE)
         self._demonstrations: dict[tuple[int, int], Demonstration] = {}
         self.uses = _possible_uses(self._loaded.policy.config)
-        self.n_steps = self._env.scene_config.n_steps
 
     def default_choice(self, task_id: int, seed: int) -> Choice:
         """Returns a scene with a demonstration and an instruction that fit it."""
@@ -155,12 +153,8 @@ class Player:
             )
         return self._demonstrations[key]
 
-    def run(self, choice: Choice, on_step: Callable[[int], None] | None = None) -> Run:
+    def run(self, choice: Choice) -> Run:
         """Runs an episode.
-
-        Args:
-            choice: Scene, demonstration and instruction.
-            on_step: Called with the number of steps that have been run.
 
         Raises:
             ValueError: The instruction is needed and empty.
@@ -171,7 +165,7 @@ class Player:
         demonstration = self.demonstration(choice)
         shown = [] if choice.use == INSTRUCTION else [demonstration]
         recording = record_episode(
-            self._loaded, self._env, choice.task_id, _scene_seed(choice), sentence, shown, on_step
+            self._loaded, self._env, choice.task_id, _scene_seed(choice), sentence, shown
         )
         picture, confidence = None, ""
         if recording.found is not None:
@@ -375,12 +369,10 @@ def build_page(player: Player, name: str) -> gr.Blocks:
             """Returns the handler that runs what `choose` makes of the user's choice."""
 
             def handle(*values: Any, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
-                choice, runs = Choice(*values), list[Run]()
+                choice = Choice(*values)
                 try:
-                    choices = choose(choice)
-                    for each in choices:
-                        before, n_steps = len(runs) * player.n_steps, len(choices) * player.n_steps
-                        runs.append(player.run(each, _reporter(progress, before, n_steps)))
+                    choices = progress.tqdm(choose(choice), desc="Running", unit="episodes")
+                    runs = [player.run(each) for each in choices]
                 except (ValueError, RuntimeError) as error:
                     gr.Warning(str(error))
                     return gr.skip()
@@ -404,11 +396,6 @@ def build_page(player: Player, name: str) -> gr.Blocks:
         chips.click(lambda sample: sample[0], chips, sentence, **quiet)
         address.change(None, address, js=_REPLACE_ADDRESS)
     return page
-
-
-def _reporter(progress: gr.Progress, n_before: int, n_steps: int) -> Callable[[int], None]:
-    """Returns a function that shows the progress of an episode."""
-    return lambda step: progress((n_before + step, n_steps), desc="Running", unit="steps")
 
 
 def play(arguments: PlayArguments) -> None:

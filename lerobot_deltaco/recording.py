@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,7 +54,6 @@ def record_episode(
     seed: int,
     instruction: str,
     demonstrations: Sequence[Demonstration],
-    on_step: Callable[[int], None] | None = None,
 ) -> Recording:
     """Runs an episode of the benchmark and records it.
 
@@ -65,7 +64,6 @@ def record_episode(
         seed: Seed of the environment's reset.
         instruction: Instruction that the policy receives; empty for none.
         demonstrations: Demonstrations that the policy receives; empty for none.
-        on_step: Called with the number of steps that have been run.
     """
     frames: list[NDArray[np.uint8]] = []
     first: dict[str, Any] = {}
@@ -80,8 +78,6 @@ def record_episode(
         assert image is not None
         frames.append(image)
         placed.update((n, env.scene.container_of(n)) for n in range(len(env.scene.bodies)))
-        if on_step is not None:
-            on_step(len(frames) - 1)
 
     episode = Episode(task_id, 0, seed, instruction, task_id if demonstrations else -1)
     with torch.inference_mode():

@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.usefixtures("short_fit")
 @pytest.mark.parametrize(
     "words",
     [

@@ -172,7 +172,6 @@ def test_a_wrong_setting_is_refused(setting, message):
         ("deltaco: {}", "deltaco: 3", "must have the mappings"),
         ("deltaco: {}", "deltaco: {start_from: scenario_a/nothing}", "is not an experiment"),
         ("deltaco: {}", "deltaco: {}\n    deltaco: {}", "'deltaco' is there twice"),
-        ("deltaco: {}", "deltaco: &a {policy: {}}\n    b: *a", "aliases are not supported"),
         ("deltaco: {}", "deltaco: {", "Cannot read"),
         ("deltaco: {}", "deltaco: " + "[" * 2000, "nested too deeply"),
         ("families:", "family:", "'families'"),
@@ -289,10 +288,6 @@ def test_a_command_that_fails_is_named(capfd):
     with pytest.raises(ExperimentError, match=r"`deltaco no_such_command` failed \(exit status 1\)"):
         experiments.call(["no_such_command"])
     assert capfd.readouterr().out.strip() == "deltaco no_such_command"
-
-
-def test_without_names_an_experiment_lists_them():
-    assert run_experiments().splitlines() == experiment_names()
 
 
 def test_policies_accept_their_options():

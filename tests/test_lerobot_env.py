@@ -1,7 +1,6 @@
 """The benchmark as LeRobot sees it: configuration, lazy vector environments, evaluation."""
 
 import numpy as np
-import pybullet
 import pytest
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
@@ -12,15 +11,10 @@ from torch import nn
 
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import TASKS, select_tasks
-from lerobot_deltaco.lerobot_env import DeltacoEnv, EvaluationEnv
+from lerobot_deltaco.lerobot_env import DeltacoEnv
 
 # One of each kind: a name, a color and a shape.
 ONE_OF_EACH_KIND = "4,32,90"
-
-
-def simulators():
-    """Ids of PyBullet's running simulators in this process."""
-    return {i for i in range(64) if pybullet.getConnectionInfo(i)["isConnected"]}
 
 
 @pytest.fixture
@@ -36,13 +30,6 @@ def make_envs():
     yield make
     for groups in made:
         close_envs(groups)
-
-
-def roll_out(env, seeds, n_steps=3):
-    """Returns the observations of the first steps, with the same random actions every time."""
-    actions = np.random.default_rng(0).uniform(-1, 1, (n_steps, env.num_envs, 4)).astype(np.float32)
-    observations = [env.reset(seed=seeds)[0], *(env.step(action)[0] for action in actions)]
-    return {key: np.stack([o[key] for o in observations]) for key in observations[0]}
 
 
 # Configuration
@@ -92,28 +79,6 @@ def test_tasks_are_grouped_by_kind(selection):
     for kind, group in groups.items():
         assert {TASKS[task_id].kind for task_id in group} == {kind}
     close_envs(groups)
-
-
-def test_simulators_start_at_the_first_reset_and_are_passed_on(make_envs):
-    EvaluationEnv._idle.clear()
-    before = simulators()
-    envs = list(make_envs("all", n_envs=2).values())
-    assert len(envs) == 300
-    assert simulators() == before
-    for env in envs[:3]:
-        env.reset(seed=0)
-        env.close()
-        assert len(simulators() - before) == 2
-
-
-def test_a_borrowed_simulator_does_not_remember(make_envs):
-    first, second = make_envs("4,54").values()
-    (fresh,) = make_envs("54").values()
-    roll_out(first, seeds=[0], n_steps=5)
-    first.close()
-    used, unused = roll_out(second, seeds=[3]), roll_out(fresh, seeds=[3])
-    for key in used:
-        np.testing.assert_array_equal(used[key], unused[key])
 
 
 def test_a_finished_episode_stays_finished(make_envs):

@@ -26,7 +26,6 @@ from gym_deltaco.tasks import FIRST_FOREIGN_INDEX, FOREIGN_FILE, MESHES, ObjectL
 _WIDTH, _LENGTH = 0.044, 0.085  # m, largest size along the fingers' motion and across it
 _MAX_YAW = 0.2  # rad
 _PALM_DISTANCE = 0.035  # m, largest distance of an object's top above its grasp height
-_N_TRIALS = 3  # in all of which the expert has to succeed
 
 
 def is_foreign(index: int) -> bool:

@@ -103,14 +103,8 @@ def object_model(index: int) -> ObjectModel:
 
     Args:
         index: Index into `OBJECTS`, 0..31.
-
-    Raises:
-        ValueError: The index is out of range.
     """
-    if index not in range(len(OBJECTS)):
-        raise ValueError(f"An object's index must be an integer from 0 to {len(OBJECTS) - 1}. Got {index!r}.")
-    label = OBJECTS[int(index)]
-    return build_model(label, _RECIPES[label.name])
+    return build_model(OBJECTS[index], _RECIPES[OBJECTS[index].name])
 
 
 def build_model(label: ObjectLabel, recipe: Recipe) -> ObjectModel:

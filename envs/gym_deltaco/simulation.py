@@ -352,11 +352,6 @@ class Simulation:
         rotation = np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
         return Pose(np.array(position), rotation, math.hypot(*linear), math.hypot(*angular))
 
-    def move(self, body: int, position: ArrayLike, yaw: float = 0.0) -> None:
-        """Moves a body to a position, (3,), m, and a yaw, rad, upright and at rest."""
-        quaternion = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
-        pybullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=self._client)
-
     def touch(self, body: int, other: int) -> bool:
         """Returns whether two bodies were in contact in the last step."""
         return bool(pybullet.getContactPoints(body, other, physicsClientId=self._client))
