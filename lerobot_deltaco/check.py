@@ -11,7 +11,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import psutil
@@ -51,26 +51,6 @@ _PICTURE_HEIGHT = 180  # px
 # are: of the benchmark's fixed cameras 0.6 to 0.8, of its wrist camera below 0.1.
 _MIN_STAYING, _COMPARED_SIZE, _EDGES, _SAME = 0.4, 48, 0.2, 0.5
 _TIMED_STEPS, _TIMED_FRAMES = 3, 64
-
-
-class EpisodeView(NamedTuple):
-    """An episode on the page.
-
-    Attributes:
-        number: Index of the episode.
-        task: Its task.
-        text: Its length, and whether it is left out.
-        pictures: Four images, as data URIs.
-        course: Points of the gripper's course, in 0..1, as in SVG.
-        lines: Times of the grasp and the release, in 0..1.
-    """
-
-    number: int
-    task: str
-    text: str
-    pictures: list[str]
-    course: str
-    lines: list[float]
 
 
 class TrainingStart:
@@ -163,7 +143,7 @@ def check(arguments: CheckArguments) -> str:
     lines = [
         *(f"{name + ':':15} {text}" for name, text in facts),
         *(f"task:           {n} episodes, {n_found} with a grasp: {task}" for task, n, n_found in counts),
-        *(f"left out:       episode {view.number}: {view.text}" for view in views if not view.lines),
+        *(f"left out:       episode {view['number']}: {view['text']}" for view in views if not view["lines"]),
         *(f"warning:        {warning}" for warning in warnings),
         f"See {page}.",
     ]
@@ -194,8 +174,8 @@ def _warnings() -> Iterator[list[str]]:
 
 def _read_episodes(
     start: TrainingStart, tasks: Sequence[str], n_shown: int
-) -> tuple[list[EpisodeView], dict[str, float]]:
-    """Returns views of episodes, and for each camera the fraction of edges that stay where they are."""
+) -> tuple[list[dict[str, Any]], dict[str, float]]:
+    """Returns episodes for the page, and for each camera the fraction of edges that stay where they are."""
     dataset, config, meta = start.dataset, start.config, start.dataset.meta
     cameras = [name for name in meta.camera_keys if name not in meta.depth_keys]
     demo_camera = config.cameras[0] if start.policy is not None else next(iter(cameras), None)
@@ -231,7 +211,16 @@ def _read_episodes(
             course = " ".join(f"{x:.3f},{y:.3f}" for x, y in zip(at, heights, strict=True))
             if isinstance(grasp, Grasp):
                 lines = [round(float(at[time - first]), 3) for time in times[1:3]]
-        views.append(EpisodeView(episode, tasks[episode], text, _strip(images, marks), course, lines))
+        views.append(
+            {
+                "number": episode,
+                "task": tasks[episode],
+                "text": text,
+                "pictures": _strip(images, marks),
+                "course": course,
+                "lines": lines,
+            }
+        )
     return views, {camera: float(np.median(values)) for camera, values in staying.items()}
 
 

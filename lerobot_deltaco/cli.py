@@ -24,18 +24,19 @@ COMMANDS = {
     "play": "Play with a policy in the browser.",
     "demo": "Train and evaluate the project's method in a few minutes.",
 }
-# The function of each command. If its module imports torch, which its help should not wait for, the function
-# has one argument, an object of a class in arguments.py.
 _FUNCTIONS = {
-    "collect": ("hub.collect_and_push", None),
-    "check": ("check.check", "CheckArguments"),
-    "evaluate": ("evaluate.evaluate_checkpoints", "EvaluateArguments"),
-    "report": ("report.write_report", None),
-    "experiment": ("experiments.run_experiments", None),
-    "look": ("look.look", "LookArguments"),
-    "play": ("play.play", "PlayArguments"),
-    "demo": ("demo.run_demo", None),
+    "collect": "hub.collect_and_push",
+    "check": "check.check",
+    "evaluate": "evaluate.evaluate_checkpoints",
+    "report": "report.write_report",
+    "experiment": "experiments.run_experiments",
+    "look": "look.look",
+    "play": "play.play",
+    "demo": "demo.run_demo",
 }
+# Commands whose modules import torch, which help should not wait for: their functions have one argument, an
+# object of a class in arguments.py.
+_SLOW = ("check", "evaluate", "look", "play")
 _PACKAGES = ("lerobot_deltaco", "gym_deltaco")
 
 
@@ -82,7 +83,7 @@ def _run(name: str, arguments: Sequence[str]) -> None:
 
     kind = command_arguments(name)
     parsed = tyro.cli(kind, prog=f"deltaco {name}", description=COMMANDS[name], args=arguments)
-    result = _function(name)(parsed) if isinstance(kind, type) else parsed
+    result = _imported(_FUNCTIONS[name])(parsed) if name in _SLOW else parsed
     if isinstance(result, Path):
         _print(f"See {result}.")
     elif result is not None:
@@ -91,12 +92,7 @@ def _run(name: str, arguments: Sequence[str]) -> None:
 
 def command_arguments(name: str) -> Callable[..., Any]:
     """Returns the function, or the class of its argument, from which tyro makes the options of a command."""
-    kind = _FUNCTIONS[name][1]
-    return _function(name) if kind is None else _imported(f"arguments.{kind}")
-
-
-def _function(name: str) -> Callable[..., Any]:
-    return _imported(_FUNCTIONS[name][0])
+    return _imported(f"arguments.{name.capitalize()}Arguments" if name in _SLOW else _FUNCTIONS[name])
 
 
 def _imported(path: str) -> Any:

@@ -386,22 +386,20 @@ def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
     return "\n".join(lines)
 
 
-def _chosen(found: Sequence[Checkpoint], steps: str) -> list[Checkpoint]:
+def _chosen(found: Sequence[Checkpoint], steps: str) -> Sequence[Checkpoint]:
     """Returns the checkpoints that `steps` selects.
 
     Raises:
         ValueError: There is no checkpoint of a step.
     """
-    if steps == "all":
-        return list(found)
-    if steps == "last":
-        return [found[-1]]
+    if steps in ("all", "last"):
+        return found if steps == "all" else found[-1:]
     available = {str(checkpoint.step): checkpoint for checkpoint in found}
-    missing = [step for step in steps.split(",") if step not in available]
-    if missing:
-        raise ValueError(
-            f"There is no checkpoint of step {missing[0]!r}. Valid are all, last and {', '.join(available)}."
-        )
+    for step in steps.split(","):
+        if step not in available:
+            raise ValueError(
+                f"There is no checkpoint of step {step!r}. Valid are all, last and {', '.join(available)}."
+            )
     return [available[step] for step in steps.split(",")]
 
 

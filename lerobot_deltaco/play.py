@@ -201,8 +201,7 @@ class Player:
             raise ValueError("The comparison needs a policy that takes a demonstration and an instruction.")
         _, layout = self.show_scene(choice)
         labels = [item.label for item in layout.objects]
-        shown = parse_instruction(get_task(choice.demonstrated).instruction)
-        fitting = [label for label in labels if shown.fits(label)]
+        fitting = [label for label in labels if get_task(choice.demonstrated).describes(label)]
         first = choice
         if len(fitting) != 1:  # the chosen demonstration does not single out an object here
             fitting = [labels[layout.target_object]]

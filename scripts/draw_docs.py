@@ -113,59 +113,53 @@ def draw_joint_control(out: Path) -> None:
 
 def draw_ambiguity(out: Path) -> None:
     """Draws both ambiguity schemes: first and last image of a demonstration, and a new scene."""
-    container_task, object_task = get_task(236), get_task(31)  # white object in left bin; jar in green bin
-    word = twin_word(object_task)
-    # Task, numbers of a demonstration and of another scene, radius of the ring around what is meant, captions
-    rows: dict[str, tuple[Any, int, int, int, tuple[str, str, str]]] = {
-        "container": (
-            container_task,
-            2,
-            55,
-            34,
-            (
-                "The demonstration begins.",
-                "It ends in the left bin, which is {color}. Which of the two is meant?",
-                'New scene: the instruction says "left bin", whatever its color.',
-            ),
-        ),
-        "object": (
-            object_task,
-            3,
-            51,
-            24,
-            (
-                "The demonstration begins. The instruction does not say which jar is meant.",
-                f"The expert takes the jar that stood on the {word}.",
-                f"New scene: again, the jar on the {word} is meant.",
-            ),
-        ),
-    }
-    figure, all_axes = _grid(2, 3, (8.4, 7.2))
-    for axes, (ambiguity, (task, shown, new, radius, captions)) in zip(all_axes, rows.items(), strict=True):
-        with closing(PickPlaceEnv(scene=SceneConfig(ambiguity=ambiguity))) as env:
-            _reset(env, task.index, shown)
-            layout, images = env.scene.layout, [env.scene.render(VIEW_SIZE)]
-            n_successes = 0
-            for step in expert_episode(env, task.index, episode_seed(0, "train", task.index, shown)):
-                n_successes += step.info["is_success"]
-                if n_successes == 3:
-                    break
-            color = layout.containers[layout.target_container].color
-            images.append(env.scene.render(VIEW_SIZE))
-            _reset(env, task.index, new)
-            layout, pose = env.scene.layout, env.scene.object_pose(env.scene.layout.target_object)
-            images.append(env.scene.render(VIEW_SIZE))
-        for ax, image, caption in zip(axes, images, captions, strict=True):
-            ax.imshow(image)
-            ax.set_xlabel(textwrap.fill(caption.format(color=color), 38), loc="left")
-            ax.set_title(" ", fontsize=12)  # room for the title, which is wider than its axes
-        title = f'Ambiguity "{ambiguity}": {task.instruction}'
-        axes[0].text(0, 1.03, title, transform=axes[0].transAxes, fontsize=12, in_layout=False)
-        center = layout.containers[layout.target_container].quadrant.container_center
-        meant = np.array([*center, TRAY_FLOOR]) if ambiguity == "container" else pose.position
-        ring = Circle(tuple(_pixel(meant, VIEW_SIZE)), radius, fill=False, edgecolor="white", linewidth=3)
-        axes[2].add_patch(ring)
+    figure, axes = _grid(2, 3, (8.4, 7.2))
+    captions = (
+        "The demonstration begins.",
+        "It ends in the left bin, which is {color}. Which of the two is meant?",
+        'New scene: the instruction says "left bin", whatever its color.',
+    )
+    _draw_ambiguity(axes[0], "container", 236, (2, 55), captions)
+    word = twin_word(get_task(31))
+    captions = (
+        "The demonstration begins. The instruction does not say which jar is meant.",
+        f"The expert takes the jar that stood on the {word}.",
+        f"New scene: again, the jar on the {word} is meant.",
+    )
+    _draw_ambiguity(axes[1], "object", 31, (3, 51), captions)
     figure.savefig(out / "ambiguity.png")
+
+
+def _draw_ambiguity(
+    axes: Any, ambiguity: str, task_id: int, episodes: tuple[int, int], captions: Sequence[str]
+) -> None:
+    """Draws a demonstration of a task and another scene, given the numbers of their episodes."""
+    with closing(PickPlaceEnv(scene=SceneConfig(ambiguity=ambiguity))) as env:
+        _reset(env, task_id, episodes[0])
+        layout, images = env.scene.layout, [env.scene.render(VIEW_SIZE)]
+        color = layout.containers[layout.target_container].color
+        successes = 0
+        for step in expert_episode(env, task_id, episode_seed(0, "train", task_id, episodes[0])):
+            successes += step.info["is_success"]
+            if successes == 3:
+                break
+        images.append(env.scene.render(VIEW_SIZE))
+        _reset(env, task_id, episodes[1])
+        layout, pose = env.scene.layout, env.scene.object_pose(env.scene.layout.target_object)
+        images.append(env.scene.render(VIEW_SIZE))
+    for ax, image, caption in zip(axes, images, captions, strict=True):
+        ax.imshow(image)
+        ax.set_xlabel(textwrap.fill(caption.format(color=color), 38), loc="left")
+        ax.set_title(" ", fontsize=12)  # room for the title, which is wider than its axes
+    title = f'Ambiguity "{ambiguity}": {get_task(task_id).instruction}'
+    axes[0].text(0, 1.03, title, transform=axes[0].transAxes, fontsize=12, in_layout=False)
+    # A ring around what is meant
+    center, radius = pose.position, 24
+    if ambiguity == "container":
+        quadrant = layout.containers[layout.target_container].quadrant
+        center, radius = np.array([*quadrant.container_center, TRAY_FLOOR]), 34
+    ring = Circle(tuple(_pixel(center, VIEW_SIZE)), radius, fill=False, edgecolor="white", linewidth=3)
+    axes[2].add_patch(ring)
 
 
 def _reset(env: PickPlaceEnv, task_id: int, number: int) -> dict[str, Any]:

@@ -5,9 +5,9 @@ import re
 import shlex
 import shutil
 from dataclasses import asdict
-from itertools import batched
 
 import pytest
+import tyro
 from fake_hub import USER, FakeHub, Repo
 from fresh_python import run_python
 from huggingface_hub import DatasetCard
@@ -101,15 +101,7 @@ def test_card_counts_tasks_and_successes(dataset):
 
 def test_command_in_the_card_makes_the_same_plan(dataset):
     command = re.search(r"^deltaco collect --root DIR (.+)$", dataset_card(dataset), re.MULTILINE)[1]
-    words = batched(shlex.split(command), 2)
-    options = {name.removeprefix("--").replace("-", "_"): value for name, value in words}
-    scene = {n.removeprefix("scene."): options.pop(n) for n in [*options] if n.startswith("scene.")}
-
-    def typed(cls, values):
-        return {name: type(getattr(cls, name, ""))(value) for name, value in values.items()}
-
-    options = typed(PLAN, options)
-    assert CollectionPlan(**options, scene=SceneConfig(**typed(PLAN.scene, scene))) == PLAN
+    assert tyro.cli(CollectionPlan, args=shlex.split(command)) == PLAN
 
 
 def test_card_of_other_scenes_says_so(dataset, copy):

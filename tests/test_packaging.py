@@ -11,6 +11,10 @@ from pathlib import Path
 
 import pytest
 from fresh_python import run_python
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs import EnvConfig
+from lerobot.policies import get_policy_class
+from lerobot.utils.import_utils import register_third_party_plugins
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -60,18 +64,9 @@ def test_what_needs_no_policy_imports_neither_torch_nor_lerobot():
     assert not {"torch", "lerobot", "transformers", "huggingface_hub"} & set(result.stdout.split())
 
 
-def test_lerobot_finds_the_distribution():
-    # With hyphens, it would silently not be found.
+def test_lerobot_finds_the_distribution_and_its_types():
+    # With hyphens in its name, it would silently not be found.
     assert PROJECT["name"] == "lerobot_policy_deltaco"
-    assert PROJECT["scripts"] == {"deltaco": "lerobot_deltaco.cli:main"}
-
-
-def test_lerobot_knows_the_policies_and_the_environment():
-    from lerobot.configs import PreTrainedConfig
-    from lerobot.envs import EnvConfig
-    from lerobot.policies import get_policy_class
-    from lerobot.utils.import_utils import register_third_party_plugins
-
     register_third_party_plugins()
     assert {"deltaco", "deltaco_match"} <= set(PreTrainedConfig.get_known_choices())
     assert "deltaco" in EnvConfig.get_known_choices()

@@ -165,7 +165,6 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         # The simulator is connected at the first reset, so that each worker process has its own.
         self._simulation: Simulation | None = None
         self._scene: Scene | None = None
-        self._is_closed = False
         self._is_success = False
         self._grasped_object = -1
         self._n_steps = 0
@@ -185,10 +184,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         """The current scene, with its privileged state.
 
         Raises:
-            gymnasium.error.ResetNeeded: The environment was not reset.
-            gymnasium.error.ClosedEnvironmentError: The environment is closed.
+            gymnasium.error.ResetNeeded: The environment was not reset, or has been closed.
         """
-        self._check_open()
         if self._scene is None:
             raise gym.error.ResetNeeded("Call `reset` before `step` or `render`.")
         return self._scene
@@ -209,9 +206,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: The task does not exist, or no object or instruction fits it. The current scene is
                 kept.
-            gymnasium.error.ClosedEnvironmentError: The environment is closed.
         """
-        self._check_open()
         task = get_task((options or {}).get("task_id", self.task.index))
         self.scene_config.check_tasks([task.index])
         if self.instructions is not None and task.index not in self.instructions:
@@ -248,8 +243,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: The action has the wrong shape, or numbers that are not real or not finite. The scene
                 is unchanged.
-            gymnasium.error.ResetNeeded: The environment was not reset.
-            gymnasium.error.ClosedEnvironmentError: The environment is closed.
+            gymnasium.error.ResetNeeded: The environment was not reset, or has been closed.
         """
         scene = self.scene
         *motion, gripper = self._checked_action(action)
@@ -270,18 +264,11 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         return None if self.render_mode is None else self.scene.render(self.render_size)
 
     def close(self) -> None:
-        """Disconnects the simulator. Closing twice is harmless."""
-        self._is_closed = True
+        """Disconnects the simulator; a later `reset` starts another one. Closing twice is harmless."""
         self._scene = None
         if self._simulation is not None:
             self._simulation.close()
             self._simulation = None
-
-    def _check_open(self) -> None:
-        if self._is_closed:
-            raise gym.error.ClosedEnvironmentError(
-                "The environment is closed. Make a new one with `gymnasium.make`."
-            )
 
     def _observation(self) -> Observation:
         scene, arm, size = self.scene, self.scene.arm, self.scene_config.image_size
