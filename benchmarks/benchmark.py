@@ -53,16 +53,12 @@ def env(episodes: int = 100, seconds: float = 1.0) -> dict[str, float]:
         episodes: Number of episodes of the expert.
         seconds: Duration of the measurement of each part.
     """
-    import psutil
-
     from gym_deltaco import kinematics
     from gym_deltaco.env import PickPlaceEnv
     from gym_deltaco.expert import expert_episode
 
-    before = psutil.Process().memory_info().rss
     pick_place = PickPlaceEnv()
     pick_place.reset(seed=0)
-    memory = (psutil.Process().memory_info().rss - before) / 1e6
     scene, seeds = pick_place.scene, itertools.count()
     signs = itertools.cycle([1.0, -1.0])
 
@@ -81,7 +77,6 @@ def env(episodes: int = 100, seconds: float = 1.0) -> dict[str, float]:
         "reset": lambda: pick_place.reset(seed=next(seeds)),
     }
     results = {f"{name}, ms": 1e3 * seconds_of(action, seconds) for name, action in parts.items()}
-    results["memory of an environment, MB"] = memory
     start = time.perf_counter()
     # 7 and 300 have no common divisor, so that 300 episodes meet every task once.
     ends = [list(expert_episode(pick_place, 7 * number % 300, number))[-1] for number in range(episodes)]

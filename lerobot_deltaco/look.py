@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -41,25 +41,6 @@ TOLERANCE = 0.2
 _BENCHMARK_TASKS, _BENCHMARK_SEED = "scenario_a_test", 1000  # the first trial of the evaluation protocol
 
 
-class View(NamedTuple):
-    """An episode on the page.
-
-    Attributes:
-        title: Instruction.
-        picture: Picture by `draw_found`, as a data URI.
-        text: Description of the episode.
-        right: Whether the pick and the place location are right, or whether the episode succeeded; None for
-            what is not known.
-        video: Video of the episode, as a data URI; None without one.
-    """
-
-    title: str
-    picture: str
-    text: str
-    right: tuple[bool | None, ...]
-    video: str | None = None
-
-
 def look(arguments: LookArguments) -> str:
     """Draws where a policy looks in episodes of a dataset or of the benchmark, on one self-contained page.
 
@@ -70,8 +51,6 @@ def look(arguments: LookArguments) -> str:
         ValueError: The policy finds no locations, or does not fit the dataset.
     """
     checkpoint, dataset, episodes = arguments.checkpoint, arguments.dataset, arguments.episodes
-    if episodes < 1:
-        raise ValueError(f"`episodes` must be at least 1. Got {episodes}.")
     loaded = load_conditioned(checkpoint)
     if not isinstance(loaded.policy, DeltacoMatchPolicy):
         raise ValueError(
@@ -87,7 +66,7 @@ def look(arguments: LookArguments) -> str:
     shown = list(tqdm(views, desc="Looking", unit="episode", total=episodes))
     rates = []
     for n, text in enumerate(results):
-        known = [view.right[n] for view in shown if view.right[n] is not None]
+        known = [view["right"][n] for view in shown if view["right"][n] is not None]
         rates += [(text, sum(known), len(known))] if known else []
     page = arguments.out / "index.html"
     content = render(
@@ -104,8 +83,8 @@ def look(arguments: LookArguments) -> str:
     return "\n".join([*(f"{text}: {n_right} of {n}" for text, n_right, n in rates), f"See {page}."])
 
 
-def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[View]:
-    """Runs episodes of the benchmark's test tasks."""
+def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[dict[str, Any]]:
+    """Runs episodes of the benchmark's test tasks, and yields each as the page shows it."""
     policy, env = loaded.policy, benchmark_env(loaded.policy.config, MIN_SIDE)
     task_ids = select_tasks(_BENCHMARK_TASKS)
     for index in _spread(len(task_ids), n_episodes):
@@ -122,11 +101,19 @@ def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[View]:
         is_success = bool(recording.info["is_success"])
         text = f"Task {task.index}: {'success' if is_success else 'failure'}"
         text += _how_sure(policy, task.instruction, recording.found)
-        yield View(task.instruction, picture, text, (is_success,), video)
+        yield {
+            "title": task.instruction,
+            "picture": picture,
+            "text": text,
+            "right": (is_success,),
+            "video": video,
+        }
     env.close()
 
 
-def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int) -> Iterator[View]:
+def _dataset_views(
+    loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int
+) -> Iterator[dict[str, Any]]:
     """Finds the locations in first images of episodes, with other episodes as demonstrations."""
     policy, config, meta = loaded.policy, loaded.policy.config, dataset.meta
     _check_features(config, dataset)
@@ -174,7 +161,13 @@ def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: in
         picture = draw_found(
             _image(dataset, data.spans[episode][0], config.cameras[0]), ends, found, 0, recorded
         )
-        yield View(tasks[episode], picture_uri(picture), f"Episode {episode}: {text}", right)
+        yield {
+            "title": tasks[episode],
+            "picture": picture_uri(picture),
+            "text": f"Episode {episode}: {text}",
+            "right": right,  # whether the pick and the place location are right; None if that is not known
+            "video": None,
+        }
 
 
 def _image(dataset: LeRobotDataset, row: int, camera: str) -> NDArray[np.uint8]:
