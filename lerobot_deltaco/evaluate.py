@@ -239,8 +239,8 @@ def evaluate(loaded: LoadedPolicy, plan: EvaluationPlan, processes: int = 1) -> 
         processes: Number of processes that share the episodes; with 1, everything runs in this one.
 
     Returns:
-        A row for each episode, with the columns of [records](records.md), by task in the plan's order, and
-        trial. They do not depend on the number of processes.
+        A row for each episode, with the columns of a record, by task in the plan's order, and trial. They do
+        not depend on the number of processes.
 
     Raises:
         ValueError: A task has no demonstration, or the policy is not one for the benchmark.

@@ -230,27 +230,18 @@ def test_an_interrupted_run_continues(tmp_path, commands):
 
 
 def test_training_resumes_from_its_last_checkpoint(tmp_path, commands):
+    run = Run(read_recipe("scenario_a/deltaco", settings=SMALL), 0, tmp_path)
+    run.folder.mkdir(parents=True)  # left by a training that stopped before its first checkpoint
     commands.failing = ("train",)
     with pytest.raises(ExperimentError):
         _run(tmp_path)
-    run = Run(read_recipe("scenario_a/deltaco", settings=SMALL), 0, tmp_path)
     assert last_step(run.folder) == 10
     assert "--resume=true" in next(run.commands())
     commands.failing = ()
     _run(tmp_path)
     assert last_step(run.folder) == 20
     assert run.unevaluated_steps() == []
-
-
-def test_a_training_without_a_checkpoint_begins_again(tmp_path, commands):
-    run = Run(read_recipe("scenario_a/deltaco", settings=SMALL), 0, tmp_path)
-    run.folder.mkdir(parents=True)
-    _run(tmp_path)
-    assert last_step(run.folder) == 20
-
-
-def test_a_checkpoint_is_evaluated_again_with_another_plan(tmp_path, commands):
-    _run(tmp_path)
+    # Another plan evaluates the checkpoints again.
     run = Run(read_recipe("scenario_a/deltaco", settings=(*SMALL, "evaluation.trials=1")), 0, tmp_path)
     assert run.unevaluated_steps() == [10, 20]
     assert run.evaluate_command() == ["evaluate", str(run.folder), "--trials", "1"]

@@ -132,14 +132,8 @@ def _rgb(code: str) -> Color:
     return red, green, blue
 
 
-BLACK, CHARCOAL, PEWTER, ASH, IVORY, WHITE = (
-    _rgb("111"),
-    _rgb("333"),
-    _rgb("777"),
-    _rgb("bbb"),
-    _rgb("eee"),
-    _rgb("fff"),
-)
+BLACK, CHARCOAL, PEWTER = _rgb("111"), _rgb("333"), _rgb("777")
+ASH, IVORY, WHITE = _rgb("bbb"), _rgb("eee"), _rgb("fff")
 IRON, IRON_DARK = _rgb("555"), _rgb("333")
 STEEL, STEEL_DARK = _rgb("777"), _rgb("555")
 SLATE, SLATE_DARK = _rgb("667"), _rgb("444")
