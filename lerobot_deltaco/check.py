@@ -8,10 +8,10 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import psutil
@@ -25,13 +25,12 @@ from torch import Tensor
 from torch.utils.data import default_collate
 from tqdm import tqdm
 
+from gym_deltaco.atomic_files import write_text
 from lerobot_deltaco.arguments import CheckArguments
 from lerobot_deltaco.base_config import dimension_names
 from lerobot_deltaco.dataset_reading import open_folder_or_hub
-from lerobot_deltaco.deltaco_match import feature_matching, proposals
+from lerobot_deltaco.deltaco_match import feature_matching
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM
-from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
 from lerobot_deltaco.deltaco_match.keyframes import Grasp, find_grasps
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.demonstrations import (
@@ -42,7 +41,7 @@ from lerobot_deltaco.demonstrations import (
     resize_images,
 )
 from lerobot_deltaco.frames import memory_for_frames
-from lerobot_deltaco.pages import picture_uri, write_page
+from lerobot_deltaco.pages import picture_uri, render
 from lerobot_deltaco.pauses import paused_frames
 from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.train import image_size_in_memory
@@ -52,26 +51,6 @@ _PICTURE_HEIGHT = 180  # px
 # are: of the benchmark's fixed cameras 0.6 to 0.8, of its wrist camera below 0.1.
 _MIN_STAYING, _COMPARED_SIZE, _EDGES, _SAME = 0.4, 48, 0.2, 0.5
 _TIMED_STEPS, _TIMED_FRAMES = 3, 64
-
-
-class EpisodeView(NamedTuple):
-    """An episode on the page.
-
-    Attributes:
-        number: Index of the episode.
-        task: Its task.
-        text: Its length, and whether it is left out.
-        pictures: Four images, as data URIs.
-        course: Points of the gripper's course, in 0..1, as in SVG.
-        lines: Times of the grasp and the release, in 0..1.
-    """
-
-    number: int
-    task: str
-    text: str
-    pictures: list[str]
-    course: str
-    lines: list[float]
 
 
 class TrainingStart:
@@ -148,9 +127,8 @@ def check(arguments: CheckArguments) -> str:
     )
     counts = [(task, n, found[task]) for task, n in Counter(tasks).items()]
     page = arguments.out / "index.html"
-    write_page(
+    content = render(
         "check.html",
-        page,
         source=arguments.dataset,
         refusal=start.refusal,
         warnings=warnings,
@@ -161,10 +139,11 @@ def check(arguments: CheckArguments) -> str:
         n_episodes=meta.total_episodes,
         has_locations=start.locations is not None,
     )
+    write_text(page, content)
     lines = [
         *(f"{name + ':':15} {text}" for name, text in facts),
         *(f"task:           {n} episodes, {n_found} with a grasp: {task}" for task, n, n_found in counts),
-        *(f"left out:       episode {view.number}: {view.text}" for view in views if not view.lines),
+        *(f"left out:       episode {view['number']}: {view['text']}" for view in views if not view["lines"]),
         *(f"warning:        {warning}" for warning in warnings),
         f"See {page}.",
     ]
@@ -195,8 +174,8 @@ def _warnings() -> Iterator[list[str]]:
 
 def _read_episodes(
     start: TrainingStart, tasks: Sequence[str], n_shown: int
-) -> tuple[list[EpisodeView], dict[str, float]]:
-    """Returns views of episodes, and for each camera the fraction of edges that stay where they are."""
+) -> tuple[list[dict[str, Any]], dict[str, float]]:
+    """Returns episodes for the page, and for each camera the fraction of edges that stay where they are."""
     dataset, config, meta = start.dataset, start.config, start.dataset.meta
     cameras = [name for name in meta.camera_keys if name not in meta.depth_keys]
     demo_camera = config.cameras[0] if start.policy is not None else next(iter(cameras), None)
@@ -232,7 +211,16 @@ def _read_episodes(
             course = " ".join(f"{x:.3f},{y:.3f}" for x, y in zip(at, heights, strict=True))
             if isinstance(grasp, Grasp):
                 lines = [round(float(at[time - first]), 3) for time in times[1:3]]
-        views.append(EpisodeView(episode, tasks[episode], text, _strip(images, marks), course, lines))
+        views.append(
+            {
+                "number": episode,
+                "task": tasks[episode],
+                "text": text,
+                "pictures": _strip(images, marks),
+                "course": course,
+                "lines": lines,
+            }
+        )
     return views, {camera: float(np.median(values)) for camera, values in staying.items()}
 
 
@@ -335,66 +323,33 @@ def _advice(start: TrainingStart, staying: dict[str, float]) -> list[str]:
 
 def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[str, str]]:
     """Measures a few steps of training, and returns what all of it would take."""
-    dataset, config, policy, bank = start.dataset, start.config, start.policy, start.bank
+    dataset, config, policy = start.dataset, start.config, start.policy
     assert policy is not None
-    assert bank is not None
     windows = resolve_delta_timestamps(config, dataset.meta)
     timed = LeRobotDataset(dataset.repo_id, dataset.root, delta_timestamps=windows, return_uint8=True)
-    some = range(min(_TIMED_FRAMES, len(dataset)))
-    reading = _seconds(lambda: [dataset[n] for n in some], 1) / len(some) * len(dataset)
+    began, n_read = time.perf_counter(), min(_TIMED_FRAMES, len(dataset))
+    for n in range(n_read):
+        dataset[n]
+    reading = (time.perf_counter() - began) / n_read * len(dataset)
     batch = default_collate([timed[n % len(timed)] for n in range(batch_size)])
     for camera in dataset.meta.camera_keys:
         batch[camera] = resize_images(batch[camera], config.image_size).float() / 255
     batch = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)[0](batch)
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
-
-    def step() -> None:
+    for n in range(1 + _TIMED_STEPS):
+        if n == 1:  # the first step is slower
+            began = time.perf_counter()
         policy.forward(batch)[0].backward()
         optimizer.step()
         optimizer.zero_grad()
-
-    step()  # the first one is slower
-    per_step, fit = _seconds(step), _seconds_of_fit(bank, policy)
-    total = reading + fit + steps * per_step
+    per_step = (time.perf_counter() - began) / _TIMED_STEPS
     memory = start.bytes + psutil.Process().memory_info().rss
     return [
         (
             "time",
-            f"about {total / 60:.0f} minutes on this machine ({config.device}) for {steps:,} steps of "
-            f"{batch_size}: {reading / 60:.1f} to read the frames, {fit / 60:.1f} to fit feature matching, "
-            f"{1000 * per_step:.0f} ms a step",
+            f"about {(reading + steps * per_step) / 60:.0f} minutes on this machine ({config.device}) for "
+            f"{steps:,} steps of {batch_size}, and several more to fit the feature matching: "
+            f"{reading / 60:.1f} to read the frames, {1000 * per_step:.0f} ms a step",
         ),
         ("memory", f"about {memory / 1e9:.1f} GB, of which the frames take {start.bytes / 1e9:.2f}"),
     ]
-
-
-def _seconds_of_fit(bank: DemonstrationBank, policy: DeltacoMatchPolicy) -> float:
-    """Returns the time that the fit of feature matching takes, from the time of its parts."""
-    known = policy.training_locations
-    assert known is not None
-    matching = FeatureMatching(policy.config.known_words, policy.config.crop_size).to(bank.frames.device)
-    rows = known.found.nonzero().flatten()
-    images, picks, generator = bank.frames[rows, 0], known.locations[rows, 0], torch.Generator()
-    native = images if bank.first_images is None else bank.first_images[rows]
-    matching.requires_grad_(True)
-    n_timed = 2 * _TIMED_STEPS
-    propose = _seconds(lambda: matching.propose.fit(images, picks, generator, n_timed), 1) / n_timed
-    crops = torch.rand(64, 1 + proposals.N_PROPOSALS, FEATURE_DIM, device=images.device)
-    compare = _seconds(lambda: sum(part.sum() for part in matching.compare(crops, generator)).backward())
-    some = slice(0, 16)
-    small = images[some].float() / 255
-    describe = _seconds(lambda: matching.describe(small, native[some], picks[some], picks[some])) / len(small)
-    n_scenes = min(len(rows), feature_matching._MAX_EPISODES)
-    return (
-        proposals.FIT_STEPS * propose
-        + feature_matching.FIT_STEPS * compare
-        + n_scenes * proposals.N_PROPOSALS * describe
-    )
-
-
-def _seconds(function: Callable[[], object], n_calls: int = _TIMED_STEPS) -> float:
-    """Returns the time of a call, in seconds, as the mean of some calls."""
-    began = time.perf_counter()
-    for _ in range(n_calls):
-        function()
-    return (time.perf_counter() - began) / n_calls

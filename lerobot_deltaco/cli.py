@@ -24,18 +24,19 @@ COMMANDS = {
     "play": "Play with a policy in the browser.",
     "demo": "Train and evaluate the project's method in a few minutes.",
 }
-# The function of each command. If its module imports torch, which its help should not wait for, the function
-# has one argument, an object of a class in arguments.py.
 _FUNCTIONS = {
-    "collect": ("hub.collect_and_push", None),
-    "check": ("check.check", "CheckArguments"),
-    "evaluate": ("evaluate.evaluate_checkpoints", "EvaluateArguments"),
-    "report": ("report.write_report", None),
-    "experiment": ("experiments.run_experiments", None),
-    "look": ("look.look", "LookArguments"),
-    "play": ("play.play", "PlayArguments"),
-    "demo": ("demo.run_demo", None),
+    "collect": "hub.collect_and_push",
+    "check": "check.check",
+    "evaluate": "evaluate.evaluate_checkpoints",
+    "report": "report.write_report",
+    "experiment": "experiments.run_experiments",
+    "look": "look.look",
+    "play": "play.play",
+    "demo": "demo.run_demo",
 }
+# Commands whose modules import torch, which help should not wait for: their functions have one argument, an
+# object of a class in arguments.py.
+_SLOW = ("check", "evaluate", "look", "play")
 _PACKAGES = ("lerobot_deltaco", "gym_deltaco")
 
 
@@ -61,8 +62,8 @@ def main() -> None:
         # Libraries report it as errors of their own.
         if "No space left on device" in str(error):
             sys.exit(
-                f"deltaco {name}: The disk of {_output_folder(arguments)} is full. Free some space, and run "
-                "the command again. Training continues from its last complete checkpoint with --resume=true "
+                f"deltaco {name}: The disk is full. Free some space, and run the command again. Training "
+                "continues from its last complete checkpoint with --resume=true "
                 "--config_path=RUN/checkpoints/last/pretrained_model/train_config.json."
             )
         if isinstance(error, OSError):  # a file or folder that cannot be read or written
@@ -82,7 +83,7 @@ def _run(name: str, arguments: Sequence[str]) -> None:
 
     kind = command_arguments(name)
     parsed = tyro.cli(kind, prog=f"deltaco {name}", description=COMMANDS[name], args=arguments)
-    result = _function(name)(parsed) if isinstance(kind, type) else parsed
+    result = _imported(_FUNCTIONS[name])(parsed) if name in _SLOW else parsed
     if isinstance(result, Path):
         _print(f"See {result}.")
     elif result is not None:
@@ -91,12 +92,7 @@ def _run(name: str, arguments: Sequence[str]) -> None:
 
 def command_arguments(name: str) -> Callable[..., Any]:
     """Returns the function, or the class of its argument, from which tyro makes the options of a command."""
-    kind = _FUNCTIONS[name][1]
-    return _function(name) if kind is None else _imported(f"arguments.{kind}")
-
-
-def _function(name: str) -> Callable[..., Any]:
-    return _imported(_FUNCTIONS[name][0])
+    return _imported(f"arguments.{name.capitalize()}Arguments" if name in _SLOW else _FUNCTIONS[name])
 
 
 def _imported(path: str) -> Any:
@@ -112,13 +108,6 @@ def _is_ours(error: BaseException) -> bool:
     """
     frames = traceback.extract_tb(error.__traceback__)
     return bool(frames) and any(f"/{package}/" in frames[-1].filename for package in _PACKAGES)
-
-
-def _output_folder(arguments: Sequence[str]) -> Path:
-    """Returns the folder that a command writes to, as its arguments say."""
-    words = [part for word in arguments for part in word.split("=", 1)]
-    named = [words[n + 1] for n, word in enumerate(words[:-1]) if word in ("--output_dir", "--out", "--root")]
-    return Path(*named[-1:]).resolve()
 
 
 # Help

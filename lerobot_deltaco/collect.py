@@ -30,12 +30,13 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from gym_deltaco import ENV_ID, EXPERT_NOISE, pybullet_import
+from gym_deltaco import ENV_ID, EXPERT_NOISE
 from gym_deltaco.atomic_files import read_json, write_json
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
+from gym_deltaco.simulation import check_simulator
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco import dataset_writer
 
@@ -143,7 +144,7 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> str:
             task; or a worker process was killed.
         ImportError: PyBullet is not installed.
     """
-    pybullet_import.load()  # fails here, before anything is written, if there is no simulator
+    check_simulator()  # fails here, before anything is written, if there is no simulator
     speed = "nothing to do"
     try:
         _check_folder(root, plan)

@@ -7,25 +7,19 @@ tasks of scenario A. Finished steps are skipped, so the same command continues a
 from __future__ import annotations
 
 import os
-import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import date
-from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-import numpy as np
-import pandas as pd
-
-from gym_deltaco.atomic_files import read_json, write_json
+from gym_deltaco.atomic_files import read_json, write_json, write_text
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco import experiments
 from lerobot_deltaco.experiments import Run, last_checkpoint, last_step, read_run_records
-from lerobot_deltaco.pages import data_uri, picture_uri, write_page
+from lerobot_deltaco.pages import data_uri, picture_uri, render
 from lerobot_deltaco.recipes import read_recipe
 from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord
 from lerobot_deltaco.statistics import followed, success_interval
@@ -48,8 +42,6 @@ DEMONSTRATION_TASKS = MappingProxyType({"the gray ring": (25, 1), "the yellow la
 SENTENCES = ("Put it in green bin.", "Put it in red bin.")  # containers 0 and 1 of the scene
 VIDEO_SIZE = 256  # px
 
-CALIBRATION_SIZE, CALIBRATION_REPEATS = 1024, 20
-
 
 def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     """Collects, trains and evaluates the project's method, and writes a page.
@@ -59,7 +51,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
         out: Folder of all outputs.
 
     Returns:
-        The page, `index.html`. A line about the run is appended to `records.csv` beside it.
+        The page, `index.html`.
 
     Raises:
         ExperimentError: A step failed.
@@ -74,9 +66,9 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     recipe = read_recipe(EXPERIMENT, settings=settings)
     run = Run(recipe, seed=0, out=out / f"{minutes}_minutes")
     run.check_settings()
-    clock = Clock(run.out / "minutes.json")
+    times = run.out / "minutes.json"
     for command in run.commands():
-        with clock.step(command[0]):
+        with _timed(times, command[0]):
             run.execute(command)
     swapped = {
         kind: replace(recipe.evaluation, counterfactual=kind, trials=1)
@@ -84,18 +76,17 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     }
     for plan in swapped.values():
         if run.unevaluated_steps(plan):
-            with clock.step("counterfactuals"):
+            with _timed(times, "counterfactuals"):
                 experiments.call(run.evaluate_command(plan))
     scene = run.out / "scene.json"
     if not scene.is_file():
-        with clock.step("videos"):
+        with _timed(times, "videos"):
             seed = recipe.evaluation.scene_seed(SCENE_TASK, SCENE_TRIAL)
             write_json(scene, record_scene(last_checkpoint(run.folder), seed))
     record = _record(run, recipe.evaluation)
     rate, low, high = (100 * number for number in success_interval(record.episodes))
-    write_page(
+    page = render(
         "demo.html",
-        out / "index.html",
         rate=rate,
         low=low,
         high=high,
@@ -110,63 +101,27 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
         training_steps=steps,
         sentences=SENTENCES,
         demonstrations=read_json(scene),
-        followed=[(kind, row) for kind, plan in swapped.items() for row in _followed(_record(run, plan))],
-        times=clock.times,
-        total=clock.total,
+        followed=[
+            (kind, row)
+            for kind, plan in swapped.items()
+            for row in followed([_record(run, plan)]).to_dict("records")
+        ],
+        times=read_json(times),
         checkpoint=last_checkpoint(run.folder),
     )
-    if clock.has_run:
-        line = {
-            "date": date.today().isoformat(),
-            "commit": _commit(),
-            "budget_min": minutes,
-            "minutes": clock.total[0],
-            "core_minutes": clock.total[1],
-            "success_rate": rate,
-            "low": low,
-            "high": high,
-            "cores": len(os.sched_getaffinity(0)),
-            "calibration_gflops": _calibration(),
-        }
-        table = out / "records.csv"
-        pd.DataFrame([line]).to_csv(
-            table, mode="a", header=not table.exists(), index=False, float_format="%.1f"
-        )
+    write_text(out / "index.html", page)
     return out / "index.html"
 
 
-class Clock:
-    """Measures the steps of a demo, and stores the times in a file.
-
-    Args:
-        path: JSON file with minutes and core-minutes by step, interrupted attempts included.
-
-    Attributes:
-        times: Its content.
-        has_run: Whether a step was measured by this object.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.times: dict[str, list[float]] = read_json(path) if path.is_file() else {}
-        self.has_run = False
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        """Adds the time of a block to that of a step."""
-        self.has_run = True
-        start = np.array([time.monotonic(), sum(os.times()[:4])])
-        try:
-            yield
-        finally:
-            spent = (np.array([time.monotonic(), sum(os.times()[:4])]) - start) / 60
-            self.times[name] = (np.array(self.times.get(name, [0, 0])) + spent).tolist()
-            write_json(self.path, self.times)
-
-    @property
-    def total(self) -> list[float]:
-        """Minutes and core-minutes of all steps."""
-        return np.sum(list(self.times.values()), axis=0).tolist()
+@contextmanager
+def _timed(path: Path, name: str) -> Iterator[None]:
+    """Adds the duration of a block, in minutes, to that of a step in a JSON file, if it fails, too."""
+    start = time.monotonic()
+    try:
+        yield
+    finally:
+        times = read_json(path) if path.is_file() else {}
+        write_json(path, {**times, name: times.get(name, 0) + (time.monotonic() - start) / 60})
 
 
 def record_scene(checkpoint: Path, seed: int) -> list[dict[str, Any]]:
@@ -185,16 +140,16 @@ def record_scene(checkpoint: Path, seed: int) -> list[dict[str, Any]]:
     from PIL import Image
 
     from lerobot_deltaco.pictures import demonstration_ends, draw_found, encode_video
-    from lerobot_deltaco.recording import benchmark_scene, load_conditioned, record_episode
+    from lerobot_deltaco.recording import benchmark_env, load_conditioned, record_episode
 
     loaded = load_conditioned(checkpoint)
-    scene = benchmark_scene(loaded.policy.config)
+    env = benchmark_env(loaded.policy.config, VIDEO_SIZE)
     rows = []
     for name, (task_id, index) in DEMONSTRATION_TASKS.items():
         given = loaded.policy.demonstrations.of_task(get_task(task_id).instruction)[:1]
         ends, episodes = demonstration_ends(given[0]), []
         for container, sentence in enumerate(SENTENCES):
-            recording = record_episode(loaded, SCENE_TASK, seed, sentence, given, scene, VIDEO_SIZE)
+            recording = record_episode(loaded, env, SCENE_TASK, seed, sentence, given)
             assert recording.found is not None
             episodes.append(
                 {
@@ -214,26 +169,3 @@ def _record(run: Run, plan: EvaluationPlan) -> EvaluationRecord:
     return next(
         record for record in read_run_records(run.folder) if record.plan == plan and record.step == step
     )
-
-
-def _followed(record: EvaluationRecord) -> list[dict[str, Any]]:
-    """Counts which input behavior followed, of the object and of the container."""
-    return followed([record]).to_dict("records")
-
-
-def _commit() -> str:
-    """Returns the commit of the clone that runs, or the version of the installed package."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return version("lerobot_policy_deltaco")
-
-
-def _calibration() -> float:
-    """Measures the speed of this machine with float32 matrix products, in GFLOP/s."""
-    matrix = np.random.default_rng(0).random((CALIBRATION_SIZE, CALIBRATION_SIZE), dtype=np.float32)
-    start = time.perf_counter()
-    for _ in range(CALIBRATION_REPEATS):
-        matrix @ matrix  # noqa: B018
-    return 2e-9 * CALIBRATION_REPEATS * CALIBRATION_SIZE**3 / (time.perf_counter() - start)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 import multiprocessing
 import shlex
@@ -17,7 +18,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import draccus
 import numpy as np
@@ -63,53 +64,8 @@ _NOT_RECORDED = (
 )
 
 
-class Outcome(NamedTuple):
-    """An episode after it has been run.
-
-    Attributes:
-        episode: The episode.
-        info: Info of the environment after the last step.
-        demonstration_episodes: Episodes of the demonstrations that the policy received, in their dataset.
-        demonstrated_objects: Indices of the objects that they move.
-        p_pick: The policy's probability of what it picks; NaN if it gives none.
-    """
-
-    episode: Episode
-    info: Mapping[str, Any]
-    demonstration_episodes: list[int]
-    demonstrated_objects: list[int]
-    p_pick: float
-
-
 # Called after the reset and after each step with the environments of a batch and their observations.
 StepCallback = Callable[[Sequence[PickPlaceEnv], Sequence[Mapping[str, NDArray]]], None]
-
-
-class Simulators:
-    """Environments that the batches of an evaluation reuse, whatever their tasks.
-
-    Args:
-        scene: Settings of the scenes.
-        render_size: Height and width of the images that are rendered for people, px; None renders none.
-    """
-
-    def __init__(self, scene: SceneConfig, render_size: int | None = None) -> None:
-        self._make = lambda task_id: PickPlaceEnv(
-            task_id, scene, None if render_size is None else "rgb_array", render_size or 256
-        )
-        self._envs: list[PickPlaceEnv] = []
-
-    def take(self, n_envs: int, task_id: int) -> list[PickPlaceEnv]:
-        """Returns some environments; `reset` chooses the task."""
-        while len(self._envs) < n_envs:
-            self._envs.append(self._make(task_id))
-        return self._envs[:n_envs]
-
-    def close(self) -> None:
-        """Closes all environments."""
-        for env in self._envs:
-            env.close()
-        self._envs = []
 
 
 class Evaluation:
@@ -118,7 +74,6 @@ class Evaluation:
     Args:
         loaded: The policy and its processors.
         plan: Episodes to run.
-        render_size: Height and width of the images that are rendered for people, px; None renders none.
 
     Attributes:
         batches: The episodes, in batches that run at the same time.
@@ -127,7 +82,7 @@ class Evaluation:
         ValueError: The policy is not one for the benchmark, or the plan is not one for this policy.
     """
 
-    def __init__(self, loaded: LoadedPolicy, plan: EvaluationPlan, render_size: int | None = None) -> None:
+    def __init__(self, loaded: LoadedPolicy, plan: EvaluationPlan) -> None:
         self.loaded, self.plan = loaded, plan
         policy = loaded.policy
         check_policy_fits(policy.config, plan.scene, loaded.rename_map)
@@ -139,35 +94,48 @@ class Evaluation:
                 each._replace(demonstration_task=-1) if each.trial % 2 == 0 else each._replace(instruction="")
                 for each in episodes
             ]
-        self.batches = _batches(episodes)
-        self.simulators = Simulators(plan.scene, render_size)
+        size = min(_MAX_BATCH, math.ceil(len(episodes) / _MIN_BATCHES))
+        self.batches = [list(batch) for batch in itertools.batched(episodes, size)]
+        # Their simulators start at the first reset, in the process that runs a batch.
+        self._envs = [PickPlaceEnv(plan.task_ids[0], plan.scene) for _ in range(size)]
 
-    def run(self, number: int, callback: StepCallback | None = None) -> list[Outcome]:
-        """Runs the episodes of a batch.
-
-        Args:
-            number: Number of the batch.
-            callback: Called after the reset and after each step.
-        """
+    def run(self, number: int) -> list[dict[str, Any]]:
+        """Runs the episodes of a batch, and returns the row of each in the record."""
         batch = self.batches[number]
         demonstrations = [self._demonstrations(episode) for episode in batch]
         with self._computing(batch):
             infos = run_episodes(
-                self.loaded, self.simulators, batch, demonstrations, callback, self.plan.joint_noise
+                self.loaded, self._envs, batch, demonstrations, joint_noise=self.plan.joint_noise
             )
         p_pick = self.loaded.policy.p_pick if isinstance(self.loaded.policy, TaskConditionedPolicy) else None
         p_picks = [math.nan] * len(batch) if p_pick is None else p_pick.tolist()
-        # Without the demonstrations' tensors, which should not be sent between processes.
-        return [
-            Outcome(
-                episode,
-                info,
-                [each.episode for each in given if each.episode is not None],
-                [each.target_object for each in given if each.target_object is not None],
-                p_pick,
+        rows = []
+        for episode, info, given, p_pick in zip(batch, infos, demonstrations, p_picks, strict=True):
+            template = get_task(episode.task_id).instruction
+            rows.append(
+                {
+                    "task_id": episode.task_id,
+                    "trial": episode.trial,
+                    "success": bool(info["is_success"]),
+                    "instruction": None if episode.instruction == template else episode.instruction,
+                    "demonstration_task": episode.demonstration_task,
+                    "demonstration_episodes": [each.episode for each in given if each.episode is not None],
+                    "demonstrated_objects": [
+                        each.target_object for each in given if each.target_object is not None
+                    ],
+                    "grasped_object": int(info["grasped_object"]),
+                    "object_containers": info["object_containers"].tolist(),
+                    "right_object": bool(info["right_object"]),
+                    "right_container": bool(info["right_container"]),
+                    "p_pick": p_pick,
+                }
             )
-            for episode, info, given, p_pick in zip(batch, infos, demonstrations, p_picks, strict=True)
-        ]
+        return rows
+
+    def close(self) -> None:
+        """Closes the environments."""
+        for env in self._envs:
+            env.close()
 
     def _demonstrations(self, episode: Episode) -> list[Demonstration]:
         """Returns the demonstrations of an episode; the trials of a task use its demonstrations in turn."""
@@ -179,6 +147,11 @@ class Evaluation:
         task = get_task(episode.demonstration_task)
         known = self._bank.of_task(task.instruction, task.target_object)
         n_each = self.plan.n_demonstrations
+        if len(known) < n_each:
+            raise ValueError(
+                f"`n_demonstrations` is {n_each}, but the task {task.instruction!r} has {len(known)}. "
+                "Collect more and name them with --demo-repo-id and --demo-root."
+            )
         return [known[(episode.trial * n_each + n) % len(known)] for n in range(n_each)]
 
     @contextmanager
@@ -202,7 +175,7 @@ class Evaluation:
 
 def run_episodes(
     loaded: LoadedPolicy,
-    simulators: Simulators,
+    envs: Sequence[PickPlaceEnv],
     episodes: Sequence[Episode],
     demonstrations: Sequence[Sequence[Demonstration]],
     callback: StepCallback | None = None,
@@ -212,7 +185,7 @@ def run_episodes(
 
     Args:
         loaded: The policy and its processors.
-        simulators: Environments with the settings of the scenes.
+        envs: At least as many environments, whatever their tasks.
         episodes: The episodes.
         demonstrations: Demonstrations of each.
         callback: Called after the reset and after each step.
@@ -222,7 +195,7 @@ def run_episodes(
         Info of each environment after its last step.
     """
     policy, instructions = loaded.policy, [episode.instruction for episode in episodes]
-    envs = simulators.take(len(episodes), episodes[0].task_id)
+    envs = envs[: len(episodes)]
     resets = [
         env.reset(seed=episode.seed, options={"task_id": episode.task_id})
         for env, episode in zip(envs, episodes, strict=True)
@@ -257,37 +230,39 @@ def _stacked(observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def run_evaluation(evaluation: Evaluation, processes: int = 1) -> list[Outcome]:
-    """Runs all batches of an evaluation.
+def evaluate(loaded: LoadedPolicy, plan: EvaluationPlan, processes: int = 1) -> pd.DataFrame:
+    """Evaluates a policy.
 
     Args:
-        evaluation: The evaluation.
-        processes: Number of processes; with 1, everything runs in this one.
+        loaded: The policy and its processors.
+        plan: Episodes to run.
+        processes: Number of processes that share the episodes; with 1, everything runs in this one.
 
     Returns:
-        The episodes by task, in the plan's order, and trial. They do not depend on the number of processes.
+        A row for each episode, with the columns of a record, by task in the plan's order, and trial. They do
+        not depend on the number of processes.
 
     Raises:
+        ValueError: A task has no demonstration, or the policy is not one for the benchmark.
         RuntimeError: A process ended unexpectedly.
     """
     keep_freed_memory()
-    outcomes: list[Outcome] = []
-    n_episodes = sum(map(len, evaluation.batches))
-    with tqdm(total=n_episodes, desc="Evaluating", unit="episode") as progress:
+    evaluation = Evaluation(loaded, plan)
+    rows: list[dict[str, Any]] = []
+    with tqdm(total=sum(map(len, evaluation.batches)), desc="Evaluating", unit="episode") as progress:
         for found in _run_batches(evaluation, min(processes, len(evaluation.batches))):
-            outcomes += found
+            rows += found
             progress.update(len(found))
-    evaluation.simulators.close()
-    order = {task_id: n for n, task_id in enumerate(evaluation.plan.task_ids)}
-    return sorted(outcomes, key=lambda outcome: (order[outcome.episode.task_id], outcome.episode.trial))
+    evaluation.close()
+    order = {task_id: n for n, task_id in enumerate(plan.task_ids)}
+    return pd.DataFrame(sorted(rows, key=lambda row: (order[row["task_id"]], row["trial"])))
 
 
-def _run_batches(evaluation: Evaluation, processes: int) -> Iterator[list[Outcome]]:
-    """Yields the episodes of the batches, in the order in which these are completed."""
+def _run_batches(evaluation: Evaluation, processes: int) -> Iterator[list[dict[str, Any]]]:
+    """Yields the rows of the batches, in the order in which these are completed."""
     numbers = range(len(evaluation.batches))
     if processes == 1:
-        for number in numbers:
-            yield evaluation.run(number)
+        yield from map(evaluation.run, numbers)
         return
     # Processes are forked, which shares the policy and takes no time: importing LeRobot takes 10 s.
     executor = ProcessPoolExecutor(
@@ -319,86 +294,9 @@ def _start_process(evaluation: Evaluation) -> None:
     _evaluation = evaluation
 
 
-def _run_batch(number: int) -> list[Outcome]:
+def _run_batch(number: int) -> list[dict[str, Any]]:
     assert _evaluation is not None
     return _evaluation.run(number)
-
-
-def evaluate(
-    loaded: LoadedPolicy,
-    plan: EvaluationPlan,
-    checkpoint: Checkpoint,
-    *,
-    command: str,
-    processes: int = 1,
-    experiment: str | None = None,
-    demonstrations: tuple[str, str] | None = None,
-) -> EvaluationRecord:
-    """Evaluates a policy.
-
-    Args:
-        loaded: The policy and its processors.
-        plan: Episodes to run.
-        checkpoint: Where the policy is from, for the record.
-        command: Command line, for the record.
-        processes: Number of processes that share the episodes.
-        experiment: Name of the experiment, for the record; None for the checkpoint's.
-        demonstrations: Name of the dataset of demonstrations, and SHA-256 of its metadata, for the record;
-            None for those of the checkpoint.
-
-    Returns:
-        The record.
-
-    Raises:
-        ValueError: A task has no demonstration, or the policy is not one for the benchmark.
-    """
-    start = time.monotonic()
-    evaluation = Evaluation(loaded, plan)
-    outcomes = run_evaluation(evaluation, processes)
-    config = loaded.policy.config
-    versions = {"benchmark": ENV_ID, **{name: version(name) for name in _PACKAGES}}
-    options = draccus.encode(config, PreTrainedConfig)
-    return EvaluationRecord(
-        experiment=experiment or checkpoint.experiment,
-        policy_type=config.type,
-        train_seed=checkpoint.seed,
-        step=checkpoint.step,
-        plan=plan,
-        wording=plan.wording,
-        policy={name: value for name, value in options.items() if name not in _NOT_RECORDED},
-        versions=versions,
-        command=command,
-        seconds=time.monotonic() - start,
-        weights=checkpoint.weights_digest,
-        demonstrations=None if demonstrations is None else demonstrations[0],
-        demonstrations_digest=None if demonstrations is None else demonstrations[1],
-        episodes=pd.DataFrame([_row(outcome) for outcome in outcomes]),
-    )
-
-
-def _row(outcome: Outcome) -> dict[str, Any]:
-    episode, info = outcome.episode, outcome.info
-    template = get_task(episode.task_id).instruction
-    return {
-        "task_id": episode.task_id,
-        "trial": episode.trial,
-        "success": bool(info["is_success"]),
-        "instruction": None if episode.instruction == template else episode.instruction,
-        "demonstration_task": episode.demonstration_task,
-        "demonstration_episodes": outcome.demonstration_episodes,
-        "demonstrated_objects": outcome.demonstrated_objects,
-        "grasped_object": int(info["grasped_object"]),
-        "object_containers": info["object_containers"].tolist(),
-        "right_object": bool(info["right_object"]),
-        "right_container": bool(info["right_container"]),
-        "p_pick": outcome.p_pick,
-    }
-
-
-def _batches(episodes: Sequence[Episode]) -> list[list[Episode]]:
-    """Splits episodes into batches that run at the same time, in their order."""
-    size = min(_MAX_BATCH, math.ceil(len(episodes) / _MIN_BATCHES))
-    return [list(episodes[start : start + size]) for start in range(0, len(episodes), size)]
 
 
 def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | ExpertBank | None:
@@ -419,19 +317,10 @@ def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | ExpertBa
         raise ValueError(
             "The policy has no demonstrations. Name a dataset of them with --demo-repo-id and --demo-root."
         )
-    if plan.n_demonstrations > 1:
-        if not hasattr(policy.config, "n_demonstrations"):
-            raise ValueError(
-                f"`n_demonstrations` is {plan.n_demonstrations}, but this policy does not combine any."
-            )
-        for task_id in plan.task_ids:
-            task = get_task(task_id).instruction
-            n_known = len(bank.rows.get(task, ()))
-            if 0 < n_known < plan.n_demonstrations:
-                raise ValueError(
-                    f"`n_demonstrations` is {plan.n_demonstrations}, but the task {task!r} has {n_known}. "
-                    "Collect more and name them with --demo-repo-id and --demo-root."
-                )
+    if plan.n_demonstrations > 1 and not hasattr(policy.config, "n_demonstrations"):
+        raise ValueError(
+            f"`n_demonstrations` is {plan.n_demonstrations}, but this policy does not combine any."
+        )
     return bank
 
 
@@ -453,7 +342,7 @@ def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
     folder = arguments.out or (path if is_run else Path("outputs/evaluate") / path.resolve().name)
     given = {name: getattr(arguments, name) for name in ("device", "demo_repo_id", "demo_root")}
     overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
-    demonstrations = None
+    demonstrations = digest = None
     if arguments.demo_repo_id is not None:
         digest = metadata_digest(arguments.demo_repo_id, arguments.demo_root)
         demonstrations = (arguments.demo_repo_id, digest)
@@ -470,14 +359,24 @@ def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
                 )
         else:
             loaded = load_policy(checkpoint.folder, overrides, rename_map)
-            record = evaluate(
-                loaded,
-                fitted,
-                checkpoint,
+            config, start = loaded.policy.config, time.monotonic()
+            episodes = evaluate(loaded, fitted, arguments.processes if config.device == "cpu" else 1)
+            options = draccus.encode(config, PreTrainedConfig)
+            record = EvaluationRecord(
+                experiment=arguments.experiment or checkpoint.experiment,
+                policy_type=config.type,
+                train_seed=checkpoint.seed,
+                step=checkpoint.step,
+                plan=fitted,
+                wording=fitted.wording,
+                policy={name: value for name, value in options.items() if name not in _NOT_RECORDED},
+                versions={"benchmark": ENV_ID, **{name: version(name) for name in _PACKAGES}},
                 command=shlex.join(["deltaco", *sys.argv[1:]]),
-                processes=arguments.processes if str(loaded.policy.config.device) == "cpu" else 1,
-                experiment=arguments.experiment,
-                demonstrations=demonstrations,
+                seconds=time.monotonic() - start,
+                weights=checkpoint.weights_digest,
+                demonstrations=arguments.demo_repo_id,
+                demonstrations_digest=digest,
+                episodes=episodes,
             )
             write_records(file, [record])
         lines.append(
@@ -487,22 +386,20 @@ def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
     return "\n".join(lines)
 
 
-def _chosen(found: Sequence[Checkpoint], steps: str) -> list[Checkpoint]:
+def _chosen(found: Sequence[Checkpoint], steps: str) -> Sequence[Checkpoint]:
     """Returns the checkpoints that `steps` selects.
 
     Raises:
         ValueError: There is no checkpoint of a step.
     """
-    if steps == "all":
-        return list(found)
-    if steps == "last":
-        return [found[-1]]
+    if steps in ("all", "last"):
+        return found if steps == "all" else found[-1:]
     available = {str(checkpoint.step): checkpoint for checkpoint in found}
-    missing = [step for step in steps.split(",") if step not in available]
-    if missing:
-        raise ValueError(
-            f"There is no checkpoint of step {missing[0]!r}. Valid are all, last and {', '.join(available)}."
-        )
+    for step in steps.split(","):
+        if step not in available:
+            raise ValueError(
+                f"There is no checkpoint of step {step!r}. Valid are all, last and {', '.join(available)}."
+            )
     return [available[step] for step in steps.split(",")]
 
 

@@ -13,8 +13,8 @@ import tyro
 from huggingface_hub import HfApi
 from huggingface_hub.errors import HFValidationError, RevisionNotFoundError
 
+from lerobot_deltaco.cards import write_dataset_card
 from lerobot_deltaco.collect import CollectionPlan, collect
-from lerobot_deltaco.dataset_card import write_dataset_card
 from lerobot_deltaco.dataset_writer import CODEBASE_VERSION
 
 
@@ -47,6 +47,7 @@ def collect_and_push(
 
 @contextmanager
 def _publishing(repo_id: str) -> Iterator[None]:
+    """Reports in one line what the Hub refuses."""
     try:
         yield
     except (httpx.HTTPError, HFValidationError, OSError) as error:
@@ -68,14 +69,9 @@ def create_repository(repo_id: str, private: bool = False) -> None:
 
 
 def push(root: Path, repo_id: str) -> str:
-    """Uploads a finished dataset with its card in one commit, tagged with the version that LeRobot looks for.
+    """Uploads a finished dataset with its card, tagged with the version that LeRobot looks for.
 
-    LeRobot's own `push_to_hub` writes a card of its own, and keeps files of an earlier dataset, which it
-    would read.
-
-    Args:
-        root: Folder of the dataset. The card is written into it.
-        repo_id: Repository on the Hub, in which this dataset replaces an earlier one.
+    It replaces an earlier dataset in the repository, of which LeRobot's own `push_to_hub` would keep files.
 
     Returns:
         Address of the dataset.
@@ -84,11 +80,9 @@ def push(root: Path, repo_id: str) -> str:
         HubError: The Hub refuses, or cannot be reached.
     """
     write_dataset_card(root, repo_id)
-    api = HfApi()
+    api, patterns = HfApi(), ["data/*", "meta/*"]
     with _publishing(repo_id):
-        api.upload_folder(
-            repo_id=repo_id, folder_path=root, repo_type="dataset", delete_patterns=["data/*", "meta/*"]
-        )
+        api.upload_folder(repo_id=repo_id, folder_path=root, repo_type="dataset", delete_patterns=patterns)
         with suppress(RevisionNotFoundError):
             api.delete_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset")
         api.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset")

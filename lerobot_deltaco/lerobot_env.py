@@ -26,7 +26,6 @@ from gym_deltaco.control import control_of
 from gym_deltaco.env import Observation, PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.simulation import Simulation
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.expert_demonstrations import expert_demonstration
 from lerobot_deltaco.paraphrases import choose_instructions
@@ -145,16 +144,13 @@ class DeltacoEnv(EnvConfig):
 class EvaluationEnv(PickPlaceEnv):
     """The environment with the scenes of the evaluation protocol.
 
-    The seed of a reset is mapped to one that also depends on the task, and that no training scene has. A
-    closed environment passes its simulator on to the next one, since starting one takes 50 ms.
+    The seed of a reset is mapped to one that also depends on the task, and that no training scene has.
 
     Args:
         demonstrations: Whether every observation also has the key `demonstration`: the first and the last
             image of the protocol's demonstration of the task, (2, 3, H, W) uint8.
         arguments: Arguments of `PickPlaceEnv`.
     """
-
-    _idle: list[Simulation] = []  # noqa: RUF012
 
     def __init__(self, *, demonstrations: bool = False, **arguments: Any) -> None:
         super().__init__(**arguments)
@@ -168,8 +164,6 @@ class EvaluationEnv(PickPlaceEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Draws and builds a new scene. See `PickPlaceEnv.reset`."""
-        if self._simulation is None and self._idle:
-            self._simulation = self._idle.pop()
         if seed is not None:
             task_id = (options or {}).get("task_id", self.task.index)
             seed = episode_seed(0, "evaluation", task_id, 0, seed)
@@ -180,13 +174,6 @@ class EvaluationEnv(PickPlaceEnv):
         if self._has_demonstrations:
             observation["demonstration"] = _demonstration_ends(self.task.index, self.scene_config).copy()
         return observation
-
-    def close(self) -> None:
-        """Passes the simulator on to the next environment."""
-        if self._simulation is not None:
-            self._idle.append(self._simulation)
-            self._simulation = None
-        super().close()
 
 
 @cache

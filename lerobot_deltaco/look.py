@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from lerobot.utils.constants import ACTION
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from gym_deltaco.atomic_files import write_text
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.arguments import LookArguments
@@ -20,8 +21,7 @@ from lerobot_deltaco.dataset_reading import open_folder_or_hub
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, Found
 from lerobot_deltaco.demonstrations import as_uint8, read_demonstrations, read_robot_data
-from lerobot_deltaco.evaluate import Simulators
-from lerobot_deltaco.pages import data_uri, picture_uri, write_page
+from lerobot_deltaco.pages import data_uri, picture_uri, render
 from lerobot_deltaco.pictures import (
     MIN_SIDE,
     PICK_COLOR,
@@ -30,7 +30,7 @@ from lerobot_deltaco.pictures import (
     draw_found,
     encode_video,
 )
-from lerobot_deltaco.recording import benchmark_scene, find_demonstration, load_conditioned, record_episode
+from lerobot_deltaco.recording import benchmark_env, find_demonstration, load_conditioned, record_episode
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -39,25 +39,6 @@ if TYPE_CHECKING:
 # benchmark, the centers of objects are at least 0.26 apart.
 TOLERANCE = 0.2
 _BENCHMARK_TASKS, _BENCHMARK_SEED = "scenario_a_test", 1000  # the first trial of the evaluation protocol
-
-
-class View(NamedTuple):
-    """An episode on the page.
-
-    Attributes:
-        title: Instruction.
-        picture: Picture by `draw_found`, as a data URI.
-        text: Description of the episode.
-        right: Whether the pick and the place location are right, or whether the episode succeeded; None for
-            what is not known.
-        video: Video of the episode, as a data URI; None without one.
-    """
-
-    title: str
-    picture: str
-    text: str
-    right: tuple[bool | None, ...]
-    video: str | None = None
 
 
 def look(arguments: LookArguments) -> str:
@@ -70,8 +51,6 @@ def look(arguments: LookArguments) -> str:
         ValueError: The policy finds no locations, or does not fit the dataset.
     """
     checkpoint, dataset, episodes = arguments.checkpoint, arguments.dataset, arguments.episodes
-    if episodes < 1:
-        raise ValueError(f"`episodes` must be at least 1. Got {episodes}.")
     loaded = load_conditioned(checkpoint)
     if not isinstance(loaded.policy, DeltacoMatchPolicy):
         raise ValueError(
@@ -87,12 +66,11 @@ def look(arguments: LookArguments) -> str:
     shown = list(tqdm(views, desc="Looking", unit="episode", total=episodes))
     rates = []
     for n, text in enumerate(results):
-        known = [view.right[n] for view in shown if view.right[n] is not None]
+        known = [view["right"][n] for view in shown if view["right"][n] is not None]
         rates += [(text, sum(known), len(known))] if known else []
     page = arguments.out / "index.html"
-    write_page(
+    content = render(
         "look.html",
-        page,
         checkpoint=checkpoint,
         source=dataset or "scenes of the benchmark",
         views=shown,
@@ -101,20 +79,21 @@ def look(arguments: LookArguments) -> str:
         pick_color=f"rgb{PICK_COLOR}",
         place_color=f"rgb{PLACE_COLOR}",
     )
+    write_text(page, content)
     return "\n".join([*(f"{text}: {n_right} of {n}" for text, n_right, n in rates), f"See {page}."])
 
 
-def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[View]:
-    """Runs episodes of the benchmark's test tasks."""
-    policy, scene = loaded.policy, benchmark_scene(loaded.policy.config)
-    task_ids, simulators = select_tasks(_BENCHMARK_TASKS), Simulators(scene, MIN_SIDE)
+def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[dict[str, Any]]:
+    """Runs episodes of the benchmark's test tasks, and yields each as the page shows it."""
+    policy, env = loaded.policy, benchmark_env(loaded.policy.config, MIN_SIDE)
+    task_ids = select_tasks(_BENCHMARK_TASKS)
     for index in _spread(len(task_ids), n_episodes):
         task = get_task(task_ids[index])
-        shown = [find_demonstration(policy, task, scene)] if policy.config.uses_demonstrations else []
-        seed = episode_seed(0, "evaluation", task.index, 0, _BENCHMARK_SEED)
-        recording = record_episode(
-            loaded, task.index, seed, task.instruction, shown, scene, MIN_SIDE, simulators=simulators
+        shown = (
+            [find_demonstration(policy, task, env.scene_config)] if policy.config.uses_demonstrations else []
         )
+        seed = episode_seed(0, "evaluation", task.index, 0, _BENCHMARK_SEED)
+        recording = record_episode(loaded, env, task.index, seed, task.instruction, shown)
         assert recording.found is not None
         ends = demonstration_ends(shown[0]) if shown else None
         picture = picture_uri(draw_found(recording.frames[0], ends, recording.found))
@@ -122,11 +101,19 @@ def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[View]:
         is_success = bool(recording.info["is_success"])
         text = f"Task {task.index}: {'success' if is_success else 'failure'}"
         text += _how_sure(policy, task.instruction, recording.found)
-        yield View(task.instruction, picture, text, (is_success,), video)
-    simulators.close()
+        yield {
+            "title": task.instruction,
+            "picture": picture,
+            "text": text,
+            "right": (is_success,),
+            "video": video,
+        }
+    env.close()
 
 
-def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int) -> Iterator[View]:
+def _dataset_views(
+    loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int
+) -> Iterator[dict[str, Any]]:
     """Finds the locations in first images of episodes, with other episodes as demonstrations."""
     policy, config, meta = loaded.policy, loaded.policy.config, dataset.meta
     _check_features(config, dataset)
@@ -174,7 +161,13 @@ def _dataset_views(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: in
         picture = draw_found(
             _image(dataset, data.spans[episode][0], config.cameras[0]), ends, found, 0, recorded
         )
-        yield View(tasks[episode], picture_uri(picture), f"Episode {episode}: {text}", right)
+        yield {
+            "title": tasks[episode],
+            "picture": picture_uri(picture),
+            "text": f"Episode {episode}: {text}",
+            "right": right,  # whether the pick and the place location are right; None if that is not known
+            "video": None,
+        }
 
 
 def _image(dataset: LeRobotDataset, row: int, camera: str) -> NDArray[np.uint8]:

@@ -10,8 +10,6 @@ from typing import Any
 import jinja2
 from PIL import Image
 
-from gym_deltaco.atomic_files import write_text
-
 
 def render(template: str, **values: Any) -> str:
     """Returns a template with values filled in."""
@@ -22,17 +20,6 @@ def render(template: str, **values: Any) -> str:
         trim_blocks=True,
     )
     return environment.get_template(template).render(**values)
-
-
-def write_page(template: str, path: Path, **values: Any) -> None:
-    """Writes a page.
-
-    Args:
-        template: Name of the template.
-        path: File to write; its folder is made.
-        values: Values for the template.
-    """
-    write_text(path, render(template, **values))
 
 
 def picture_uri(picture: Image.Image) -> str:

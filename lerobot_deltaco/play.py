@@ -18,10 +18,9 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import N_ROWS, TASKS, ContainerWord, get_task, select_tasks
 from lerobot_deltaco.arguments import PlayArguments
 from lerobot_deltaco.demonstrations import Demonstration
-from lerobot_deltaco.evaluate import Simulators
 from lerobot_deltaco.pages import data_uri, picture_uri, render
 from lerobot_deltaco.pictures import demonstration_ends, draw_found, encode_video
-from lerobot_deltaco.recording import benchmark_scene, find_demonstration, load_conditioned, record_episode
+from lerobot_deltaco.recording import benchmark_env, find_demonstration, load_conditioned, record_episode
 from lerobot_deltaco.verdict import Verdict, judge, object_name, parse_instruction
 
 # Before Gradio is imported: the page loads nothing from other servers and reports to none.
@@ -105,7 +104,6 @@ class Player:
 
     Attributes:
         uses: What the policy may receive, of `BOTH`, `DEMONSTRATION` and `INSTRUCTION`.
-        n_steps: Number of steps of an episode.
 
     Raises:
         ValueError: There is no checkpoint, or its policy is not one for the benchmark.
@@ -113,11 +111,9 @@ class Player:
 
     def __init__(self, checkpoint: str | Path) -> None:
         self._loaded = load_conditioned(checkpoint)
-        self._scene = benchmark_scene(self._loaded.policy.config)
-        self._simulators = Simulators(self._scene, _RENDER_SIZE)
+        self._env = benchmark_env(self._loaded.policy.config, _RENDER_SIZE)
         self._demonstrations: dict[tuple[int, int], Demonstration] = {}
         self.uses = _possible_uses(self._loaded.policy.config)
-        self.n_steps = self._scene.n_steps
 
     def default_choice(self, task_id: int, seed: int) -> Choice:
         """Returns a scene with a demonstration and an instruction that fit it."""
@@ -142,11 +138,10 @@ class Player:
 
     def show_scene(self, choice: Choice) -> tuple[np.ndarray, Layout]:
         """Returns an image of a scene, and its objects and containers."""
-        (env,) = self._simulators.take(1, choice.task_id)
-        env.reset(seed=_scene_seed(choice), options={"task_id": choice.task_id})
-        image = env.render()
+        self._env.reset(seed=_scene_seed(choice), options={"task_id": choice.task_id})
+        image = self._env.render()
         assert image is not None
-        return image, env.scene.layout
+        return image, self._env.scene.layout
 
     def demonstration(self, choice: Choice) -> Demonstration:
         """Returns the demonstration of a choice; one that the checkpoint lacks is recorded by the expert."""
@@ -154,16 +149,12 @@ class Player:
         if key not in self._demonstrations:
             task = get_task(choice.demonstrated)
             self._demonstrations[key] = find_demonstration(
-                self._loaded.policy, task, self._scene, choice.recorded
+                self._loaded.policy, task, self._env.scene_config, choice.recorded
             )
         return self._demonstrations[key]
 
-    def run(self, choice: Choice, on_step: Callable[[int], None] | None = None) -> Run:
+    def run(self, choice: Choice) -> Run:
         """Runs an episode.
-
-        Args:
-            choice: Scene, demonstration and instruction.
-            on_step: Called with the number of steps that have been run.
 
         Raises:
             ValueError: The instruction is needed and empty.
@@ -174,15 +165,7 @@ class Player:
         demonstration = self.demonstration(choice)
         shown = [] if choice.use == INSTRUCTION else [demonstration]
         recording = record_episode(
-            self._loaded,
-            choice.task_id,
-            _scene_seed(choice),
-            sentence,
-            shown,
-            self._scene,
-            _RENDER_SIZE,
-            on_step,
-            self._simulators,
+            self._loaded, self._env, choice.task_id, _scene_seed(choice), sentence, shown
         )
         picture, confidence = None, ""
         if recording.found is not None:
@@ -218,8 +201,7 @@ class Player:
             raise ValueError("The comparison needs a policy that takes a demonstration and an instruction.")
         _, layout = self.show_scene(choice)
         labels = [item.label for item in layout.objects]
-        shown = parse_instruction(get_task(choice.demonstrated).instruction)
-        fitting = [label for label in labels if shown.fits(label)]
+        fitting = [label for label in labels if get_task(choice.demonstrated).describes(label)]
         first = choice
         if len(fitting) != 1:  # the chosen demonstration does not single out an object here
             fitting = [labels[layout.target_object]]
@@ -386,12 +368,10 @@ def build_page(player: Player, name: str) -> gr.Blocks:
             """Returns the handler that runs what `choose` makes of the user's choice."""
 
             def handle(*values: Any, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
-                choice, runs = Choice(*values), list[Run]()
+                choice = Choice(*values)
                 try:
-                    choices = choose(choice)
-                    for each in choices:
-                        before, n_steps = len(runs) * player.n_steps, len(choices) * player.n_steps
-                        runs.append(player.run(each, _reporter(progress, before, n_steps)))
+                    choices = progress.tqdm(choose(choice), desc="Running", unit="episodes")
+                    runs = [player.run(each) for each in choices]
                 except (ValueError, RuntimeError) as error:
                     gr.Warning(str(error))
                     return gr.skip()
@@ -415,11 +395,6 @@ def build_page(player: Player, name: str) -> gr.Blocks:
         chips.click(lambda sample: sample[0], chips, sentence, **quiet)
         address.change(None, address, js=_REPLACE_ADDRESS)
     return page
-
-
-def _reporter(progress: gr.Progress, n_before: int, n_steps: int) -> Callable[[int], None]:
-    """Returns a function that shows the progress of an episode."""
-    return lambda step: progress((n_before + step, n_steps), desc="Running", unit="steps")
 
 
 def play(arguments: PlayArguments) -> None:

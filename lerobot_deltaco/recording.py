@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from lerobot_deltaco.checkpoints import LoadedPolicy, find_checkpoints, load_pol
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
 from lerobot_deltaco.demonstrations import Demonstration, kept_frames, resize_images
 from lerobot_deltaco.episodes import Episode
-from lerobot_deltaco.evaluate import Simulators, run_episodes
+from lerobot_deltaco.evaluate import run_episodes
 from lerobot_deltaco.expert_demonstrations import expert_demonstration
 from lerobot_deltaco.lerobot_env import check_policy_fits
 
@@ -49,27 +49,21 @@ class Recording(NamedTuple):
 
 def record_episode(
     loaded: LoadedPolicy,
+    env: PickPlaceEnv,
     task_id: int,
     seed: int,
     instruction: str,
     demonstrations: Sequence[Demonstration],
-    scene: SceneConfig = SceneConfig(),  # noqa: B008
-    render_size: int = 320,
-    on_step: Callable[[int], None] | None = None,
-    simulators: Simulators | None = None,
 ) -> Recording:
     """Runs an episode of the benchmark and records it.
 
     Args:
         loaded: The policy and its processors.
+        env: The environment, as of `benchmark_env`.
         task_id: Index of the task that the scene is drawn for.
         seed: Seed of the environment's reset.
         instruction: Instruction that the policy receives; empty for none.
         demonstrations: Demonstrations that the policy receives; empty for none.
-        scene: Settings of the scene.
-        render_size: Height and width of the frames, px.
-        on_step: Called with the number of steps that have been run.
-        simulators: Environments with the same scene and render size to use; None makes one.
     """
     frames: list[NDArray[np.uint8]] = []
     first: dict[str, Any] = {}
@@ -84,17 +78,10 @@ def record_episode(
         assert image is not None
         frames.append(image)
         placed.update((n, env.scene.container_of(n)) for n in range(len(env.scene.bodies)))
-        if on_step is not None:
-            on_step(len(frames) - 1)
 
-    own = simulators or Simulators(scene, render_size)
-    try:
-        with torch.inference_mode():
-            episode = Episode(task_id, 0, seed, instruction, task_id if demonstrations else -1)
-            (info,) = run_episodes(loaded, own, [episode], [demonstrations], record)
-    finally:
-        if simulators is None:
-            own.close()
+    episode = Episode(task_id, 0, seed, instruction, task_id if demonstrations else -1)
+    with torch.inference_mode():
+        (info,) = run_episodes(loaded, [env], [episode], [demonstrations], record)
     in_containers = frozenset(pair for pair in placed if pair[1] >= 0)
     found = getattr(loaded.policy, "found", None)
     return Recording(frames, first["observed"], found, info, first["layout"], in_containers)
@@ -137,8 +124,12 @@ def first_camera(observation: Mapping[str, Any], config: TaskConditionedConfig) 
     return pixels[config.cameras[0].rpartition(".")[-1]] if isinstance(pixels, Mapping) else pixels
 
 
-def benchmark_scene(config: Any) -> SceneConfig:
-    """Returns the benchmark's scene with the image size and the control that a policy was trained on.
+def benchmark_env(config: Any, render_size: int) -> PickPlaceEnv:
+    """Makes an environment with the image size and the control that a policy was trained on.
+
+    Args:
+        config: Configuration of the policy.
+        render_size: Height and width of the frames of recordings, px.
 
     Raises:
         ValueError: The policy is not one for the benchmark.
@@ -147,7 +138,7 @@ def benchmark_scene(config: Any) -> SceneConfig:
     control = control_of(config.image_features) or SceneConfig.control
     scene = SceneConfig(image_size=sizes[0], control=control) if sizes else SceneConfig()
     check_policy_fits(config, scene)
-    return scene
+    return PickPlaceEnv(scene=scene, render_mode="rgb_array", render_size=render_size)
 
 
 def load_conditioned(checkpoint: str | Path) -> LoadedPolicy:

@@ -47,7 +47,6 @@ SCHEMA = pa.schema(
 )
 TEMPLATES = "templates"
 _KEY = b"deltaco"
-_MAX_JOINT_NOISE = 180.0  # degrees
 _N_OBJECTS = 3
 
 Counterfactual = Literal["none", "demonstration", "instruction"]
@@ -99,12 +98,11 @@ class EvaluationPlan:
     def __post_init__(self) -> None:
         object.__setattr__(self, "scene", self.scene.for_tasks(self.tasks))
         self.scene.check_tasks(self.task_ids)
-        for name, least in {"trials": 1, "seed": 0, "scene_set": 0, "n_demonstrations": 1}.items():
+        leasts = {"trials": 1, "seed": 0, "scene_set": 0, "n_demonstrations": 1, "joint_noise": 0}
+        for name, least in leasts.items():
             number = getattr(self, name)
             if number is not None and number < least:
                 raise ValueError(f"`{name}` must be at least {least}. Got {number}.")
-        if not 0 <= self.joint_noise <= _MAX_JOINT_NOISE:
-            raise ValueError(f"`joint_noise` must be from 0 to {_MAX_JOINT_NOISE}. Got {self.joint_noise}.")
         valid = get_args(Counterfactual)
         for name in ("counterfactual", "without"):
             if getattr(self, name) not in valid:

@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from gym_deltaco.layout import Layout
-from gym_deltaco.phrases import MIN_TYPO_LENGTH, misspellings, read_phrases
+from gym_deltaco.phrases import read_phrases
 from gym_deltaco.tasks import (
     COLORS,
     CONTAINER_COLORS,
@@ -23,6 +23,7 @@ from gym_deltaco.tasks import (
     ContainerWord,
     ObjectLabel,
 )
+from lerobot_deltaco.deltaco_match.words import understand
 
 Words = tuple[str, ...]
 
@@ -73,45 +74,33 @@ class Request(NamedTuple):
 
 def parse_instruction(sentence: str) -> Request:
     """Parses a sentence: covers its words with phrases, names first and then the longest."""
-    lexicon = _lexicon()
+    meanings, known = _lexicon()
     typed = _words(sentence)
-    words = tuple(lexicon.misspelled.get(word, word) for word in typed)
+    understood = understand(" ".join(typed), known)
+    words = tuple(right or word for right, word in zip(understood, typed, strict=True))
     spans = [
         (start, end)
         for start in range(len(words))
         for end in range(start + 1, len(words) + 1)
-        if words[start:end] in lexicon.meanings
+        if words[start:end] in meanings
     ]
-    spans.sort(key=lambda span: (lexicon.meanings[words[slice(*span)]][0] != "name", span[0] - span[1]))
+    spans.sort(key=lambda span: (meanings[words[slice(*span)]][0] != "name", span[0] - span[1]))
     left, found = set(range(len(words))), set[tuple[str, str]]()
     for start, end in spans:
         if left.issuperset(range(start, end)):
             left.difference_update(range(start, end))
-            found.add(lexicon.meanings[words[start:end]])
+            found.add(meanings[words[start:end]])
     return Request(
         frozenset(meaning for meaning in found if meaning[0] not in ("", "container")),
         frozenset(word for word in CONTAINER_WORDS if ("container", word) in found),
-        tuple(typed[n] for n in sorted(left) if words[n] in lexicon.words),
-        tuple(typed[n] for n in sorted(left) if words[n] not in lexicon.words),
+        tuple(typed[n] for n in sorted(left) if words[n] in known),
+        tuple(typed[n] for n in sorted(left) if words[n] not in known),
     )
 
 
-class _Lexicon(NamedTuple):
-    """Phrases with their meanings.
-
-    Attributes:
-        meanings: What a phrase says, as a kind and a value; both empty if it says nothing.
-        words: All words of the phrases.
-        misspelled: Words by their misspellings.
-    """
-
-    meanings: dict[Words, tuple[str, str]]
-    words: frozenset[str]
-    misspelled: dict[str, str]
-
-
 @cache
-def _lexicon() -> _Lexicon:
+def _lexicon() -> tuple[dict[Words, tuple[str, str]], Words]:
+    """Returns what each phrase says, as a kind and a value (empty for nothing), and all their words."""
     phrases = {part: _both_splits(lists) for part, lists in read_phrases().items()}
     meanings: dict[Words, tuple[str, str]] = {}
 
@@ -148,15 +137,7 @@ def _lexicon() -> _Lexicon:
     for label in OBJECTS:
         add(label.name, "name", label.name)
     meanings.pop((), None)
-    words = frozenset(word for phrase in meanings for word in phrase)
-    misspelled = {
-        wrong: word
-        for word in sorted(words)
-        for position in range(1, len(word) - 1)
-        for wrong in misspellings(word, position)
-        if len(word) >= MIN_TYPO_LENGTH and wrong not in words
-    }
-    return _Lexicon(meanings, words, misspelled)
+    return meanings, tuple(sorted({word for phrase in meanings for word in phrase}))
 
 
 def _both_splits(lists: Any) -> Any:

@@ -200,15 +200,6 @@ def test_end_effector_stays_within_its_limits(env):
         move(env, (0.6, 0.15, -0.15))
 
 
-def test_fingertips_stop_at_the_floor_above_the_lower_limit(env):
-    for y, floor in ((0.15, -0.37), (0.05, -0.375)):  # tray, table
-        move(env, (0.6, y, -0.2))
-        for _ in range(8):
-            command(env, (0.6, y, -1.0))
-        assert kin.forward(env.scene.arm._joint_targets)[0][2] == pytest.approx(-0.34)
-        assert env.scene.arm.position[2] == pytest.approx(floor + 0.05, abs=0.005)
-
-
 def test_gripper_obeys_an_absolute_command_with_threshold_0(env):
     for gripper, is_open in ((0.0, False), (1e-3, True), (-1e-3, False), (-1.0, False), (1.0, True)):
         env.step(np.array([0, 0, 0, gripper]))

@@ -8,7 +8,6 @@ from dataclasses import fields
 
 import pytest
 from fresh_python import run_python
-from safetensors import SafetensorError
 
 from lerobot_deltaco import cli
 
@@ -90,43 +89,35 @@ def test_an_unknown_command_names_the_valid_ones(monkeypatch):
         cli.main()
 
 
-def run_with(monkeypatch, function):
-    monkeypatch.setattr(cli, "_imported", lambda path: function)
-    monkeypatch.setattr(sys, "argv", ["deltaco", "report"])
-    cli.main()
+FULL = "deltaco report: The disk is full."
 
 
 @pytest.mark.parametrize(
-    ("error", "message"),
+    ("error", "message", "is_ours"),
     [
-        (ImportError("no simulator"), "deltaco report: no simulator"),
-        (FileNotFoundError("no file"), "deltaco report: no file"),
-        (KeyboardInterrupt(), "\nInterrupted. Run the same command again to continue."),
+        (ImportError("no simulator"), "deltaco report: no simulator", True),
+        (FileNotFoundError("no file"), "deltaco report: no file", False),
+        (KeyboardInterrupt(), "\nInterrupted. Run the same command again to continue.", False),
+        (RuntimeError("No space left on device (os error 28)"), FULL, False),  # as libraries report it
+        (OSError(28, "No space left on device"), FULL, False),
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_an_error_that_a_user_can_act_on_is_one_line(monkeypatch, error, message):
+def test_an_error_that_a_user_can_act_on_is_one_line(monkeypatch, error, message, is_ours):
     def fail() -> None:
         raise error
 
     # Errors that are raised on purpose come from one of the packages.
-    monkeypatch.setattr(cli, "_PACKAGES", ("tests",))
+    monkeypatch.setattr(cli, "_PACKAGES", ("tests",) if is_ours else ())
+    monkeypatch.setattr(cli, "_imported", lambda path: fail)
+    monkeypatch.setattr(sys, "argv", ["deltaco", "report"])
     with pytest.raises(SystemExit) as caught:
-        run_with(monkeypatch, fail)
-    assert caught.value.code == message
-
-
-@pytest.mark.parametrize("error", [RuntimeError, OSError, SafetensorError])
-def test_a_full_disk_is_named_whatever_reports_it(monkeypatch, error):
-    def fail() -> None:
-        raise error("I/O error: No space left on device (os error 28)")
-
-    monkeypatch.setattr(cli, "_run", lambda name, arguments: fail())
-    monkeypatch.setattr(sys, "argv", ["deltaco", "train", "--steps=3", "--output_dir=/mnt/full/run"])
-    with pytest.raises(
-        SystemExit, match=r"^deltaco train: The disk of /mnt/full/run is full. .*--resume=true"
-    ):
         cli.main()
+    assert str(caught.value.code).startswith(message)
+    if is_ours:  # otherwise, it is a bug
+        monkeypatch.setattr(cli, "_PACKAGES", ())
+        with pytest.raises(type(error)):
+            cli.main()
 
 
 def test_a_mistyped_option_of_json_is_one_line(monkeypatch):
@@ -136,21 +127,13 @@ def test_a_mistyped_option_of_json_is_one_line(monkeypatch):
             cli.main()
 
 
-def test_a_bug_shows_its_traceback(monkeypatch):
-    def fail() -> None:
-        raise TypeError
-
-    with pytest.raises(TypeError):
-        run_with(monkeypatch, fail)
-
-
 # The command of a dataset's card: a stranger pastes it
 
 
 @pytest.mark.slow
 def test_act_is_trained_and_evaluated_by_the_command_of_a_datasets_card(tmp_path):
+    from lerobot_deltaco.cards import dataset_card
     from lerobot_deltaco.collect import CollectionPlan, collect
-    from lerobot_deltaco.dataset_card import dataset_card
 
     root = tmp_path / "data"
     collect(root, CollectionPlan("4", 2))

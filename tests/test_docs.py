@@ -88,7 +88,6 @@ def parse_lerobot(command: str, arguments: list[str], monkeypatch: pytest.Monkey
     """Parses a command's configuration with draccus, as LeRobot does, but reads no checkpoint."""
     from lerobot.configs import PreTrainedConfig
 
-    monkeypatch.syspath_prepend(ROOT / "examples")
     own = ("lerobot_policy_deltaco", "lerobot_policy_example", "other_environments")
     for module in ("lerobot.policies", "lerobot.envs", *own):
         importlib.import_module(module)
@@ -173,10 +172,6 @@ def test_the_gymnasium_snippet_of_the_readme_runs():
 # Pages, links and tables
 
 
-def test_the_readme_fits_on_a_page():
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 140
-
-
 def slugs(path: Path) -> set[str]:
     """Returns the anchors of a page's headings, as GitHub and MyST make them."""
     text = re.sub(r"^```.*?^```$", "", path.read_text(), flags=re.MULTILINE | re.DOTALL)
@@ -194,12 +189,6 @@ def test_internal_links_resolve(path):
         linked = (path.parent / file).resolve() if file else path
         assert linked.exists(), target
         assert not anchor or anchor in slugs(linked), target
-
-
-def test_every_page_is_in_the_table_of_contents():
-    contents = "\n".join(fences(DOCS / "index.md", r"\{toctree\}"))
-    listed = {line for line in contents.splitlines() if line and not line.startswith(":")}
-    assert listed == {path.stem for path in DOCS.glob("*.md")} - {"index"}
 
 
 def test_the_tables_of_the_benchmark_are_those_of_the_code():

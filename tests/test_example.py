@@ -1,14 +1,13 @@
 """The example of a policy that takes demonstrations from the benchmark: `examples/`."""
 
 import sys
-import tomllib
-from pathlib import Path
 
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_eval
+from lerobot_policy_example import ExamplePolicy
 from small_policies import as_options, run_training
 
 from gym_deltaco.scene_config import SceneConfig
@@ -17,11 +16,10 @@ from lerobot_deltaco.arguments import EvaluateArguments
 from lerobot_deltaco.checkpoints import find_checkpoints, load_policy
 from lerobot_deltaco.collect import CollectionPlan, collect
 from lerobot_deltaco.demonstrations import as_uint8
-from lerobot_deltaco.evaluate import Evaluation, evaluate_checkpoints
+from lerobot_deltaco.evaluate import evaluate, evaluate_checkpoints
 from lerobot_deltaco.lerobot_env import EvaluationEnv
 from lerobot_deltaco.records import EvaluationPlan, read_records
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
 TASKS = "24,35"
 
 
@@ -29,26 +27,22 @@ TASKS = "24,35"
 def checkpoint(benchmark, tmp_path_factory):
     """A checkpoint of the example after two steps of `lerobot-train`."""
     folder = tmp_path_factory.mktemp("example")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(EXAMPLES)
-        __import__("lerobot_policy_example")
-        options = {"policy.type": "example", "policy.push_to_hub": False}
-        run_training(benchmark, folder / "run", options, in_memory=False, steps=2)
-        yield find_checkpoints(folder / "run")[-1].folder
+    options = {"policy.type": "example", "policy.push_to_hub": False}
+    run_training(benchmark, folder / "run", options, in_memory=False, steps=2)
+    return find_checkpoints(folder / "run")[-1].folder
 
 
 @pytest.fixture
 def received(monkeypatch):
     """What the network of the example receives: sentence, and ends of the demonstration."""
-    policy, found = sys.modules["lerobot_policy_example"].ExamplePolicy, set()
-    find = policy.find
+    found, find = set(), ExamplePolicy.find
 
     def noted(self, scenes, sentences, ends):
         pixels = (255 * ends).round().byte().contiguous().numpy()
         found.update((text, own.tobytes()) for text, own in zip(sentences, pixels, strict=True))
         return find(self, scenes, sentences, ends)
 
-    monkeypatch.setattr(policy, "find", noted)
+    monkeypatch.setattr(ExamplePolicy, "find", noted)
     return found
 
 
@@ -85,12 +79,11 @@ def test_evaluations_give_the_demonstrations_of_the_protocol(checkpoint, receive
     assert received == by_set_tasks
 
 
-def test_another_tasks_demonstration_can_be_given(checkpoint, received):
+def test_another_tasks_demonstration_can_be_given(checkpoint):
     plan = EvaluationPlan(TASKS, 1, scene=SceneConfig(episode_length=1), counterfactual="demonstration")
-    evaluation = Evaluation(load_policy(checkpoint, ["--device=cpu"]), plan)
-    (first,), (second,) = (evaluation.run(number) for number in range(2))
-    assert [each.episode.demonstration_task for each in (first, second)] == [35, 24]
-    assert first.demonstrated_objects[0] in get_task(35).targets
+    episodes = evaluate(load_policy(checkpoint, ["--device=cpu"]), plan)
+    assert episodes["demonstration_task"].tolist() == [35, 24]
+    assert episodes["demonstrated_objects"][0][0] in get_task(35).targets
 
 
 def test_an_observation_has_the_demonstration_on_request():
@@ -101,10 +94,3 @@ def test_an_observation_has_the_demonstration_on_request():
     assert (first["demonstration"] != other["demonstration"]).any()
     later = env.step(env.action_space.sample())[0]
     assert (later["demonstration"] == other["demonstration"]).all()
-
-
-def test_lerobot_finds_the_example():
-    project = tomllib.loads((EXAMPLES / "pyproject.toml").read_text())
-    name = project["project"]["name"]
-    assert project["tool"]["hatch"]["build"]["targets"]["wheel"]["only-include"] == [f"{name}.py"]
-    assert (EXAMPLES / f"{name}.py").is_file()

@@ -1,54 +1,32 @@
 """The benchmark as LeRobot sees it: configuration, lazy vector environments, evaluation."""
 
 import numpy as np
-import pybullet
 import pytest
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
-from lerobot.envs import close_envs, env_to_policy_features, make_env
+from lerobot.envs import env_to_policy_features, make_env
 from lerobot.policies import PreTrainedPolicy
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from torch import nn
 
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import TASKS, select_tasks
-from lerobot_deltaco.lerobot_env import DeltacoEnv, EvaluationEnv
+from lerobot_deltaco.lerobot_env import DeltacoEnv
 
 # One of each kind: a name, a color and a shape.
 ONE_OF_EACH_KIND = "4,32,90"
 
 
-def simulators():
-    """Ids of PyBullet's running simulators in this process."""
-    return {i for i in range(64) if pybullet.getConnectionInfo(i)["isConnected"]}
-
-
-@pytest.fixture
-def make_envs():
-    """Makes {task: vector environment} as LeRobot does, and closes all of them afterwards."""
-    made = []
-
-    def make(task, n_envs=1, **options):
-        groups = make_env(DeltacoEnv(task=task, **options), n_envs)
-        made.append(groups)
-        return {task_id: env for group in groups.values() for task_id, env in group.items()}
-
-    yield make
-    for groups in made:
-        close_envs(groups)
-
-
-def roll_out(env, seeds, n_steps=3):
-    """Returns the observations of the first steps, with the same random actions every time."""
-    actions = np.random.default_rng(0).uniform(-1, 1, (n_steps, env.num_envs, 4)).astype(np.float32)
-    observations = [env.reset(seed=seeds)[0], *(env.step(action)[0] for action in actions)]
-    return {key: np.stack([o[key] for o in observations]) for key in observations[0]}
+def make_one(task, **options):
+    """Makes the vector environment of a task, as LeRobot does."""
+    (group,) = make_env(DeltacoEnv(task=task, **options), 1).values()
+    return group[int(task)]
 
 
 # Configuration
 
 
-def test_features_are_those_of_datasets_and_of_the_spaces(make_envs):
+def test_features_are_those_of_datasets_and_of_the_spaces():
     config = DeltacoEnv(scene=SceneConfig(image_size=64))
     features = env_to_policy_features(config)
     assert {key: (feature.type, tuple(feature.shape)) for key, feature in features.items()} == {
@@ -56,7 +34,7 @@ def test_features_are_those_of_datasets_and_of_the_spaces(make_envs):
         "observation.state": (FeatureType.STATE, (10,)),
         "action": (FeatureType.ACTION, (4,)),
     }
-    (env,) = make_envs("4", scene=config.scene).values()
+    env = make_one("4", scene=config.scene)
     spaces = {**env.single_observation_space, "action": env.single_action_space}
     assert {name: space.shape for name, space in spaces.items()} == {
         name: tuple(feature.shape) for name, feature in config.features.items()
@@ -85,39 +63,15 @@ def test_invalid_options_say_what_is_valid(options, message):
 # Vector environments
 
 
-@pytest.mark.parametrize("selection", ["scenario_a_test", "all", "4,50-73"])
-def test_tasks_are_grouped_by_kind(selection):
-    groups = make_env(DeltacoEnv(task=selection), n_envs=2)
-    assert sorted(task for group in groups.values() for task in group) == sorted(select_tasks(selection))
+def test_tasks_are_grouped_by_kind():
+    groups = make_env(DeltacoEnv(task="all"), n_envs=2)
+    assert sorted(task for group in groups.values() for task in group) == list(range(300))
     for kind, group in groups.items():
         assert {TASKS[task_id].kind for task_id in group} == {kind}
-    close_envs(groups)
 
 
-def test_simulators_start_at_the_first_reset_and_are_passed_on(make_envs):
-    EvaluationEnv._idle.clear()
-    before = simulators()
-    envs = list(make_envs("all", n_envs=2).values())
-    assert len(envs) == 300
-    assert simulators() == before
-    for env in envs[:3]:
-        env.reset(seed=0)
-        env.close()
-        assert len(simulators() - before) == 2
-
-
-def test_a_borrowed_simulator_does_not_remember(make_envs):
-    first, second = make_envs("4,54").values()
-    (fresh,) = make_envs("54").values()
-    roll_out(first, seeds=[0], n_steps=5)
-    first.close()
-    used, unused = roll_out(second, seeds=[3]), roll_out(fresh, seeds=[3])
-    for key in used:
-        np.testing.assert_array_equal(used[key], unused[key])
-
-
-def test_a_finished_episode_stays_finished(make_envs):
-    (env,) = make_envs("4", scene=SceneConfig(episode_length=2)).values()
+def test_a_finished_episode_stays_finished():
+    env = make_one("4", scene=SceneConfig(episode_length=2))
     env.reset(seed=0)
     action = np.ones((1, 4), np.float32)
     env.step(action)

@@ -14,6 +14,7 @@ from gym_deltaco.object_sets import MAX_OBJECTS, OBJECT_SETS, find_label, find_m
 from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.random_objects import FIRST_INDEX, random_label
 from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.simulation import _obj_text
 from gym_deltaco.tasks import COLOR_SHAPE_PAIRS, FOLDS, OBJECTS, SCENARIOS, TASK_SETS, get_task
 
 # Lengths in m
@@ -52,17 +53,6 @@ def test_every_label_has_one_read_only_model():
     for array in (model.mesh.vertices, model.mesh.colors, model.parts[0]):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0.0
-
-
-def test_invalid_index_is_an_error():
-    for index in (-1, 1.5, 32.5, "32", None):
-        for find in (find_label, find_model):
-            with pytest.raises(ValueError, match=r"integer of at least 0: 0 to 31 are .*\. Got "):
-                find(index)
-        with pytest.raises(ValueError, match="integer of at least 32"):
-            random_label(index)
-        with pytest.raises(ValueError, match="0 to 31"):
-            object_model(index)
 
 
 def test_mesh_is_closed_and_faces_outward(model):
@@ -221,16 +211,6 @@ def tilts(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(upright, -1, 1))).reshape(len(MODELS), -1)
 
 
-def _obj_text(parts: tuple[np.ndarray, ...]) -> str:
-    """Formats a group per part; PyBullet makes the convex hull of each group."""
-    lines, start = [], 1
-    for part in parts:
-        lines += ["o part", *(f"v {x} {y} {z}" for x, y, z in part)]
-        lines += [f"f {corner} {corner + 1} {corner + 2}" for corner in range(start, start + len(part) - 2)]
-        start += len(part)
-    return "\n".join(lines)
-
-
 def test_stands_after_a_drop(model, tilts):
     assert tilts[MODELS.index(model.label.index)].max() < 5
 
@@ -271,6 +251,7 @@ def test_unknown_set_is_an_error_that_names_the_valid_ones():
 
 @pytest.mark.parametrize("fold", range(3))
 def test_folds_hold_out_their_objects(fold):
+    assert sorted(index for each in FOLDS for index in each) == list(range(24))
     held_out, labels = set(FOLDS[fold]), select_objects(f"fold_{fold}:400")
     pairs = {(OBJECTS[index].color, OBJECTS[index].shape) for index in held_out}
     assert {label.index for label in labels if label.index < 24} == set(range(24)) - held_out
@@ -284,7 +265,3 @@ def test_folds_hold_out_their_objects(fold):
     by_name = {get_task(index).row for index in validation if get_task(index).kind == "name"}
     assert by_name == held_out
     assert not by_name & {get_task(index).row for index in train}
-
-
-def test_folds_are_the_training_objects():
-    assert sorted(index for fold in FOLDS for index in fold) == list(range(24))

@@ -20,7 +20,7 @@ def test_equal_settings_are_equal_and_immutable():
     [
         ("ambiguity", ["both", None], r"`ambiguity` must be one of container, object\. Got "),
         ("objects", ["some", "random:9", ["all"], None], r"`objects` must be .*random:N"),
-        ("adversarial_probability", [1.1, -0.1, float("nan"), "0.6", None, True], "must be between 0 and 1"),
+        ("adversarial_probability", [1.1, -0.1, float("nan"), True * 2], "must be between 0 and 1"),
         ("adversarial_draw", ["both", None], r"must be one of each, scene\. Got "),
         ("control", ["torque", None], r"must be one of position, joints\. Got "),
         ("image_size", [7, 4097, 48.0, "48", True], r"must be an integer from 8 to 4096\. Got "),

@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+import pybullet
 import pytest
 
 from gym_deltaco.env import PickPlaceEnv
@@ -32,7 +33,12 @@ def put(env, number, container, offset=(0.0, 0.0), height=0.002):
     """Drops an object from just above a container's floor; returns the info of a step without motion."""
     half_height = env.scene.layout.objects[number].model.half_extents[2]
     center = env.scene.layout.containers[container].quadrant.container_center
-    env.scene.place(number, (*(center + offset), TRAY_FLOOR + 0.003 + half_height + height))
+    position = (*(center + offset), TRAY_FLOOR + 0.003 + half_height + height)
+    client = env.scene._simulation._client
+    pybullet.resetBasePositionAndOrientation(
+        env.scene.bodies[number], position, (0, 0, 0, 1), physicsClientId=client
+    )
+    env.scene._settle()
     return env.step(STAY_OPEN)[-1]
 
 
@@ -129,7 +135,10 @@ def test_info_tells_the_grasped_object_and_its_container(small_envs, ambiguity):
         _, info = env.reset(seed=3, options={"task_id": 4})
         number = (info["target_object"] + (not is_right_object)) % 3
         container = info["target_container"] if is_right_container else 1 - info["target_container"]
-        expert = Expert(env, np.random.default_rng(0), 0.0, target_object=number, target_container=container)
+        layout = env.scene.layout
+        env.scene.layout = layout._replace(target_object=number, target_container=container)
+        expert = Expert(env, np.random.default_rng(0), 0.0)
+        env.scene.layout = layout
         infos, stages = [info], [Stage.REACH]
         for _ in range(30):
             infos.append(env.step(expert.act())[-1])

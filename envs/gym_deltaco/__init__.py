@@ -1,6 +1,6 @@
 """Gymnasium environment of the DeL-TaCo benchmark (Yu & Mooney, ICLR 2023): 300 pick-and-place tasks.
 
-Importing the package registers `gym_deltaco/PickPlace-v0`. PyBullet is loaded with the first environment.
+Importing the package registers `gym_deltaco/PickPlace-v0`.
 """
 
 import gymnasium

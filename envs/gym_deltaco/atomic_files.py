@@ -33,11 +33,11 @@ def write_json(path: Path, content: Any, indent: int = 4) -> None:
     write_text(path, json.dumps(content, indent=indent, ensure_ascii=False) + "\n")
 
 
-def parse_json(text: str, source: object) -> Any:
+def parse_json(text: str | bytes, source: object) -> Any:
     """Returns the content of a text of JSON.
 
     Args:
-        text: The text.
+        text: The text, in UTF-8.
         source: Where it is from, for the error.
 
     Raises:
@@ -56,8 +56,4 @@ def read_json(path: Path) -> Any:
         OSError: It cannot be read.
         ValueError: It is damaged.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not valid JSON: {error}.") from None
-    return parse_json(text, path)
+    return parse_json(path.read_bytes(), path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,14 +10,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from gym_deltaco import CONTROL_FPS, pybullet_import
+from gym_deltaco import CONTROL_FPS
 from gym_deltaco import kinematics as kin
 from gym_deltaco.arm import JOINT_HIGH, JOINT_LOW
 from gym_deltaco.control import CONTROLS
 from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene import Scene
 from gym_deltaco.scene_config import DEFAULT_SCENE, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, SceneConfig
-from gym_deltaco.simulation import Simulation
+from gym_deltaco.simulation import Simulation, check_simulator
 from gym_deltaco.tasks import Task, get_task
 
 ACTION_SCALE = 0.1  # m, motion of the end effector for an action of 1
@@ -138,11 +137,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         render_size: int = 256,
         instructions: Mapping[int, Sequence[str]] | None = None,
     ) -> None:
-        if not isinstance(scene, SceneConfig):
-            raise ValueError(
-                f"`scene` must be a `SceneConfig`, such as SceneConfig(image_size=96). Got {scene!r}."
-            )
-        pybullet_import.load()  # fails here, not at the first reset, if it is missing
+        check_simulator()  # fails here, not at the first reset, if it is missing
         scene.check_tasks([task_id])
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"`render_mode` must be 'rgb_array' or None. Got {render_mode!r}.")
@@ -151,8 +146,6 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
                 f"`render_size` must be an integer from {MIN_IMAGE_SIZE} to {MAX_IMAGE_SIZE}. "
                 f"Got {render_size!r}."
             )
-        if instructions is not None:
-            _check_instructions(instructions)
         self.task: Task = get_task(task_id)
         self.scene_config = scene
         self.render_mode = render_mode
@@ -172,7 +165,6 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         # The simulator is connected at the first reset, so that each worker process has its own.
         self._simulation: Simulation | None = None
         self._scene: Scene | None = None
-        self._is_closed = False
         self._is_success = False
         self._grasped_object = -1
         self._n_steps = 0
@@ -192,10 +184,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         """The current scene, with its privileged state.
 
         Raises:
-            gymnasium.error.ResetNeeded: The environment was not reset.
-            gymnasium.error.ClosedEnvironmentError: The environment is closed.
+            gymnasium.error.ResetNeeded: The environment was not reset, or has been closed.
         """
-        self._check_open()
         if self._scene is None:
             raise gym.error.ResetNeeded("Call `reset` before `step` or `render`.")
         return self._scene
@@ -214,15 +204,9 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
             The first observation and info.
 
         Raises:
-            ValueError: The task does not exist, no object or instruction fits it, or `options` is not a
-                dictionary. The current scene is kept.
-            gymnasium.error.ClosedEnvironmentError: The environment is closed.
+            ValueError: The task does not exist, or no object or instruction fits it. The current scene is
+                kept.
         """
-        self._check_open()
-        if options is not None and not isinstance(options, Mapping):
-            raise ValueError(
-                f'`options` must be a dictionary, such as {{"task_id": 4}}, or None. Got {options!r}.'
-            )
         task = get_task((options or {}).get("task_id", self.task.index))
         self.scene_config.check_tasks([task.index])
         if self.instructions is not None and task.index not in self.instructions:
@@ -259,8 +243,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             ValueError: The action has the wrong shape, or numbers that are not real or not finite. The scene
                 is unchanged.
-            gymnasium.error.ResetNeeded: The environment was not reset.
-            gymnasium.error.ClosedEnvironmentError: The environment is closed.
+            gymnasium.error.ResetNeeded: The environment was not reset, or has been closed.
         """
         scene = self.scene
         *motion, gripper = self._checked_action(action)
@@ -281,18 +264,11 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         return None if self.render_mode is None else self.scene.render(self.render_size)
 
     def close(self) -> None:
-        """Disconnects the simulator. Closing twice is harmless."""
-        self._is_closed = True
+        """Disconnects the simulator; a later `reset` starts another one. Closing twice is harmless."""
         self._scene = None
         if self._simulation is not None:
             self._simulation.close()
             self._simulation = None
-
-    def _check_open(self) -> None:
-        if self._is_closed:
-            raise gym.error.ClosedEnvironmentError(
-                "The environment is closed. Make a new one with `gymnasium.make`."
-            )
 
     def _observation(self) -> Observation:
         scene, arm, size = self.scene, self.scene.arm, self.scene_config.image_size
@@ -343,21 +319,3 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 def _box(bounds: tuple[NDArray[np.float64], NDArray[np.float64]]) -> Any:
     low, high = bounds
     return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
-
-
-def _check_instructions(instructions: Mapping[int, Sequence[str]]) -> None:
-    """Checks that instructions map task indices to one or more sentences each."""
-    valid = (
-        "`instructions` must be a dictionary from task indices to lists of sentences, such as "
-        '{4: ["Put it into the green bin."]}.'
-    )
-    if not isinstance(instructions, Mapping):
-        raise ValueError(f"{valid} Got {reprlib.repr(instructions)}.")
-    for task_id, sentences in instructions.items():
-        try:
-            get_task(task_id)
-        except ValueError as error:
-            raise ValueError(f"{valid} {error}") from None
-        is_list = isinstance(sentences, (list, tuple)) and len(sentences) > 0
-        if not is_list or not all(isinstance(sentence, str) and sentence.strip() for sentence in sentences):
-            raise ValueError(f"{valid} Got {reprlib.repr(sentences)} for task {task_id}.")

@@ -148,8 +148,6 @@ class Expert:
         rng: Source of the drop point and of the noise.
         noise: Standard deviation of the Gaussian noise on the first three numbers of the actions; the binary
             command of the gripper has no noise.
-        target_object: Number of the object to pick, as in the environment's info; None for the task's target.
-        target_container: Number of the container to place it in; None for the task's target.
 
     Attributes:
         stage: Stage of the last action.
@@ -159,14 +157,11 @@ class Expert:
     env: PickPlaceEnv
     rng: np.random.Generator
     noise: float = EXPERT_NOISE
-    target_object: int | None = None
-    target_container: int | None = None
 
     def __post_init__(self) -> None:
         self._scene = self.env.scene
         layout = self._scene.layout
-        self._target = layout.target_object if self.target_object is None else self.target_object
-        self._container = layout.target_container if self.target_container is None else self.target_container
+        self._target, self._container = layout.target_object, layout.target_container
         self._grasp_height = layout.objects[self._target].model.grasp_height
         middle = layout.containers[self._container].quadrant.container_center
         spread = _DROP_FRACTION * np.array(CONTAINER_HALF_EXTENTS)

@@ -8,7 +8,6 @@ gripper. Only meshes 500 to 999 are used, and of these only those that the scrip
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import sys
@@ -18,16 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gym_deltaco import pybullet_import
 from gym_deltaco.atomic_files import write_text
 from gym_deltaco.objects import ObjectModel
+from gym_deltaco.simulation import check_simulator
 from gym_deltaco.solids import Mesh
 from gym_deltaco.tasks import FIRST_FOREIGN_INDEX, FOREIGN_FILE, MESHES, ObjectLabel
 
 _WIDTH, _LENGTH = 0.044, 0.085  # m, largest size along the fingers' motion and across it
 _MAX_YAW = 0.2  # rad
 _PALM_DISTANCE = 0.035  # m, largest distance of an object's top above its grasp height
-_N_TRIALS = 3  # in all of which the expert has to succeed
 
 
 def is_foreign(index: int) -> bool:
@@ -82,11 +80,10 @@ def foreign_model(index: int) -> ObjectModel:
 
 
 def _folder() -> Path:
-    spec = importlib.util.find_spec("pybullet_data")
-    if spec is None or spec.origin is None:
-        pybullet_import.load()  # raises an error that says how to install both
-        raise ImportError("PyBullet's data are not installed. Install PyBullet again.", name="pybullet_data")
-    return Path(spec.origin).with_name("random_urdfs")
+    check_simulator()
+    import pybullet_data
+
+    return Path(pybullet_data.getDataPath()) / "random_urdfs"
 
 
 def _read_obj(text: str) -> tuple[np.ndarray, np.ndarray, list[slice]]:

@@ -6,8 +6,6 @@ import re
 from functools import cache
 from types import MappingProxyType
 
-import numpy as np
-
 from gym_deltaco.foreign_objects import foreign_label, foreign_model, is_foreign
 from gym_deltaco.objects import ObjectModel, object_model
 from gym_deltaco.random_objects import FIRST_INDEX, random_label, random_model
@@ -82,12 +80,7 @@ def _with_random_objects(name: str, n_objects: int, fold: int | None) -> tuple[O
 
 
 def find_label(index: int) -> ObjectLabel:
-    """Returns name, shape and color of an object: 0..31 the paper's, 32..10007 random, 20500..20999 foreign.
-
-    Raises:
-        ValueError: The index is not a non-negative integer.
-    """
-    _check_index(index)
+    """Returns the label of an object: 0..31 the paper's, 32..10007 random, 20500..20999 foreign."""
     if is_foreign(index):
         return foreign_label(index)
     return OBJECTS[index] if index < FIRST_INDEX else random_label(index)
@@ -97,22 +90,11 @@ def find_model(index: int) -> ObjectModel:
     """Returns the geometry of an object: 0..31 the paper's, 32..10007 random, 20500..20999 foreign.
 
     Raises:
-        ValueError: The index is not a non-negative integer.
         ImportError: The object is foreign, and PyBullet is not installed.
     """
-    _check_index(index)
     if is_foreign(index):
         return foreign_model(index)
     return object_model(index) if index < FIRST_INDEX else random_model(index)
-
-
-def _check_index(index: int) -> None:
-    if not isinstance(index, (int, np.integer)) or index < 0:
-        raise ValueError(
-            f"An object's index must be an integer of at least 0: 0 to {FIRST_INDEX - 1} are the paper's "
-            f"objects, {FIRST_FOREIGN_INDEX + MESHES[0]} to {FIRST_FOREIGN_INDEX + MESHES[-1]} foreign ones, "
-            f"all others random ones. Got {index!r}."
-        )
 
 
 def default_objects(tasks: str) -> str:

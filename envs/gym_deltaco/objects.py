@@ -103,14 +103,8 @@ def object_model(index: int) -> ObjectModel:
 
     Args:
         index: Index into `OBJECTS`, 0..31.
-
-    Raises:
-        ValueError: The index is out of range.
     """
-    if index not in range(len(OBJECTS)):
-        raise ValueError(f"An object's index must be an integer from 0 to {len(OBJECTS) - 1}. Got {index!r}.")
-    label = OBJECTS[int(index)]
-    return build_model(label, _RECIPES[label.name])
+    return build_model(OBJECTS[index], _RECIPES[OBJECTS[index].name])
 
 
 def build_model(label: ObjectLabel, recipe: Recipe) -> ObjectModel:
@@ -138,14 +132,8 @@ def _rgb(code: str) -> Color:
     return red, green, blue
 
 
-BLACK, CHARCOAL, PEWTER, ASH, IVORY, WHITE = (
-    _rgb("111"),
-    _rgb("333"),
-    _rgb("777"),
-    _rgb("bbb"),
-    _rgb("eee"),
-    _rgb("fff"),
-)
+BLACK, CHARCOAL, PEWTER = _rgb("111"), _rgb("333"), _rgb("777")
+ASH, IVORY, WHITE = _rgb("bbb"), _rgb("eee"), _rgb("fff")
 IRON, IRON_DARK = _rgb("555"), _rgb("333")
 STEEL, STEEL_DARK = _rgb("777"), _rgb("555")
 SLATE, SLATE_DARK = _rgb("667"), _rgb("444")

@@ -21,7 +21,7 @@ PhraseSplit = Literal["train", "held_out"]
 
 _FILE = Path(__file__).with_name("phrases.yaml")
 _P_NO_ARTICLE, _P_TYPO = 0.3, 0.1
-MIN_TYPO_LENGTH = 5  # letters, of a word that is misspelled
+_MIN_TYPO_LENGTH = 5  # letters, of a word that is misspelled
 _P_HELD_OUT = 0.4  # of each part of a held-out sentence
 _ENDS = ("", "", ".", "!")
 
@@ -74,24 +74,14 @@ def _draw_sentence(task: Task, split: PhraseSplit, rng: np.random.Generator) -> 
 
 def _misspell(sentence: str, rng: np.random.Generator) -> str:
     """Returns a sentence with two letters of a word swapped, or one left out or doubled."""
-    words = [found for found in re.finditer(r"[a-z]+", sentence) if len(found[0]) >= MIN_TYPO_LENGTH]
+    words = [found for found in re.finditer(r"[a-z]+", sentence) if len(found[0]) >= _MIN_TYPO_LENGTH]
     if not words:
         return sentence
     word = words[int(rng.integers(len(words)))]
     position = int(rng.integers(1, len(word[0]) - 1))
-    changed = misspellings(word[0], position)[int(rng.integers(3))]
-    return sentence[: word.start()] + changed + sentence[word.end() :]
-
-
-def misspellings(word: str, position: int) -> tuple[str, str, str]:
-    """Returns a word with two letters swapped, with one left out, and with one doubled.
-
-    Args:
-        word: The word.
-        position: Index of the letter; another one follows.
-    """
-    before, pair, after = word[:position], word[position : position + 2], word[position + 2 :]
-    return before + pair[::-1] + after, before + pair[1:] + after, before + pair[0] + pair + after
+    before, pair, after = word[0][:position], word[0][position : position + 2], word[0][position + 2 :]
+    typos = (before + pair[::-1] + after, before + pair[1:] + after, before + pair[0] + pair + after)
+    return sentence[: word.start()] + typos[int(rng.integers(3))] + sentence[word.end() :]
 
 
 @cache

@@ -39,14 +39,7 @@ def random_label(index: int) -> ObjectLabel:
 
     Args:
         index: At least `FIRST_INDEX`.
-
-    Raises:
-        ValueError: The index is too small, or not an integer.
     """
-    if not isinstance(index, (int, np.integer)) or index < FIRST_INDEX:
-        raise ValueError(
-            f"A random object's index must be an integer of at least {FIRST_INDEX}. Got {index!r}."
-        )
     turn, position = divmod(int(index) - FIRST_INDEX, len(COLOR_SHAPE_PAIRS))
     order = np.random.default_rng((_SEED, turn)).permutation(len(COLOR_SHAPE_PAIRS))
     color, shape = COLOR_SHAPE_PAIRS[order[position]]
@@ -59,9 +52,6 @@ def random_model(index: int) -> ObjectModel:
 
     Args:
         index: At least `FIRST_INDEX`.
-
-    Raises:
-        ValueError: The index is too small, or not an integer.
     """
     label = random_label(index)
     rng = np.random.default_rng((_SEED, 0, label.index))

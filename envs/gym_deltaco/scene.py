@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from gym_deltaco.arm import Arm
 from gym_deltaco.fixtures import (
@@ -106,11 +106,6 @@ class Scene:
         """
         self.arm.command_joints(joints, opening)
         self._read()
-
-    def place(self, index: int, position: ArrayLike, yaw: float = 0.0) -> None:
-        """Drops an object from a position of its center, (3,), m, upright and turned by `yaw`, rad."""
-        self._simulation.move(self.bodies[index], position, yaw)
-        self._settle()
 
     def render(self, size: int) -> NDArray[np.uint8]:
         """Returns the image of the benchmark's camera, (size, size, 3) uint8."""

@@ -57,13 +57,10 @@ class SceneConfig:
             if getattr(self, name) not in valid:
                 raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
         select_objects(self.objects)
-        probability = self.adversarial_probability
-        if (
-            isinstance(probability, bool)
-            or not isinstance(probability, (int, float))
-            or not 0 <= probability <= 1
-        ):
-            raise ValueError(f"`adversarial_probability` must be between 0 and 1. Got {probability!r}.")
+        if not 0 <= self.adversarial_probability <= 1:
+            raise ValueError(
+                f"`adversarial_probability` must be between 0 and 1. Got {self.adversarial_probability!r}."
+            )
         image, length = (MIN_IMAGE_SIZE, MAX_IMAGE_SIZE), (1, MAX_EPISODE_LENGTH)
         ranges = {"image_size": (self.image_size, image), "episode_length": (self.n_steps, length)}
         for name, (number, (low, high)) in ranges.items():

@@ -26,10 +26,6 @@ def episode_seed(seed: int, split: Split, task_id: int, episode: int, attempt: i
     Raises:
         ValueError: The split is unknown, or a number is negative.
     """
-    if split not in SPLITS:
-        raise ValueError(f"`split` must be one of {', '.join(SPLITS)}. Got {split!r}.")
     entropy = (seed, SPLITS.index(split), task_id, episode, attempt)
-    if min(entropy) < 0:
-        raise ValueError(f"Seeds, tasks, episodes and attempts count from 0. Got {entropy}.")
     state = np.random.SeedSequence(entropy).generate_state(1, np.uint64)
     return int(state[0] >> np.uint64(1))

@@ -22,9 +22,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from gym_deltaco import pybullet_import as pybullet
 from gym_deltaco.camera import Camera, HandCamera
 from gym_deltaco.solids import Mesh
+
+# Optional, because many systems have to compile it: tasks, layouts, datasets and policies do not need it.
+_import_error: ImportError | None = None
+try:
+    import pybullet
+except ImportError as error:
+    _import_error = error
 
 TIME_STEP = 1 / 240  # s
 GRAVITY = -10.0  # m/s²
@@ -109,6 +115,20 @@ class Link:
 _Matrices = tuple[Sequence[float], Sequence[float]]  # view and projection
 
 
+def check_simulator() -> None:
+    """Checks that PyBullet is installed.
+
+    Raises:
+        ImportError: It is not; the message says what to install.
+    """
+    if _import_error is not None:
+        raise ImportError(
+            f"The environment needs PyBullet, which cannot be imported: {_import_error}. Install it with "
+            '`pip install "lerobot_policy_deltaco[sim]"`; it needs a C++ compiler where there is no wheel.',
+            name="pybullet",
+        ) from _import_error
+
+
 @functools.cache
 def camera_matrices(camera: Camera) -> _Matrices:
     """Returns the view and projection matrices of a camera, 16 numbers each in column-major order."""
@@ -132,20 +152,17 @@ class Simulation:
         # PyBullet reads textures and unions of hulls from files.
         self._files = Path(tempfile.mkdtemp(prefix="gym_deltaco_"))
         self._texture_file = self._files / "colors.png"
-        try:
-            _color_texture().save(self._texture_file)
-            self._client = _connect()
-        except BaseException:
-            shutil.rmtree(self._files, ignore_errors=True)
-            raise
+        _color_texture().save(self._texture_file)
+        self._client = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
+            raise RuntimeError("PyBullet has no free client left. Close environments that you no longer use.")
         self._release = weakref.finalize(self, _release, self._client, self._files, os.getpid())
         self._hull_files: dict[object, str] = {}
         self._texture = -1
         # Visible parts, as body and link. Static parts have their mesh and position, as keys of backgrounds.
         self._static_parts: dict[tuple[int, int], tuple[object, ...]] = {}
         self._moving_parts: list[tuple[int, int]] = []
-        # Whether static and moving parts are shown; None after an interrupted change
-        self._shown: tuple[bool, bool] | None = (True, True)
+        self._shown = (True, True)  # static and moving parts
         self._backgrounds: dict[object, _Background] = {}
 
     def close(self) -> None:
@@ -332,11 +349,6 @@ class Simulation:
         rotation = np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
         return Pose(np.array(position), rotation, math.hypot(*linear), math.hypot(*angular))
 
-    def move(self, body: int, position: ArrayLike, yaw: float = 0.0) -> None:
-        """Moves a body to a position, (3,), m, and a yaw, rad, upright and at rest."""
-        quaternion = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
-        pybullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=self._client)
-
     def touch(self, body: int, other: int) -> bool:
         """Returns whether two bodies were in contact in the last step."""
         return bool(pybullet.getContactPoints(body, other, physicsClientId=self._client))
@@ -453,9 +465,8 @@ class Simulation:
 
     def _show(self, static: bool = True, moving: bool = True) -> None:
         """Shows or hides all static and all moving parts. The renderer skips fully transparent ones."""
-        before, self._shown = self._shown or (None, None), None
         kinds = (self._static_parts, self._moving_parts)
-        for parts, was_visible, is_visible in zip(kinds, before, (static, moving), strict=True):
+        for parts, was_visible, is_visible in zip(kinds, self._shown, (static, moving), strict=True):
             if was_visible != is_visible:
                 color = (1, 1, 1, float(is_visible))
                 for body, link in parts:
@@ -483,14 +494,6 @@ class Simulation:
         # They are tuples if PyBullet was built without NumPy.
         image = np.asarray(pixels, dtype=np.uint8).reshape(size, size, 4)
         return image[..., :3], np.asarray(depths, dtype=np.float32).reshape(size, size)
-
-
-def _connect() -> int:
-    """Connects a client without a window, and returns its id."""
-    client = pybullet.connect(pybullet.DIRECT)
-    if client < 0:
-        raise RuntimeError("PyBullet has no free client left. Close environments that are no longer used.")
-    return client
 
 
 def _release(client: int, files: Path, process: int) -> None:

@@ -404,25 +404,22 @@ def select_tasks(selection: str) -> tuple[int, ...]:
         ValueError: A part of the selection is not a task set, an index or a range; an index is out of range;
             or the selection is empty.
     """
+    valid = (
+        f"Valid are the task sets {', '.join(TASK_SETS)}, and indices and ranges from 0 to {N_TASKS - 1}, "
+        "separated by commas, such as '4,50-73'."
+    )
     selected: list[int] = []
     for term in filter(None, (part.strip() for part in selection.split(","))):
         span = re.fullmatch(r"(\d+)(?:\s*-\s*(\d+))?", term)
         if term in TASK_SETS:
             selected.extend(TASK_SETS[term])
         elif span is None:
-            raise ValueError(
-                f"Unknown task selection {term!r}. Valid are the task sets {', '.join(TASK_SETS)}, and "
-                f"indices and ranges from 0 to {N_TASKS - 1}, separated by commas, such as '4,50-73'."
-            )
+            raise ValueError(f"Unknown task selection {term!r}. {valid}")
         else:
             first, last = int(span[1]), int(span[2] or span[1])
             if last < first:
                 raise ValueError(f"The range {term!r} is empty. Write the smaller index first.")
-            get_task(first), get_task(last)
             selected.extend(get_task(index).index for index in range(first, last + 1))
     if not selected:
-        raise ValueError(
-            f"The task selection {selection!r} is empty. Valid are the task sets {', '.join(TASK_SETS)}, and "
-            f"indices and ranges from 0 to {N_TASKS - 1}, separated by commas, such as '4,50-73'."
-        )
+        raise ValueError(f"The task selection {selection!r} is empty. {valid}")
     return tuple(dict.fromkeys(selected))
