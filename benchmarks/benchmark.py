@@ -115,7 +115,8 @@ def train(policy_type: str = "deltaco", batch_size: int = 256, steps: int = 10) 
                 "output_dir": f"{folder}/{in_memory}",
             }
             results[f"{name}, samples/s"] = batch_size / seconds_of_steps(options, in_memory)
-    return results
+    stock, ours = results.values()
+    return {**results, "ratio": ours / stock}
 
 
 def device() -> str:

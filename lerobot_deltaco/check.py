@@ -29,7 +29,7 @@ from gym_deltaco.atomic_files import write_text
 from lerobot_deltaco.arguments import CheckArguments
 from lerobot_deltaco.base_config import dimension_names
 from lerobot_deltaco.dataset_reading import open_folder_or_hub
-from lerobot_deltaco.deltaco_match import feature_matching
+from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.keyframes import Grasp, find_grasps
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
@@ -50,7 +50,7 @@ _PICTURE_HEIGHT = 180  # px
 # A camera stands still if at least this fraction of the edges in an episode's first image stay where they
 # are: of the benchmark's fixed cameras 0.6 to 0.8, of its wrist camera below 0.1.
 _MIN_STAYING, _COMPARED_SIZE, _EDGES, _SAME = 0.4, 48, 0.2, 0.5
-_TIMED_STEPS, _TIMED_FRAMES = 3, 64
+_TIMED_STEPS, _TIMED_FRAMES, _DESCRIBED_EPISODES = 3, 64, 16
 
 
 class TrainingStart:
@@ -88,7 +88,7 @@ class TrainingStart:
         self.bytes = memory_for_frames(dataset, size)
         self.policy = make_policy(config, ds_meta=dataset.meta).train()
         self.policy.feature_matching.fitted.fill_(True)  # the fit takes minutes, and is left out
-        data = read_robot_data(dataset, range(dataset.meta.total_episodes))
+        data = read_robot_data(dataset, range(dataset.meta.total_episodes), config.cameras[0])
         self.grasps = find_grasps(config.gripper_opening(data.actions), data.spans)
         self.bank = read_demonstrations(dataset, config.cameras[0], config.image_size, config.n_demo_frames)
         self.policy.set_training_data(self.bank, data)
@@ -323,8 +323,9 @@ def _advice(start: TrainingStart, staying: dict[str, float]) -> list[str]:
 
 def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[str, str]]:
     """Measures a few steps of training, and returns what all of it would take."""
-    dataset, config, policy = start.dataset, start.config, start.policy
+    dataset, config, policy, bank = start.dataset, start.config, start.policy, start.bank
     assert policy is not None
+    assert bank is not None
     windows = resolve_delta_timestamps(config, dataset.meta)
     timed = LeRobotDataset(dataset.repo_id, dataset.root, delta_timestamps=windows, return_uint8=True)
     began, n_read = time.perf_counter(), min(_TIMED_FRAMES, len(dataset))
@@ -343,13 +344,22 @@ def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[
         optimizer.step()
         optimizer.zero_grad()
     per_step = (time.perf_counter() - began) / _TIMED_STEPS
+    # Crops of all proposals are encoded, which is most of the fit.
+    images = bank.frames[:_DESCRIBED_EPISODES, 0]
+    native = images if bank.first_images is None else bank.first_images[:_DESCRIBED_EPISODES]
+    middle = torch.zeros(len(images), 2, device=images.device)
+    began = time.perf_counter()
+    policy.feature_matching.describe(images.float() / 255, native, middle, middle)
+    per_crop = (time.perf_counter() - began) / len(images)
+    fit = min(len(bank), feature_matching.MAX_EPISODES) * proposals.N_PROPOSALS * per_crop
+    total = reading + fit + steps * per_step
     memory = start.bytes + psutil.Process().memory_info().rss
     return [
         (
             "time",
-            f"about {(reading + steps * per_step) / 60:.0f} minutes on this machine ({config.device}) for "
-            f"{steps:,} steps of {batch_size}, and several more to fit the feature matching: "
-            f"{reading / 60:.1f} to read the frames, {1000 * per_step:.0f} ms a step",
+            f"about {total / 60:.0f} minutes on this machine ({config.device}) for {steps:,} steps of "
+            f"{batch_size}: {reading / 60:.1f} to read the frames, {fit / 60:.1f} to encode crops for the "
+            f"feature matching, {1000 * per_step:.0f} ms a step",
         ),
         ("memory", f"about {memory / 1e9:.1f} GB, of which the frames take {start.bytes / 1e9:.2f}"),
     ]

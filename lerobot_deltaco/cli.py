@@ -62,8 +62,8 @@ def main() -> None:
         # Libraries report it as errors of their own.
         if "No space left on device" in str(error):
             sys.exit(
-                f"deltaco {name}: The disk is full. Free some space, and run the command again. Training "
-                "continues from its last complete checkpoint with --resume=true "
+                f"deltaco {name}: The disk of {_output_folder(arguments)} is full. Free some space, and run "
+                "the command again. Training continues from its last complete checkpoint with --resume=true "
                 "--config_path=RUN/checkpoints/last/pretrained_model/train_config.json."
             )
         if isinstance(error, OSError):  # a file or folder that cannot be read or written
@@ -108,6 +108,13 @@ def _is_ours(error: BaseException) -> bool:
     """
     frames = traceback.extract_tb(error.__traceback__)
     return bool(frames) and any(f"/{package}/" in frames[-1].filename for package in _PACKAGES)
+
+
+def _output_folder(arguments: Sequence[str]) -> Path:
+    """Returns the folder that a command writes to, as its arguments say."""
+    words = [part for word in arguments for part in word.split("=", 1)]
+    named = [words[n + 1] for n, word in enumerate(words[:-1]) if word in ("--output_dir", "--out", "--root")]
+    return Path(*named[-1:]).resolve()
 
 
 # Help

@@ -7,13 +7,19 @@ tasks of scenario A. Finished steps are skipped, so the same command continues a
 from __future__ import annotations
 
 import os
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import date
+from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
 
 from gym_deltaco.atomic_files import read_json, write_json, write_text
 from gym_deltaco.tasks import get_task
@@ -42,6 +48,8 @@ DEMONSTRATION_TASKS = MappingProxyType({"the gray ring": (25, 1), "the yellow la
 SENTENCES = ("Put it in green bin.", "Put it in red bin.")  # containers 0 and 1 of the scene
 VIDEO_SIZE = 256  # px
 
+_CALIBRATION_SIZE, _CALIBRATION_REPEATS = 1024, 20
+
 
 def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     """Collects, trains and evaluates the project's method, and writes a page.
@@ -51,7 +59,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
         out: Folder of all outputs.
 
     Returns:
-        The page, `index.html`.
+        The page, `index.html`. A line about the run is appended to `records.csv` beside it.
 
     Raises:
         ExperimentError: A step failed.
@@ -83,7 +91,8 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
         with _timed(times, "videos"):
             seed = recipe.evaluation.scene_seed(SCENE_TASK, SCENE_TRIAL)
             write_json(scene, record_scene(last_checkpoint(run.folder), seed))
-    record = _record(run, recipe.evaluation)
+    record, spent = _record(run, recipe.evaluation), read_json(times)
+    total = np.sum(list(spent.values()), axis=0).tolist()
     rate, low, high = (100 * number for number in success_interval(record.episodes))
     page = render(
         "demo.html",
@@ -106,22 +115,38 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
             for kind, plan in swapped.items()
             for row in followed([_record(run, plan)]).to_dict("records")
         ],
-        times=read_json(times),
+        times=spent,
+        total=total,
         checkpoint=last_checkpoint(run.folder),
     )
     write_text(out / "index.html", page)
+    line = {
+        "date": date.today().isoformat(),
+        "commit": _commit(),
+        "budget_min": minutes,
+        "minutes": total[0],
+        "core_minutes": total[1],
+        "success_rate": rate,
+        "low": low,
+        "high": high,
+        "cores": len(os.sched_getaffinity(0)),
+        "calibration_gflops": _calibration(),
+    }
+    table = out / "records.csv"
+    pd.DataFrame([line]).to_csv(table, mode="a", header=not table.exists(), index=False, float_format="%.1f")
     return out / "index.html"
 
 
 @contextmanager
 def _timed(path: Path, name: str) -> Iterator[None]:
-    """Adds the duration of a block, in minutes, to that of a step in a JSON file, if it fails, too."""
-    start = time.monotonic()
+    """Adds the minutes and core-minutes of a block to those of a step in a JSON file, if it fails, too."""
+    start = np.array([time.monotonic(), sum(os.times()[:4])])
     try:
         yield
     finally:
+        spent = (np.array([time.monotonic(), sum(os.times()[:4])]) - start) / 60
         times = read_json(path) if path.is_file() else {}
-        write_json(path, {**times, name: times.get(name, 0) + (time.monotonic() - start) / 60})
+        write_json(path, {**times, name: (spent + times.get(name, [0, 0])).tolist()})
 
 
 def record_scene(checkpoint: Path, seed: int) -> list[dict[str, Any]]:
@@ -169,3 +194,21 @@ def _record(run: Run, plan: EvaluationPlan) -> EvaluationRecord:
     return next(
         record for record in read_run_records(run.folder) if record.plan == plan and record.step == step
     )
+
+
+def _commit() -> str:
+    """Returns the commit of the clone that runs, or the version of the installed package."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return version("lerobot_policy_deltaco")
+
+
+def _calibration() -> float:
+    """Measures the speed of this machine with float32 matrix products, in GFLOP/s."""
+    matrix = np.random.default_rng(0).random((_CALIBRATION_SIZE, _CALIBRATION_SIZE), dtype=np.float32)
+    start = time.perf_counter()
+    for _ in range(_CALIBRATION_REPEATS):
+        matrix @ matrix  # noqa: B018
+    return 2e-9 * _CALIBRATION_REPEATS * _CALIBRATION_SIZE**3 / (time.perf_counter() - start)

@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 
 import pytest
 from fresh_python import run_python
@@ -75,7 +76,7 @@ def test_the_help_of_training_lists_the_options_of_both_policies(helps):
     from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 
     text, _ = helps["train"]
-    hidden = {"push_to_hub", "normalization_mapping", "one_hot_tasks", "known_words", "demo_feature_dim"}
+    hidden = {"push_to_hub", "normalization_mapping", "one_hot_tasks", "known_words"}
     inherited = {field.name for field in fields(DeltacoConfig.__mro__[2])}
     for config in (DeltacoConfig, DeltacoMatchConfig):
         for option in {field.name for field in fields(config)} - inherited - hidden:
@@ -89,7 +90,7 @@ def test_an_unknown_command_names_the_valid_ones(monkeypatch):
         cli.main()
 
 
-FULL = "deltaco report: The disk is full."
+FULL = f"deltaco report: The disk of {Path.cwd()} is full. Free some space"
 
 
 @pytest.mark.parametrize(

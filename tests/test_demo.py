@@ -3,6 +3,7 @@ import re
 from pathlib import Path
 
 import gymnasium
+import pandas as pd
 import pytest
 from example_records import make_record
 from test_experiments import FakeCommands
@@ -56,6 +57,9 @@ def test_the_page_shows_the_result(tmp_path, commands):
         assert page.count(f"<td>{name}</td>") == 2
     assert not re.search(r'(src|href)="(?!data:)', page)
     assert "evaluation on the 102 novel tasks" in page
+    (line,) = pd.read_csv(tmp_path / "records.csv").to_dict("records")
+    assert line["success_rate"] == 25
+    assert line["calibration_gflops"] > 0
 
 
 def test_finished_steps_are_skipped(tmp_path, commands):

@@ -47,7 +47,7 @@ _COLOR_WEIGHT = 2.0  # of colors among the features
 _INITIAL_GATE = (8.0, -5.0)  # slope and offset of the logit that a proposal is the very object, by its cosine
 # Of the fit.
 FIT_STEPS = 1500
-_MAX_EPISODES = 10_000
+MAX_EPISODES = 10_000
 _SCENES_PER_STEP = 64
 _LEARNING_RATE, _WORD_LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 1e-3, 3e-3, 0.2, 0.1
 _P_DROP_WORD = 0.3
@@ -234,7 +234,7 @@ class FeatureMatching(nn.Module):
         """
         generator, device = torch.Generator().manual_seed(seed), images.device
         grasps = (~locations.isnan().any(dim=1)).nonzero().flatten().cpu()
-        drawn = grasps[torch.randperm(len(grasps), generator=generator)[:_MAX_EPISODES]].sort().values
+        drawn = grasps[torch.randperm(len(grasps), generator=generator)[:MAX_EPISODES]].sort().values
         _Pairs([tasks[row] for row in drawn.tolist()])  # fails before the slow part
         with torch.random.fork_rng(devices=[]), torch.enable_grad():
             torch.manual_seed(seed)
