@@ -7,7 +7,7 @@ INSTALLED := .venv/.installed
 PYTHON ?=
 # More arguments of the target's command: make test ARGS="-k tasks"
 ARGS ?=
-# Minutes of the demo: 8, or 25 for the whole recipe
+# Minutes that the demo may take: 8, or 25 for the whole recipe
 MINUTES ?= 8
 
 export UV_PYTHON_DOWNLOADS := never
@@ -19,7 +19,7 @@ help: ## List the targets
 
 install: $(INSTALLED) ## Only set up the environment, in .venv
 
-demo: $(INSTALLED) ## Collect, train and evaluate, in 8 minutes or make demo MINUTES=25: outputs/demo/index.html
+demo: $(INSTALLED) ## Collect, train and evaluate, in 7 minutes, or make demo MINUTES=25: outputs/demo/index.html
 	$(BIN)/deltaco demo --minutes $(MINUTES) $(ARGS)
 
 play: $(INSTALLED) ## Play with the trained policy in the browser: http://127.0.0.1:7860
