@@ -47,8 +47,8 @@ class PolicyOptions:
 
     Args:
         demo_camera: Name of the camera of demonstrations. By default, the first.
-        gripper: Gripper's dimension of the action: an index, or "auto" for the one whose name contains "gripper";
-            of several, the one that moves most.
+        gripper: Gripper's dimension of the action: an index, or "auto" for the one whose name contains
+            "gripper"; of several, the one that moves most.
         gripper_closed: Whether low or high values of the gripper's dimension mean closed.
         image_size: Height and width to which images are scaled, px.
         chunk_size: Number of steps that the policy predicts at once, on which the time depends; None, as in
