@@ -12,9 +12,13 @@ from small_policies import (
     TABLE_TASKS,
     batch_of,
     demos_of,
+    draw_table,
+    observation,
     random_moves,
     small_policy,
+    state_at,
     use_short_fit,
+    write_episodes,
     write_table,
 )
 
@@ -309,3 +313,18 @@ def test_a_gripper_and_a_state_are_needed(table):
 def test_invalid_options_say_what_is_valid(options, message):
     with pytest.raises(ValueError, match=message):
         DeltacoMatchConfig(device="cpu", **options)
+
+
+def test_a_demonstration_may_be_given_by_hand_while_the_arm_rests(table, tmp_path):
+    task, start, other, end = MOVES[0]
+    rest = {"observation.state": state_at(np.zeros(2)), "action": np.array([0, 0, 1], np.float32)}
+    frames = [{"observation.image": draw_table(task, at, other), **rest} for at in (start, start, end, end)]
+    named = {"observation.state": list("abc"), "action": ["a", "b", "gripper"]}
+    demos = write_episodes(tmp_path / "demos", "test/hand", [(task, frames)], **named)
+    policy, before, _ = small_policy(table, "deltaco_match", **demos_of(demos))
+    policy._prepare_training()
+    policy.eval()
+    assert policy.demonstrations.pick_states.isnan().all()
+    action = policy.select_action(before(observation(table, [task])))
+    assert torch.isfinite(action).all()
+    assert policy.found.by_demonstration[0]
