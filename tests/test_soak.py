@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 import pytest
@@ -23,31 +24,33 @@ COMMAND_TIMEOUT = 600  # s
 
 
 def start(words):
-    """Starts `deltaco`, with its children in a process group."""
+    """Starts `deltaco`, with its children in a process group; returns it, and the file of its errors."""
     command = [sys.executable, "-m", "lerobot_deltaco.cli", *map(str, words)]
-    return subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, process_group=0
-    )
+    errors = tempfile.TemporaryFile("w+")  # progress bars would fill a pipe that nobody reads
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors, process_group=0), errors
+
+
+def check_code(process, errors, *codes):
+    code = process.wait(COMMAND_TIMEOUT)
+    errors.seek(0)
+    assert code in codes, errors.read()[-3000:]
 
 
 def run(words):
-    process = start(words)
-    _, errors = process.communicate(timeout=COMMAND_TIMEOUT)
-    assert process.returncode == 0, errors[-3000:]
+    check_code(*start(words), 0)
 
 
 def run_and_kill(words, folder, rng):
     """Kills a command a moment after it has written something new; returns whether it was killed."""
-    before = set(folder.rglob("*"))
-    process, end = start(words), time.monotonic() + COMMAND_TIMEOUT
+    before, end = set(folder.rglob("*")), time.monotonic() + COMMAND_TIMEOUT
+    process, errors = start(words)
     while process.poll() is None and set(folder.rglob("*")) <= before:
         assert time.monotonic() < end, f"{words[0]} writes nothing."
         time.sleep(0.02)
     time.sleep(rng.uniform(0, 1))
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
-    _, errors = process.communicate()
-    assert process.returncode in (0, -signal.SIGKILL), errors[-3000:]
+    check_code(process, errors, 0, -signal.SIGKILL)
     return process.returncode != 0
 
 
