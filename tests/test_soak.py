@@ -26,7 +26,7 @@ COMMAND_TIMEOUT = 600  # s
 def start(words):
     """Starts `deltaco`, with its children in a process group; returns it, and the file of its errors."""
     command = [sys.executable, "-m", "lerobot_deltaco.cli", *map(str, words)]
-    errors = tempfile.TemporaryFile("w+")  # progress bars would fill a pipe that nobody reads
+    errors = tempfile.TemporaryFile("w+")  # noqa: SIM115  (progress bars would fill a pipe)
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors, process_group=0), errors
 
 
