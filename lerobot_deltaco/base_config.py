@@ -146,6 +146,14 @@ class TaskConditionedConfig(PreTrainedConfig):
                 "--policy.demo_root, any name will do."
             )
 
+        # Images must stay in 0..1, and actions in -1..1: the networks are made for these.
+        for kind, valid in {"VISUAL": ("IDENTITY",), "ACTION": ("MIN_MAX", "IDENTITY")}.items():
+            mode = self.normalization_mapping.get(kind, NormalizationMode.IDENTITY)
+            if mode.name not in valid:
+                raise ValueError(
+                    f"`normalization_mapping` must be {' or '.join(valid)} for {kind}. Got {mode.name}."
+                )
+
     def check_choices(self, **choices: Any) -> None:
         """Checks that options are among their valid values.
 

@@ -162,3 +162,8 @@ def test_a_chunk_lasts_two_thirds_of_a_second_where_steps_are_small(n_frames, fp
     fixed = DeltacoMatchConfig(device="cpu", chunk_size=3)
     fixed.set_dataset_length(meta)
     assert fixed.chunk_size == 3
+
+
+def test_images_and_actions_keep_the_ranges_that_the_networks_are_made_for():
+    with pytest.raises(ValueError, match="`normalization_mapping` must be IDENTITY for VISUAL. Got MEAN_STD"):
+        DeltacoConfig(device="cpu", normalization_mapping={"VISUAL": NormalizationMode.MEAN_STD})

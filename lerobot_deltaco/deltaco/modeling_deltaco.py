@@ -77,7 +77,8 @@ class DeltacoPolicy(TaskConditionedPolicy):
         self.instructions: InstructionEmbeddings = InstructionEmbeddings(config.language_encoder)
         self.config: DeltacoConfig = config
         if config.method == "one_hot" and not config.one_hot_tasks:
-            assert dataset_meta is not None
+            if dataset_meta is None:
+                raise ValueError("A one-hot policy needs the tasks that it knows: set `one_hot_tasks`.")
             config.one_hot_tasks = list(dataset_meta.tasks.index)
         self.model = _make_network(config)
         self.demo_encoder = _make_demo_encoder(config)
