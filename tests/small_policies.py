@@ -1,14 +1,16 @@
 """Small datasets, policies and trainings in this process, with fake encoders of sentences and images."""
 
+import functools
 import hashlib
 import sys
 
 import numpy as np
 import pytest
 import torch
+from draccus import argparsing
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.video import RGBEncoderConfig
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import LeRobotDataset, dataset_metadata, load_episodes
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 from lerobot.scripts import lerobot_train
@@ -27,6 +29,27 @@ from lerobot_deltaco.demonstrations import DemonstrationBank
 from lerobot_deltaco.frames import FramesInMemory
 from lerobot_deltaco.recording import load_conditioned
 from lerobot_deltaco.train import train
+
+# Most of a small training is spent on making parsers of options and on opening datasets: do both once.
+
+
+_parsers = functools.cache(argparsing.ArgumentParser)
+_episodes = functools.cache(lambda root, *times: load_episodes(root))
+
+
+def parser_once(config_class, config_path=None, **options):
+    parser = _parsers(config_class, **options)
+    parser.config_path = config_path
+    return parser
+
+
+def load_episodes_once(root):
+    files = sorted((root / "meta" / "episodes").rglob("*.parquet"))
+    return _episodes(root, *((path, path.stat().st_mtime_ns) for path in files))
+
+
+argparsing.ArgumentParser = parser_once
+dataset_metadata.load_episodes = load_episodes_once
 
 # Fake encoders
 
