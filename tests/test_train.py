@@ -174,7 +174,7 @@ def test_episodes_and_the_split_are_respected(train, seen, monkeypatch, policy):
 
     monkeypatch.setattr(DeltacoPolicy, "set_training_data", noted)
     split = {"dataset.episodes": "[1,2,3,7,8,9]", "dataset.eval_split": 0.5, "eval_steps": 2}
-    train({**POLICIES[policy], **split}, batch_size=30)
+    train({**POLICIES[policy], **split}, batch_size=30, steps=2)
     trained, held_back = (
         {index for training, batch in seen if training == wanted for index in batch["episode_index"].tolist()}
         for wanted in (True, False)
