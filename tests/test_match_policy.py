@@ -22,6 +22,7 @@ from small_policies import (
     write_table,
 )
 
+from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.demonstrations import DemonstrationBank
 from lerobot_deltaco.normalization import StateLimits
@@ -67,6 +68,8 @@ def trained(table):
     """A policy that has learned, on 36 of the 48 episodes, to find the locations."""
     with pytest.MonkeyPatch.context() as patch:
         use_short_fit(patch, 60)
+        patch.setattr(proposals, "_SCENES_PER_STEP", 16)
+        patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
         patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._LOCATED_FRACTION", 1.0)
         patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._SHIFT_PADDING", 1)
         policy, before, _ = small_policy(table, "deltaco_match")
