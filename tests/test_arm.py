@@ -57,9 +57,6 @@ def published_forward(joints):
     return pose[:3, 3] + pose[:3, 0] * 0.043, pose[:3, :3]
 
 
-# Kinematics
-
-
 def test_forward_follows_the_published_chain():
     for joints in np.random.default_rng(0).uniform(-2, 2, (50, 6)):
         for ours, published in zip(kin.forward(joints), published_forward(joints), strict=True):
@@ -115,9 +112,6 @@ def test_position_on_the_axis_of_the_waist_keeps_the_waist():
     position = kin.forward(joints)[0]
     assert position[2] == pytest.approx(-0.2)
     assert np.linalg.norm(position[:2] - [0.6, 0]) < 0.031
-
-
-# Simulation
 
 
 @pytest.fixture(scope="module")

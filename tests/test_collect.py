@@ -77,9 +77,6 @@ def read_frames(root):
     return {"observation.image": np.stack([np.asarray(image) for image in images]), **frames}
 
 
-# Contents
-
-
 def test_dataset_does_not_depend_on_the_number_of_workers(finished, tmp_path):
     assert "episodes/s" in collect(tmp_path, PLAN, workers=2)
     assert contents(tmp_path) == contents(finished)
@@ -135,9 +132,6 @@ def test_scene_settings_reach_the_scenes_and_the_features(tmp_path):
     assert read_frames(tmp_path)["benchmark.target_object"].min() >= 32
     assert read_frames(tmp_path)["benchmark.seed"][0] == episode_seed(0, "validation", 1000, 0)
     assert collect_module.read_plan(tmp_path) == plan
-
-
-# Plans
 
 
 def test_held_out_tasks_are_for_validation():
@@ -244,9 +238,6 @@ def test_an_expert_that_never_succeeds_is_an_error(tmp_path, monkeypatch):
         CollectionError, match="failed 2 times in a row at task 4, episode 0. A noise of 10000"
     ):
         collect(tmp_path, CollectionPlan("4", 1, noise=1e6))
-
-
-# Refusals
 
 
 def test_finished_dataset_of_the_same_plan_is_left_alone(finished, collected, monkeypatch):

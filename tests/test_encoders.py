@@ -88,9 +88,6 @@ def test_error_without_network_and_packages_says_what_to_do(monkeypatch, name):
         load_language_encoder(name)
 
 
-# CLIP, in a tiny version
-
-
 @pytest.fixture(scope="module")
 def clip_folder(tmp_path_factory):
     torch.manual_seed(0)
@@ -131,9 +128,6 @@ def test_clip_encodes_sentences(clip_folder, monkeypatch):
     assert embeddings.shape == (3, 8)
     assert embeddings.isfinite().all()
     assert not torch.allclose(embeddings[0], embeddings[1], atol=1e-5)
-
-
-# R3M and EfficientNet-Lite0
 
 
 def test_r3m_is_read_from_its_file(monkeypatch):
@@ -192,9 +186,6 @@ def test_encoders_that_cannot_be_loaded_are_explained(monkeypatch):
     for name, message in zip(names, messages, strict=True):
         with pytest.raises(PretrainedWeightsError, match=message):
             load_vision_encoder(name)
-
-
-# Features of demonstrations
 
 
 def test_bank_is_encoded_without_a_shift_and_in_random_variants():

@@ -38,9 +38,6 @@ def connected_clients():
     return {i for i in range(64) if pybullet.getConnectionInfo(i)["isConnected"]}
 
 
-# Interface
-
-
 def test_gymnasiums_checker_has_no_warnings():
     for ambiguity in AMBIGUITIES:
         scene = SceneConfig(ambiguity=ambiguity)
@@ -137,9 +134,6 @@ def test_containers_appear_where_their_words_say():
     env.close()
 
 
-# Episodes
-
-
 def test_episode_is_truncated_at_its_length_and_never_terminates():
     for length in (30, 3):
         env = gym.make(ENV_ID, task_id=4, scene=SceneConfig(image_size=8, episode_length=length))
@@ -198,9 +192,6 @@ def test_instructions_are_drawn_by_the_seed_and_leave_the_scene_alone():
     assert env.task_description == "only one"
     env.close()
     plain.close()
-
-
-# Invalid input
 
 
 @pytest.mark.parametrize(
@@ -281,9 +272,6 @@ def test_use_before_reset_or_after_close_is_an_error():
         env.reset(seed=0)
         env.close()
         env.close()
-
-
-# Resources
 
 
 @pytest.fixture

@@ -92,9 +92,6 @@ def _run(out, *names, settings=SMALL, **options):
     return run_experiments(names or ("scenario_a/deltaco",), out=out, settings=settings, **options)
 
 
-# Recipes
-
-
 def test_all_recipes_are_valid_and_make_commands(tmp_path):
     for name in experiment_names():
         recipe = read_recipe(name)
@@ -197,9 +194,6 @@ def test_unknown_names_and_scales_are_refused():
         read_recipe("deltaco")
     with pytest.raises(ExperimentError, match="no scale 'paper'"):
         read_recipe("random_objects/deltaco_match", "paper")
-
-
-# Runs
 
 
 def test_steps_run_once(tmp_path, commands):

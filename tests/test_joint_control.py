@@ -34,9 +34,6 @@ def episodes():
         return {task_id: list(expert_episode(env, task_id, seed=task_id)) for task_id in range(4, 300, 60)}
 
 
-# Environment
-
-
 def test_scenes_are_those_of_position_control(env):
     with closing(PickPlaceEnv(4, SceneConfig(image_size=16))) as other:
         for seed in range(3):
@@ -80,9 +77,6 @@ def test_joints_reach_their_targets(env):
         env.step(np.zeros(4))
 
 
-# Expert
-
-
 def test_expert_succeeds_at_its_own_speed_in_every_episode(episodes):
     lengths = [len(steps) for steps in episodes.values()]
     assert sum(steps[-1].info["is_success"] for steps in episodes.values()) >= len(episodes) - 1
@@ -106,9 +100,6 @@ def test_expert_repeats_to_the_last_bit(episodes, env):
         np.testing.assert_array_equal(
             step.observation["pixels"]["wrist"], expected.observation["pixels"]["wrist"]
         )
-
-
-# LeRobot
 
 
 def test_dataset_and_environment_have_the_names_of_a_robot(tmp_path):

@@ -64,9 +64,6 @@ def assert_frequency(count, n, probability):
     assert np.abs(np.asarray(count) - n * probability).max() <= 4.5 * spread
 
 
-# Containers
-
-
 def test_one_container_fits_the_task_and_is_the_target(layouts):
     for task, layout in layouts:
         green, red = layout.containers
@@ -88,9 +85,6 @@ def test_containers_take_every_allowed_pair_of_quadrants_equally_often():
         assert_frequency([*counts.values()], 300, 1 / n_pairs)
         if n_pairs == 8:  # a position task, whose container has any color
             assert_frequency(sum(layout.target_container for layout in layouts), 300, 1 / 2)
-
-
-# Objects
 
 
 def test_objects_lie_in_both_free_quadrants_and_keep_their_distances(layouts):
@@ -148,9 +142,6 @@ def test_scenes_are_drawn_from_the_chosen_objects():
     assert targets == matching
 
 
-# Ambiguity "container"
-
-
 def test_exactly_one_object_fits_the_instruction():
     for task, layout in draw_all("container"):
         fits = [task.describes(item.label) for item in layout.objects]
@@ -174,9 +165,6 @@ def test_distractors_are_adversarial_as_often_as_specified(monkeypatch, draw_of)
         assert_frequency(counts.count(0), n, (1 - probability) ** (1 if draw_of == "scene" else 2) * uniform)
         if probability == 1:
             assert set(counts) == {min(2, len(similar))}
-
-
-# Ambiguity "object"
 
 
 def test_target_has_an_identical_twin_on_the_other_side():

@@ -184,9 +184,6 @@ def test_states_of_the_gripper_are_those_that_follow_its_commands():
     assert follows_gripper(states, gripper, [(0, 29), (30, 59)]).tolist() == [False, True, False, True]
 
 
-# Calibration and heights
-
-
 def stacked_images(images):
     return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
 
@@ -290,9 +287,6 @@ def test_height_of_a_demonstration_counts_as_far_as_it_can_be_trusted():
     assert by_appearance.isfinite().all()
     change = (found - by_appearance)[~is_same].abs().mean()
     assert change < 0.5 * (demonstrated - by_appearance)[~is_same].abs().mean()
-
-
-# Colors and maps
 
 
 def test_hue_augmentation_changes_a_fraction_of_the_samples_and_leaves_gray_gray():

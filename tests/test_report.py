@@ -35,9 +35,6 @@ def links(page):
     return set(re.findall(r"\]\(([^)]*)\)", page.read_text(encoding="utf-8")))
 
 
-# Statistics
-
-
 def test_the_interval_is_that_of_resampled_tasks_which_count_alike():
     episodes = episodes_of(t1="1", t2="0000", t3="10")
     assert task_rates(episodes).to_dict() == {1: 1.0, 2: 0.0, 3: 0.5}
@@ -112,9 +109,6 @@ def test_followed_counts_conflicts(counterfactual, follows, column):
     assert statistics.followed([agreeing])["episodes"].tolist() == [0, 0]
 
 
-# Results
-
-
 def test_other_settings_are_results_of_their_own():
     plans = {
         "": {},
@@ -176,9 +170,6 @@ def test_rows_of_the_paper_are_recipes():
     assert [result.paper.rate for result in results] == pytest.approx([np.nan, 0.305], nan_ok=True)
 
 
-# Tables
-
-
 def test_a_variant_is_compared_with_the_same_trainings():
     def succeeds(seed):
         return lambda task_id, trial: trial < seed
@@ -229,9 +220,6 @@ def test_success_stands_beside_the_papers():
     assert (row["paper"], row["paper_sd"], row["best_sets"], row["best_sets_sd"]) == (0.258, 0.034, 0.5, 0.0)
     assert (row["training_seeds"], row["step"], row["each_seed"]) == ("0 1", 2000, "50.0, 50.0")
     assert (row["episodes"], row["scenes"]) == (24, "1000")
-
-
-# Reports
 
 
 def test_a_report_has_the_tables_of_its_records(tmp_path):

@@ -103,9 +103,6 @@ def test_scenes_of_the_protocol_are_those_on_its_page():
             assert hashlib.sha256(observation["pixels"].tobytes()).hexdigest().startswith(image)
 
 
-# Episodes
-
-
 def absorb(digest, *values):
     """Adds numbers, arrays and dictionaries of them to a hash, to the last bit."""
     for value in values:

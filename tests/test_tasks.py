@@ -66,9 +66,6 @@ def test_tasks_by_color_and_shape():
     assert not {target for task in tasks[198:] for target in task.targets} & set(range(24, 32))
 
 
-# Splits
-
-
 def test_scenarios_split_the_rows_as_published():
     splits = {
         "a": ([*range(24), *range(36, 45)], [*range(24, 36), *range(45, 50)], 198, 102),
@@ -108,9 +105,6 @@ def test_clean_scenario_has_no_test_object_as_a_target_in_training():
     assert set(SCENARIOS["a"].train_tasks) - set(train) == set(tasks_of([39]))
     assert {target for task in train for target in TASKS[task].targets} == set(range(24))
     assert TASK_SETS["scenario_a_clean_test"] == SCENARIOS["a"].test_tasks
-
-
-# Selections
 
 
 def test_selection_keeps_its_order_and_names_each_task_once():
