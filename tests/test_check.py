@@ -34,30 +34,25 @@ def checked(root, out, **options):
     return report, (out / "index.html").read_text()
 
 
-@pytest.fixture(scope="module")
-def table(tmp_path_factory):
-    return write_table(tmp_path_factory.mktemp("data") / "table", random_moves(26))
-
-
 def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path):
     report, page = checked(table.root, tmp_path)
     assert "Training would refuse" not in report
     assert "demo camera:    observation.image stands still" in report
     assert "dimension 2 of the action (gripper); low values close it" in report
-    assert "in 26 of 26 episodes" in report
-    assert all(f"13 episodes, 13 with a grasp: {task}" in report for task in TABLE_TASKS)
+    assert "in 48 of 48 episodes" in report
+    assert all(f"24 episodes, 24 with a grasp: {task}" in report for task in TABLE_TASKS)
     assert "for 100 steps of 4" in report
     # The training's own warning, of a joint that never moves.
     assert report.count("warning:") == report.count("hardly move in the training data") == 1
-    assert page.count("data:image/jpeg;base64") == 4 * 26
+    assert page.count("data:image/jpeg;base64") == 4 * 48
     assert "would refuse" not in page
 
 
 def test_the_direction_of_the_gripper_is_the_one_given(table, tmp_path):
     report, _ = checked(table.root, tmp_path, gripper_closed="high")
     assert "high values close it" in report
-    assert "in 0 of 26 episodes" in report
-    assert report.count("left out:       episode") == 26
+    assert "in 0 of 48 episodes" in report
+    assert report.count("left out:       episode") == 48
     assert "Set --policy.gripper_closed=low" in report
 
 

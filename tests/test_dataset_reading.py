@@ -184,11 +184,10 @@ def test_instructions_that_the_policy_cannot_tell_apart(tmp_path, monkeypatch, c
 
 
 @pytest.fixture
-def banks(monkeypatch):
+def banks(spy):
     """Demonstrations that policies are trained with."""
-    banks, given = [], TaskConditionedPolicy.set_training_data
-    noted = lambda self, bank, robot_data: (banks.append(bank), given(self, bank, robot_data))  # noqa: E731
-    monkeypatch.setattr(TaskConditionedPolicy, "set_training_data", noted)
+    banks = []
+    spy(TaskConditionedPolicy, "set_training_data", lambda _, bank, robot_data: banks.append(bank))
     return banks
 
 

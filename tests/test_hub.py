@@ -97,14 +97,14 @@ def test_card_of_other_scenes_says_so(dataset, copy):
     scene = SceneConfig("object", "scenario_a_train", 0.2, "scene", image_size=64)
     path.write_text(json.dumps({**origin, "plan": {**origin["plan"], "scene": asdict(scene)}}))
     card = " ".join(dataset_card(copy).split())
+    options = "image_size=64 ambiguity=object objects=scenario_a_train adversarial_probability=0.2"
+    words = [f"--env.scene.{option}" for option in [*options.split(), "adversarial_draw=scene"]]
     for text in (
         "two of the objects are identical",
         "Scenes are made of the objects `scenario_a_train`",
         "with probability 0.2** instead of the paper's 0.6",
         "One draw decides for both distractors",
-        "--env.task=4 --env.scene.image_size=64 --env.scene.ambiguity=object "
-        "--env.scene.objects=scenario_a_train --env.scene.adversarial_probability=0.2 "
-        "--env.scene.adversarial_draw=scene --eval.n_episodes",
+        f"--env.task=4 {' '.join(words)} --eval.n_episodes",
     ):
         assert text in card
         assert text not in usual
