@@ -89,10 +89,10 @@ class FakeHub:
         """Status, headers and content of the answer to a request."""
         if path == "/api/validate-yaml":
             return _json({"errors": [], "warnings": []})
-        if self.refused and re.search(self.refused, f"{method} {path}"):
-            return _error(422, "This Hub does not do that")
         if method in ("POST", "DELETE") and token != TOKEN:
             return _error(403, "Forbidden: you do not have the required rights")
+        if self.refused and re.search(self.refused, f"{method} {path}"):
+            return _error(422, "This Hub does not do that")
         with self._lock:
             if path == "/api/repos/create":
                 return self._create(json.loads(body))

@@ -90,7 +90,7 @@ def test_joints_do_not_jump_along_a_path():
             joints = following
 
 
-def test_position_out_of_reach_is_moved_into_reach():
+def test_position_out_of_reach_is_moved_towards_the_shoulder():
     for point in ((0.4, 0.4, -0.1), (0.8, 0.4, -0.12), (0.6, 0.9, -0.3), (3, 4, 5)):
         wrist = np.array(point) + [0, 0, HAND] - SHOULDER
         position, rotation = kin.forward(kin.inverse(point))

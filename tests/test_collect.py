@@ -142,18 +142,15 @@ def test_held_out_tasks_are_for_validation():
     assert CollectionPlan("scenario_a_test", 1, split="train").split == "train"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_invalid_plans_are_refused():
+    for arguments, message in [
         ({"tasks": "scenario_c"}, "Valid are the task sets all, scenario_a_train"),
         ({"tasks": "24", "scene": SceneConfig(objects="scenario_a_train")}, "Task 24 asks for"),
         ({"episodes_per_task": 0}, "`episodes_per_task` must be at least 1. Got 0"),
         ({"noise": float("nan")}, "`noise` must be at least 0. Got nan"),
-    ],
-)
-def test_invalid_plans_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        CollectionPlan(**{"tasks": "4", "episodes_per_task": 1, **arguments})
+    ]:
+        with pytest.raises(ValueError, match=message):
+            CollectionPlan(**{"tasks": "4", "episodes_per_task": 1, **arguments})
 
 
 # Interruptions

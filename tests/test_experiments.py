@@ -127,9 +127,8 @@ def test_layers_add_up():
     assert own.policy == {"type": "deltaco_match", "device": "cpu", **changed}
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
+def test_a_wrong_setting_is_refused():
+    for setting, message in [
         ("training.stepz=3", "`stepz` are not valid...batch_size, steps"),
         ("training.steps=many", "steps"),
         ("training.steps=true", "`steps` must be int"),
@@ -147,11 +146,9 @@ def test_layers_add_up():
         ("training.steps=[1,", "Cannot read"),
         ("steps=3", "must have the mappings data, ...Got 'steps': 3"),
         ("training.steps", "SECTION.NAME=VALUE"),
-    ],
-)
-def test_a_wrong_setting_is_refused(setting, message):
-    with pytest.raises(ExperimentError, match=".*".join(map(re.escape, message.split("...")))):
-        read_recipe("scenario_a/deltaco", settings=[setting])
+    ]:
+        with pytest.raises(ExperimentError, match=".*".join(map(re.escape, message.split("...")))):
+            read_recipe("scenario_a/deltaco", settings=[setting])
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def test_a_finished_episode_stays_finished():
 
 def still_policy():
     """A policy that does nothing, and remembers which instructions it was given."""
-    policy = mock.MagicMock(spec=PreTrainedPolicy, config=None, instructions=set())
+    policy = mock.MagicMock(spec=PreTrainedPolicy, config=None, training=False, instructions=set())
 
     def select_action(batch):
         policy.instructions.update(batch["task"])

@@ -51,9 +51,8 @@ def ramps(*values, frames=10):
     return np.concatenate([np.concatenate([part, np.full(frames, part[-1])]) for part in parts])
 
 
-@pytest.mark.parametrize(
-    ("values", "closes", "opens"),
-    [
+def test_each_course_of_a_gripper_has_its_own_grasp():
+    for values, closes, opens in [
         ((1, 0, 1), 30, 50),
         ((0, 1, 0.3, 1, 0), 50, 70),  # at rest, it is closed; the object holds it open
         ((1, 0.4, 0.7), 30, 50),  # it opens less after the release
@@ -63,15 +62,13 @@ def ramps(*values, frames=10):
         ((0.1, 0.6, 0.5, 0.6, 0.1), 50, 70),  # the object is wide
         ((1, 0, 0.2, 0, 1), 30, 90),  # its hold on the object loosens
         ((0, 1, 0, 1, 0, 0.2, 0), 50, 70),  # it trembles at rest
-    ],
-)
-def test_each_course_of_a_gripper_has_its_own_grasp(values, closes, opens):
-    noise = np.random.default_rng(0).normal(0, 0.01 * max(values), 20 * len(values))
-    course = torch.from_numpy(ramps(*values) + noise)
-    ((grasp, release),) = grasp_frames(course, [(0, len(course) - 1)])
-    # Within the ramps, each of which takes 10 frames.
-    assert closes - 10 <= grasp <= closes
-    assert opens - 10 <= release <= opens
+    ]:
+        noise = np.random.default_rng(0).normal(0, 0.01 * max(values), 20 * len(values))
+        course = torch.from_numpy(ramps(*values) + noise)
+        ((grasp, release),) = grasp_frames(course, [(0, len(course) - 1)])
+        # Within the ramps, each of which takes 10 frames.
+        assert closes - 10 <= grasp <= closes
+        assert opens - 10 <= release <= opens
 
 
 def test_glitches_of_a_frame_or_two_are_no_openings():

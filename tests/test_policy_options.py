@@ -31,9 +31,8 @@ def test_defaults_of_deltaco_are_those_of_the_paper():
     assert config.normalization_mapping == dict(zip(("VISUAL", "STATE", "ACTION"), modes, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_invalid_options_say_what_is_valid():
+    for options, message in [
         ({"method": "best"}, "`method` must be one of deltaco, language_only"),
         ({"language_encoder": "clip"}, "`language_encoder` must be one of paraphrase-MiniLM-L3-v2"),
         ({"num_mixture_components": 0}, "`num_mixture_components` must be from 1 to 1000. Got 0"),
@@ -51,12 +50,10 @@ def test_defaults_of_deltaco_are_those_of_the_paper():
         ({"n_demonstrations": 5, "demo_episode": 0}, "names a single demonstration, but .* is 5"),
         ({"grasp_height_bias": float("nan")}, "`grasp_height_bias` must be from -10 to 10"),
         ({"frames_after_release": -1}, "`frames_after_release` must be from 0"),
-    ],
-)
-def test_invalid_options_say_what_is_valid(options, message):
-    matching = {"p_hue_augmentation", "n_demonstrations", "grasp_height_bias", "frames_after_release"}
-    with pytest.raises(ValueError, match=message):
-        (DeltacoMatchConfig if matching & options.keys() else DeltacoConfig)(device="cpu", **options)
+    ]:
+        matching = {"p_hue_augmentation", "n_demonstrations", "grasp_height_bias", "frames_after_release"}
+        with pytest.raises(ValueError, match=message):
+            (DeltacoMatchConfig if matching & options.keys() else DeltacoConfig)(device="cpu", **options)
 
 
 def test_bfloat16_needs_instructions_of_the_processor(monkeypatch, caplog):

@@ -89,24 +89,21 @@ def counterfactual_record(counterfactual, follows):
     return make_record(plan=plan, succeeds=never, columns=columns)
 
 
-@pytest.mark.parametrize(
-    ("counterfactual", "follows", "column"),
-    [
+def test_followed_counts_conflicts():
+    for counterfactual, follows, column in [
         ("demonstration", "scene", "instruction"),
         ("demonstration", "other", "demonstration"),
         ("instruction", "scene", "demonstration"),
         ("instruction", "other", "instruction"),
         ("instruction", "none", "neither"),
-    ],
-)
-def test_followed_counts_conflicts(counterfactual, follows, column):
-    record = counterfactual_record(counterfactual, follows)
-    table = statistics.followed([record, record]).set_index("aspect")
-    assert list(table.columns) == ["demonstration", "instruction", "neither", "episodes"]
-    assert (table["episodes"] == 2 * len(record.episodes)).all()
-    assert (table[column] == table["episodes"]).all()
-    agreeing = make_record(plan={"counterfactual": "demonstration"})  # the demonstrations are the scene's
-    assert statistics.followed([agreeing])["episodes"].tolist() == [0, 0]
+    ]:
+        record = counterfactual_record(counterfactual, follows)
+        table = statistics.followed([record, record]).set_index("aspect")
+        assert list(table.columns) == ["demonstration", "instruction", "neither", "episodes"]
+        assert (table["episodes"] == 2 * len(record.episodes)).all()
+        assert (table[column] == table["episodes"]).all()
+        agreeing = make_record(plan={"counterfactual": "demonstration"})  # the demonstrations are the scene's
+        assert statistics.followed([agreeing])["episodes"].tolist() == [0, 0]
 
 
 def test_other_settings_are_results_of_their_own():
@@ -139,20 +136,17 @@ def test_only_steps_of_all_seeds_count():
     assert len(result.episodes) == 3 * len(records[0].episodes)
 
 
-@pytest.mark.parametrize(
-    ("records", "message"),
-    [
+def test_what_cannot_be_compared_is_refused():
+    for records, message in [
         (
             [make_record(), make_record(succeeds=never)],
             "step 10000 of 'scenario_a/deltaco' with the training",
         ),
         ([make_record(versions={"benchmark": f"a-v{n}"}) for n in range(2)], "of the benchmark, a-v0, a-v1"),
         ([make_record(seed=0, step=1), make_record(seed=1, step=2)], "at no common step"),
-    ],
-)
-def test_what_cannot_be_compared_is_refused(records, message):
-    with pytest.raises(ReportError, match=message):
-        collect_results(records)
+    ]:
+        with pytest.raises(ReportError, match=message):
+            collect_results(records)
 
 
 def test_results_are_in_the_papers_order_and_numbers_in_theirs():
