@@ -222,7 +222,7 @@ def test_actions_that_cannot_be_carried_out_are_errors(make, table):
 def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):
     stats = {OBS_STATE: {"std": np.array([0.5, 0.2, 1e-5, 0.3])}}
     limits = StateLimits(4, stats)
-    assert "Dimensions 2 of the robot's state hardly move" in caplog.text
+    assert "In the training data, dimension 2 of the robot's state hardly moves" in caplog.text
     # Divided by 3 % of the median, 0.2, and clipped.
     torch.testing.assert_close(
         limits(torch.tensor([1.0, -9.0, 300.0, 0.0])), torch.tensor([1.0, -5.0, 0.5, 0.0])

@@ -39,6 +39,7 @@ def test_defaults_of_deltaco_are_those_of_the_paper():
         ({"language_encoder": "clip"}, "`language_encoder` must be one of paraphrase-MiniLM-L3-v2"),
         ({"num_mixture_components": 0}, "`num_mixture_components` must be from 1 to 1000. Got 0"),
         ({"optimizer_lr": float("nan")}, "`optimizer_lr` must be from"),
+        ({"tasks_per_batch": -1}, "`tasks_per_batch` must be from 0"),
         ({"n_action_steps": 2}, "`n_action_steps` must be from 1 to 1"),
         ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
         ({"film": "none", "concat": "none"}, "no demonstration is used"),
