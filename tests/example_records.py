@@ -23,28 +23,25 @@ def make_record(
 ) -> EvaluationRecord:
     """Makes a record in which an episode of a task and trial succeeds or nothing happens."""
     full_plan = EvaluationPlan(**({"tasks": TASKS, "trials": 2} | (plan or {})))
-    rows = [
+    trials = [(task_id, trial) for task_id in full_plan.task_ids for trial in range(full_plan.trials)]
+    success = [succeeds(*each) for each in trials]
+    task_ids = [task_id for task_id, _ in trials]
+    episodes = pd.DataFrame(
         {
-            "task_id": task_id,
-            "trial": trial,
-            "success": succeeds(task_id, trial),
+            "task_id": task_ids,
+            "trial": [trial for _, trial in trials],
+            "success": success,
             "instruction": None,
-            "demonstration_task": task_id,
-            "demonstration_episodes": [task_id],
-            "demonstrated_objects": [24],
+            "demonstration_task": task_ids,
+            "demonstration_episodes": [[task_id] for task_id in task_ids],
+            "demonstrated_objects": [[24]] * len(trials),
+            "grasped_object": [0 if each else -1 for each in success],
+            "object_containers": [[1 if each else -1, -1, -1] for each in success],
+            "right_object": success,
+            "right_container": success,
+            "p_pick": np.nan,
         }
-        for task_id in full_plan.task_ids
-        for trial in range(full_plan.trials)
-    ]
-    episodes = pd.DataFrame(rows)
-    success = episodes["success"]
-    episodes["grasped_object"] = success.map({True: 0, False: -1})
-    episodes["object_containers"] = [[1, -1, -1] if item else [-1, -1, -1] for item in success]
-    episodes["right_object"] = success
-    episodes["right_container"] = success
-    episodes["p_pick"] = np.nan
-    for name, values in (columns or {}).items():
-        episodes[name] = values
+    ).assign(**(columns or {}))
     other = {
         "policy_type": "deltaco",
         "wording": full_plan.wording,

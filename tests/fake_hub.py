@@ -1,23 +1,22 @@
 """A Hugging Face Hub in a thread of this process: enough of it for LeRobot's and huggingface_hub's clients.
 
-It keeps repositories of models and datasets in memory. A client runs in a process of its own, with the
-variables of `FakeHub.environment`, because huggingface_hub reads them when it is imported.
+It keeps repositories of models and datasets in memory.
 """
 
 import base64
 import hashlib
 import json
-import os
 import re
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import unquote, urlsplit
 
+import huggingface_hub
+from huggingface_hub import constants, hf_api
+from lerobot.datasets import dataset_metadata, lerobot_dataset
+
 TOKEN = "hf_of_the_fake_hub"
 USER = "tester"
-
-# The clients' own check of a card goes to a fixed address of the real Hub, even from here.
-WITHOUT_CARD_CHECK = "from huggingface_hub import RepoCard; RepoCard.validate = lambda *_, **__: None; "
 
 
 def digest(content):
@@ -27,8 +26,7 @@ def digest(content):
 class Repo:
     """Files by path, of the branch `main` and of tags."""
 
-    def __init__(self, visibility="public", files=()):
-        self.visibility = visibility
+    def __init__(self, files=()):
         self.revisions = {"main": dict(files)}
 
     @staticmethod
@@ -42,12 +40,9 @@ class Repo:
 
 
 class FakeHub:
-    """`with FakeHub() as hub:` serves until the block ends.
+    """Serves `repos`, {("dataset" or "model", "user/name"): Repo}, until the end of a `with` block.
 
-    Attributes:
-        url: Its address.
-        repos: {("dataset" or "model", "user/name"): Repo}.
-        refused: A regular expression; requests in whose method and path it is found are refused.
+    Requests in whose method and path the regular expression `refused` is found are refused.
     """
 
     def __init__(self):
@@ -67,21 +62,28 @@ class FakeHub:
         self._server.shutdown()
         self._server.server_close()
 
-    def environment(self, home, token=TOKEN):
-        """Variables of a client whose caches are in the folder `home`, which is best a new one."""
-        ours = re.compile("HF_|HUGGING|LEROBOT_|TRANSFORMERS_OFFLINE")
-        kept = {name: value for name, value in os.environ.items() if not ours.match(name)}
-        variables = {
-            **kept,
-            "HOME": str(home),
-            "HF_HOME": str(home / "huggingface"),
-            "HF_LEROBOT_HOME": str(home / "lerobot"),
-            "HF_ENDPOINT": self.url,
-            "HF_HUB_DISABLE_XET": "1",
-            "HF_HUB_DISABLE_TELEMETRY": "1",
-            "NO_PROXY": "127.0.0.1",
+    def connect(self, patch, home, token=TOKEN):
+        """Sends the clients of this process here, with their caches in the folder `home`, best a new one."""
+        settings = {
+            "ENDPOINT": self.url,
+            "HUGGINGFACE_CO_URL_TEMPLATE": self.url + "/{repo_id}/resolve/{revision}/{filename}",
+            "HF_HUB_CACHE": str(home / "hub"),
+            "HF_TOKEN_PATH": str(home / "token"),
+            "HF_HUB_OFFLINE": False,
+            "HF_HUB_DISABLE_XET": True,
+            "HF_HUB_DISABLE_TELEMETRY": True,
         }
-        return variables if token is None else {**variables, "HF_TOKEN": token}
+        for name, value in settings.items():
+            patch.setattr(constants, name, value)
+        patch.setattr(hf_api.api, "endpoint", self.url)
+        # The clients' own check of a card goes to a fixed address of the real Hub, even from here.
+        patch.setattr(huggingface_hub.RepoCard, "validate", lambda *_, **__: None)
+        patch.setattr(dataset_metadata, "HF_LEROBOT_HOME", home / "lerobot")
+        for module in (dataset_metadata, lerobot_dataset):
+            patch.setattr(module, "HF_LEROBOT_HUB_CACHE", home / "lerobot" / "hub")
+        patch.setenv("NO_PROXY", "127.0.0.1")
+        patch.setenv("HF_TOKEN", token or "")
+        huggingface_hub.close_session()  # of another proxy
 
     def answer(self, method, path, body, token):
         """Status, headers and content of the answer to a request."""
@@ -111,7 +113,7 @@ class FakeHub:
         url = f"{self.url}/{'datasets/' if kind == 'dataset' else ''}{repo_id}"
         if (kind, repo_id) in self.repos:
             return _json({"error": "You already created this repo", "url": url}, 409)
-        self.repos[kind, repo_id] = Repo(request.get("visibility", "public"))
+        self.repos[kind, repo_id] = Repo()
         return _json({"url": url, "id": repo_id, "name": repo_id})
 
     def _get_revision(self, repo, revision, _):
@@ -130,12 +132,9 @@ class FakeHub:
         return _json(refs)
 
     def _get_tree(self, repo, revision, _):
-        return _json(
-            [
-                {"type": "file", "path": path, "size": len(content), "oid": digest(content)}
-                for path, content in repo.files(revision).items()
-            ]
-        )
+        files = repo.files(revision).items()
+        entries = [{"path": path, "size": len(content), "oid": digest(content)} for path, content in files]
+        return _json([{"type": "file", **entry} for entry in entries])
 
     def _get_resolve(self, repo, rest, _):
         revision, _, path = rest.partition("/")
@@ -162,9 +161,8 @@ class FakeHub:
                 del files[value["path"]]
         repo.revisions[branch] = files
         commit = repo.commit(files)
-        return _json(
-            {"success": True, "commitOid": commit, "commitUrl": f"{self.url}/any/name/commit/{commit}"}
-        )
+        url = f"{self.url}/any/name/commit/{commit}"
+        return _json({"success": True, "commitOid": commit, "commitUrl": url})
 
     def _post_tag(self, repo, branch, body):
         repo.revisions[json.loads(body)["tag"]] = repo.files(branch)

@@ -1,14 +1,16 @@
 """Small datasets, policies and trainings in this process, with fake encoders of sentences and images."""
 
+import functools
 import hashlib
 import sys
 
 import numpy as np
 import pytest
 import torch
+from draccus import argparsing
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.video import RGBEncoderConfig
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import LeRobotDataset, dataset_metadata, load_episodes
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 from lerobot.scripts import lerobot_train
@@ -27,6 +29,27 @@ from lerobot_deltaco.demonstrations import DemonstrationBank
 from lerobot_deltaco.frames import FramesInMemory
 from lerobot_deltaco.recording import load_conditioned
 from lerobot_deltaco.train import train
+
+# Most of a small training is spent on making parsers of options and on opening datasets: do both once.
+
+
+_parsers = functools.cache(argparsing.ArgumentParser)
+_episodes = functools.cache(lambda root, *times: load_episodes(root))
+
+
+def parser_once(config_class, config_path=None, **options):
+    parser = _parsers(config_class, **options)
+    parser.config_path = config_path
+    return parser
+
+
+def load_episodes_once(root):
+    files = sorted((root / "meta" / "episodes").rglob("*.parquet"))
+    return _episodes(root, *((path, path.stat().st_mtime_ns) for path in files))
+
+
+argparsing.ArgumentParser = parser_once
+dataset_metadata.load_episodes = load_episodes_once
 
 # Fake encoders
 
@@ -70,26 +93,17 @@ def use_short_fit(monkeypatch, steps=2):
 
 
 def write_episodes(root, repo_id, episodes, fps=10, video=False, **names):
-    """Writes a dataset.
+    """Writes a dataset of episodes (task, frames), with names of a feature's dimensions, and opens it.
 
-    Args:
-        root: Its folder.
-        repo_id: Its name.
-        episodes: (task, frames) of each episode; the values of the first frame tell the features.
-        fps: Frames per second.
-        video: Whether images are stored as videos.
-        names: Names of a feature's dimensions, by feature.
-
-    Returns:
-        The dataset, opened.
+    The values of the first frame tell the features.
     """
 
     def feature(name, value):
         if isinstance(value, str):
             return {"dtype": "string", "shape": (1,), "names": None}
         if value.ndim == 3:
-            image_names = ["height", "width", "channels"]
-            return {"dtype": "video" if video else "image", "shape": value.shape, "names": image_names}
+            kind, axes = "video" if video else "image", ["height", "width", "channels"]
+            return {"dtype": kind, "shape": value.shape, "names": axes}
         return {"dtype": str(value.dtype), "shape": value.shape, "names": names.get(name)}
 
     features = {name: feature(name, value) for name, value in episodes[0][1][0].items()}
@@ -247,14 +261,8 @@ def observation(dataset, tasks):
 
 # Benchmark tasks of which the untrained policy has a demonstration, and sentences whose words it knows.
 DEMONSTRATED = (4, 26)
-SENTENCES = (
-    *(task.instruction for task in BENCHMARK_TASKS),
-    "Put it in the green bin.",
-    "Put it in the red bin.",
-    "wave at me",
-    "",
-    "put the blue goblet into the red one",
-)
+SENTENCES = [task.instruction for task in BENCHMARK_TASKS]
+SENTENCES += ["Put it in the red bin.", "wave at me", "put the blue goblet into the red one"]
 
 
 def save_tiny_policy(folder, **options):
@@ -289,54 +297,27 @@ def load_tiny_policy(folder, **options):
 # Trainings
 
 DELTACO = {"policy.type": "deltaco", "policy.backbone": "strided", "policy.tasks_per_batch": 2}
-MATCH = {
-    "policy.type": "deltaco_match",
-    "policy.tasks_per_batch": 2,
-    # accelerate keeps its precision for the whole process.
-    "policy.dtype": "float32",
+# accelerate keeps its precision for the whole process.
+MATCH = {"policy.type": "deltaco_match", "policy.tasks_per_batch": 2, "policy.dtype": "float32"}
+_SMALL_ACT = {
+    **{"type": "act", "pretrained_backbone_weights": "null", "push_to_hub": False},
+    **{"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "chunk_size": 5, "n_action_steps": 5},
+    **{"n_encoder_layers": 1, "n_vae_encoder_layers": 1},
 }
-ACT = {
-    "policy.type": "act",
-    "policy.dim_model": 16,
-    "policy.n_heads": 2,
-    "policy.dim_feedforward": 16,
-    "policy.n_encoder_layers": 1,
-    "policy.n_vae_encoder_layers": 1,
-    "policy.chunk_size": 5,
-    "policy.n_action_steps": 5,
-    "policy.pretrained_backbone_weights": "null",
-    "policy.push_to_hub": False,
-}
+ACT = {f"policy.{name}": value for name, value in _SMALL_ACT.items()}
 POLICIES = {"deltaco": DELTACO, "deltaco_match": MATCH, "act": ACT}
 
 
 def run_training(root, folder, options, in_memory=True, **more):
-    """Trains in this process, since a new one takes seconds to import LeRobot.
-
-    Args:
-        root: Folder of the dataset.
-        folder: Output folder.
-        options: Options of the policy.
-        in_memory: Whether as `deltaco train`, or as `lerobot-train`.
-        more: More options, with two underscores for a dot.
-
-    Returns:
-        The folder of the checkpoints.
-    """
+    """Trains as `deltaco train` or `lerobot-train` do, in this process; returns the folder of checkpoints."""
     arguments = {
-        "policy.device": "cpu",
-        "dataset.repo_id": "test/small",
-        "dataset.root": root,
-        "batch_size": 6,
-        "steps": 4,
-        "save_freq": 2,
-        "log_freq": 1,
-        "num_workers": 0,
+        **{"policy.device": "cpu", "dataset.repo_id": "test/small", "dataset.root": root},
+        **{"batch_size": 6, "steps": 4, "save_freq": 2, "log_freq": 1, "num_workers": 0},
         "output_dir": folder,
         **options,
-        **{name.replace("__", "."): value for name, value in more.items()},
+        **more,
     }
-    if "resume" in arguments:
+    if "resume" in more:
         arguments = {"output_dir": folder, **more}
     with pytest.MonkeyPatch.context() as patch:
         use_fake_encoder(patch)

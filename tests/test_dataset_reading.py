@@ -29,6 +29,7 @@ from lerobot_deltaco.frames import FramesInMemory
 
 TOP = "observation.images.top"
 DATA, TABLE = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
+TASKS = "meta/tasks.parquet"
 
 
 @pytest.fixture
@@ -49,7 +50,9 @@ def swap(values):
     values[0], values[3] = values[3], values[0]
 
 
-def set_item(row, value, dimension=None):
+def put(row, value, dimension=None):
+    """Changes a value, or a number of it."""
+
     def change_values(values):
         if dimension is None:
             values[row] = value
@@ -62,48 +65,18 @@ def set_item(row, value, dimension=None):
 @pytest.mark.parametrize(
     ("file", "column", "change_values", "message"),
     [
-        (
-            TABLE,
-            "tasks",
-            swap,
-            r"Episode 0 of .*: its task is \['stack the cups'\], but \['pour the tea'\] by",
-        ),
-        (TABLE, "tasks", set_item(2, []), r"Episode 2 of .*: its task is \['stack the cups'\], but \[\] by"),
-        (TABLE, "length", set_item(1, 4), "Episode 1 of .*: the table contradicts itself"),
+        (TABLE, "tasks", swap, r"Episode 0 .*: its task is \['stack the cups'\], but \['pour the tea'\] by"),
+        (TABLE, "tasks", put(2, []), r"Episode 2 .*: its task is \['stack the cups'\], but \[\] by"),
+        (TABLE, "length", put(1, 4), "Episode 1 of .*: the table contradicts itself"),
         (TABLE, "dataset_from_index", swap, "Episode 0 of .*: the table contradicts itself"),
         (TABLE, "episode_index", swap, "Episode 0 of .*: the table contradicts itself"),
-        (
-            DATA,
-            "episode_index",
-            set_item(12, 0),
-            "Episode 0 of .*: its frames are not those with the indices",
-        ),
-        (DATA, "frame_index", set_item(12, 0), "Episode 2 of .*: its frames are not those with the indices"),
-        (
-            DATA,
-            "task_index",
-            set_item(12, 2),
-            r"Episode 2 of .*: it has several tasks, \['stack the cups', 'w",
-        ),
-        (
-            DATA,
-            "task_index",
-            set_item(12, 9),
-            r"Episode 2 of .*: it has several tasks, .*number 9",
-        ),
-        (
-            DATA,
-            "action",
-            set_item(7, np.nan, 1),
-            r"`action` is not finite: dimension 1 is nan in frame 2 of ep",
-        ),
-        (
-            DATA,
-            "action",
-            set_item(7, 9.0, 1),
-            r"`action` is outside of the range in .*stats.json: dimension 1",
-        ),
-        ("meta/tasks.parquet", "task_index", set_item(0, 2), "row 0 has the `task_index` 2"),
+        (DATA, "episode_index", put(12, 0), "Episode 0 .*: its frames are not those with the indices"),
+        (DATA, "frame_index", put(12, 0), "Episode 2 .*: its frames are not those with the indices"),
+        (DATA, "task_index", put(12, 2), r"Episode 2 .*: it has several tasks, \['stack the cups', 'w"),
+        (DATA, "task_index", put(12, 9), r"Episode 2 .*: it has several tasks, .*number 9"),
+        (DATA, "action", put(7, np.nan, 1), "`action` is not finite: dimension 1 is nan in frame 2 of ep"),
+        (DATA, "action", put(7, 9.0, 1), "`action` is outside of the range in .*stats.json: dimension 1"),
+        (TASKS, "task_index", put(0, 2), "row 0 has the `task_index` 2"),
     ],
 )
 def test_contradictions_name_the_episode_and_the_file(root, file, column, change_values, message):
@@ -115,19 +88,18 @@ def test_contradictions_name_the_episode_and_the_file(root, file, column, change
         FramesInMemory(LeRobotDataset("test/foreign", root=root, return_uint8=True))
 
 
-def test_missing_statistics_are_named(root):
-    (root / "meta/stats.json").unlink()
+def test_missing_files_and_statistics_are_named(root, tmp_path):
+    (root / "meta/stats.json").rename(tmp_path / "stats.json")
     with pytest.raises(ValueError, match=r"meta/stats.json has no statistics of `action`"):
         open_dataset("--dataset.root", "test/foreign", root)
-
-
-@pytest.mark.parametrize("file", [DATA, "meta/tasks.parquet"])
-def test_a_missing_file_says_its_path(root, tmp_path, file):
-    (root / file).unlink()
-    with pytest.raises(FileNotFoundError, match=f"copy/{file} is missing"):
-        open_dataset("--dataset.root", "test/foreign", root)
-    with pytest.raises(FileNotFoundError, match=f"copy/{file} is missing"):
-        run_training(root, tmp_path / "run", DELTACO)
+    (tmp_path / "stats.json").rename(root / "meta/stats.json")
+    for file in (DATA, TASKS):
+        (root / file).rename(tmp_path / "moved")
+        with pytest.raises(FileNotFoundError, match=f"copy/{file} is missing"):
+            open_dataset("--dataset.root", "test/foreign", root)
+        with pytest.raises(FileNotFoundError, match=f"copy/{file} is missing"):
+            run_training(root, tmp_path / "run", DELTACO)
+        (tmp_path / "moved").rename(root / file)
 
 
 def cut(image):
@@ -135,7 +107,7 @@ def cut(image):
 
 
 @pytest.mark.parametrize("row", [10, 12])
-def test_a_cut_image_names_its_frame(root, row):
+def test_a_cut_image_and_one_of_another_size_name_their_frame(root, row):
     change(root / DATA, TOP, lambda values: values.__setitem__(row, cut(values[row])))
     message = f"The image {TOP} in frame {row % 5} of episode 2 .*{DATA}. cannot be decoded"
     dataset = open_dataset("--dataset.root", "test/foreign", root)
@@ -144,45 +116,35 @@ def test_a_cut_image_names_its_frame(root, row):
     if row == 10:  # the first of its episode
         with pytest.raises(ValueError, match=message):
             read_demonstrations(dataset, TOP, 16, 2)
-
-
-def test_an_image_of_another_size_names_its_frame(root):
+    # So does an image of another size.
     other = pq.read_table(root / DATA)["observation.images.wrist"].to_pylist()[0]
-    change(root / DATA, TOP, set_item(12, other))
-    message = (
-        f"The image {TOP} in frame 2 of episode 2 .* has 24 x 24 pixels, but by meta/info.json the shape is"
-    )
-    with pytest.raises(ValueError, match=message):
+    change(root / DATA, TOP, put(row, other))
+    found = f"in frame {row % 5} of episode 2 .* has 24 x 24 pixels, but by meta/info.json the shape is"
+    with pytest.raises(ValueError, match=f"The image {TOP} {found}"):
         FramesInMemory(LeRobotDataset("test/foreign", root=root, return_uint8=True))
 
 
-@pytest.mark.parametrize("channels", [1, 4])
-def test_depth_and_other_cameras_are_refused_with_a_remedy(channels):
-    with pytest.raises(ValueError, match=r"Got \{'depth': .*remove_feature .*\['depth'\]"):
-        check_image_shapes({"rgb": (3, 48, 48), "depth": (channels, 48, 48)})
+def test_depth_and_other_cameras_are_refused_with_a_remedy():
+    for channels in (1, 4):
+        with pytest.raises(ValueError, match=r"Got \{'depth': .*remove_feature .*\['depth'\]"):
+            check_image_shapes({"rgb": (3, 48, 48), "depth": (channels, 48, 48)})
 
 
 # Forms of names
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
+def test_names_are_read_in_any_form_or_an_error():
+    for names in (
         ["x", "y", "gripper"],
         [["x", "y", "gripper"]],  # Unitree's converter
         {"motors": ["x", "y", "gripper"]},
         {"arm": ["x", "y"], "hand": ["gripper"]},
         {"gripper": 2, "x": 0, "y": 1},  # LeRobot's gamepad
-    ],
-)
-def test_names_are_read_in_any_form(names):
-    assert dimension_names({"shape": (3,), "names": names}) == ["x", "y", "gripper"]
-
-
-@pytest.mark.parametrize("names", [["x", "gripper"], {"motors": 3}, [1, 2, 3], {"gripper": [0, 1]}])
-def test_names_that_cannot_be_read_are_an_error(names):
-    with pytest.raises(ValueError, match=r"The `names` of 'action' .* --policy.gripper"):
-        dimension_names({"shape": (3,), "names": names})
+    ):
+        assert dimension_names({"shape": (3,), "names": names}) == ["x", "y", "gripper"]
+    for names in (["x", "gripper"], {"motors": 3}, [1, 2, 3], {"gripper": [0, 1]}):
+        with pytest.raises(ValueError, match=r"The `names` of 'action' .* --policy.gripper"):
+            dimension_names({"shape": (3,), "names": names})
 
 
 @pytest.mark.parametrize(("stds", "index"), [([3, 1, 0.1], 1), ([3, 0.1, 1], 2), ([3, 0, 0], 2)])
@@ -214,11 +176,8 @@ def test_instructions_that_the_policy_cannot_tell_apart(tmp_path, monkeypatch, c
     if policy == "deltaco":
         same = torch.nn.functional.normalize(torch.ones(384), dim=0)
         encode = {"wave": same, "dance": same, "sing": -same}
-        monkeypatch.setattr(
-            language,
-            "load_language_encoder",
-            lambda name: lambda texts: torch.stack([encode[t] for t in texts]),
-        )
+        encoder = lambda texts: torch.stack([encode[text] for text in texts])  # noqa: E731
+        monkeypatch.setattr(language, "load_language_encoder", lambda name: encoder)
         made, before, _ = small_policy(dataset, "deltaco", method="language_only")
         for _ in range(2):
             made(before(batch_of(dataset, [0, 5])))
@@ -233,23 +192,20 @@ def test_instructions_that_the_policy_cannot_tell_apart(tmp_path, monkeypatch, c
 # Episodes and names of the command line
 
 
-def banks_of(monkeypatch):
+@pytest.fixture
+def banks(monkeypatch):
+    """Demonstrations that policies are trained with."""
     banks, given = [], TaskConditionedPolicy.set_training_data
-
-    def noted(self, bank, robot_data):
-        banks.append(bank)
-        given(self, bank, robot_data)
-
+    noted = lambda self, bank, robot_data: (banks.append(bank), given(self, bank, robot_data))  # noqa: E731
     monkeypatch.setattr(TaskConditionedPolicy, "set_training_data", noted)
     return banks
 
 
 @pytest.mark.parametrize("in_memory", [True, False])
-def test_only_the_chosen_episodes_are_needed(root, tmp_path, monkeypatch, in_memory):
+def test_only_the_chosen_episodes_are_needed(root, tmp_path, banks, in_memory):
     # As the files of other episodes are, theirs are damaged.
     change(root / DATA, TOP, lambda values: values.__setitem__(5, cut(values[5])))
-    change(root / DATA, "action", set_item(7, np.nan, 1))
-    banks = banks_of(monkeypatch)
+    change(root / DATA, "action", put(7, np.nan, 1))
     options = {**DELTACO, "dataset.episodes": "[0,2,3]", "policy.demo_encoder": "attention"}
     run_training(root, tmp_path / "run", options, in_memory, steps=1, save_freq=1)
     assert banks[0].episodes.tolist() == [0, 2, 3]
@@ -265,17 +221,13 @@ def test_held_out_episodes_are_not_demonstrations(root, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("in_memory", [True, False])
-def test_fine_tuning_honors_the_rename_map(root, tmp_path, monkeypatch, in_memory):
+def test_fine_tuning_honors_the_rename_map(root, tmp_path, banks, in_memory):
     first = run_training(root, tmp_path / "first", {**DELTACO, "policy.demo_encoder": "attention"}, steps=2)
+    banks.clear()
     other = write_dataset(tmp_path / "other", EPISODES, ("front", "hand")).root
-    banks = banks_of(monkeypatch)
     names = {"observation.images.front": TOP, "observation.images.hand": "observation.images.wrist"}
-    options = {
-        "policy.path": first / "000002" / "pretrained_model",
-        "rename_map": json.dumps(names),
-        "policy.demo_repo_id": "test/small",
-        "policy.demo_root": other,
-    }
+    options = {"policy.path": first / "000002" / "pretrained_model", "rename_map": json.dumps(names)}
+    options |= {"policy.demo_repo_id": "test/small", "policy.demo_root": other}
     tuned = run_training(other, tmp_path / "tuned", options, in_memory, steps=1, save_freq=1)
     assert (tuned / "000001").is_dir()
     expected = read_demonstrations(open_dataset("", "test/small", other), "observation.images.front", 48, 2)
@@ -288,9 +240,8 @@ def test_demonstrations_in_other_units_are_warned_of(root, dataset, monkeypatch,
     small_policy(dataset, "deltaco", **demos)
     assert not [record for record in caplog.records if record.name.startswith("lerobot_deltaco")]
     stats = json.loads((root / "meta/stats.json").read_text())
-    for name, values in stats["action"].items():
-        if name != "count":
-            values[2] *= 57.3
+    for name in stats["action"].keys() - {"count"}:
+        stats["action"][name][2] *= 57.3
     (root / "meta/stats.json").write_text(json.dumps(stats))
     change(root / DATA, "action", lambda rows: [row.__setitem__(2, row[2] * 57.3) for row in rows])
     small_policy(dataset, "deltaco", **demos)

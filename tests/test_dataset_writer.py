@@ -9,9 +9,8 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import torch
-from lerobot.datasets import LeRobotDataset, dataset_metadata
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata, dataset_metadata
 from lerobot.datasets import utils as lerobot_files
-from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.utils.constants import DEFAULT_FEATURES
@@ -24,6 +23,7 @@ from lerobot_deltaco.collect import ROBOT_TYPE, dataset_features
 REPO_ID = "user/deltaco"
 FPS = 24
 FEATURES = dataset_features(SceneConfig(image_size=16))
+FEATURES_OF_LEROBOT = {name: {**own, "shape": tuple(own["shape"])} for name, own in FEATURES.items()}
 TASKS = ["Put the cup in the left bin.", "Put the vase in the red bin."]
 LENGTHS = [5, 4, 6, 5, 3]
 TASK_INDICES = [0, 0, 1, 1, 0]
@@ -83,14 +83,11 @@ def dataset(root):
 def reference(tmp_path_factory, episodes):
     """The same episodes, written by LeRobot."""
     features = {
-        name: {**feature, "shape": tuple(feature["shape"])}
-        for name, feature in FEATURES.items()
-        if name not in DEFAULT_FEATURES
+        name: feature for name, feature in FEATURES_OF_LEROBOT.items() if name not in DEFAULT_FEATURES
     }
     root = tmp_path_factory.mktemp("theirs") / "dataset"
-    recorder = LeRobotDataset.create(
-        REPO_ID, FPS, features, root=root, robot_type=ROBOT_TYPE, use_videos=False
-    )
+    options = {"root": root, "robot_type": ROBOT_TYPE, "use_videos": False}
+    recorder = LeRobotDataset.create(REPO_ID, FPS, features, **options)
     for episode in episodes:
         for i in range(len(episode.frames["action"])):
             frame = {name: np.atleast_1d(values[i]) for name, values in episode.frames.items()}
@@ -126,18 +123,14 @@ def episode_statistics(root):
 # Files
 
 
-def test_constants_are_lerobots():
+def test_files_are_named_and_numbered_as_lerobots():
     assert writer.CODEBASE_VERSION == dataset_metadata.CODEBASE_VERSION
     assert writer.FILES_PER_CHUNK == lerobot_files.DEFAULT_CHUNK_SIZE
     assert writer.DATA_FILE == lerobot_files.DEFAULT_DATA_PATH
     assert writer.EPISODES_FILE == lerobot_files.DEFAULT_EPISODES_PATH
-    assert writer.INFO_FILE == lerobot_files.INFO_PATH
-    assert writer.STATS_FILE == lerobot_files.STATS_PATH
-    assert writer.TASKS_FILE == lerobot_files.DEFAULT_TASKS_PATH
+    files = writer.INFO_FILE, writer.STATS_FILE, writer.TASKS_FILE
+    assert files == (lerobot_files.INFO_PATH, lerobot_files.STATS_PATH, lerobot_files.DEFAULT_TASKS_PATH)
     assert json.loads(json.dumps(DEFAULT_FEATURES)) == writer.DEFAULT_FEATURES
-
-
-def test_chunk_is_followed_by_the_next_chunk():
     names = [writer._numbered(writer.DATA_FILE, number) for number in (0, 999, 1000, 12345)]
     expected = ["000/file-000", "000/file-999", "001/file-000", "012/file-345"]
     assert names == [f"data/chunk-{name}.parquet" for name in expected]
@@ -157,9 +150,8 @@ def test_info_and_tasks_are_lerobots(root, reference):
 def test_tables_have_the_columns_types_and_values_of_lerobots(root, reference, folder):
     (our_schema, ours), (their_schema, theirs) = (read_table(path, folder) for path in (root, reference))
     assert our_schema.equals(their_schema)
-    features = {name: {**feature, "shape": tuple(feature["shape"])} for name, feature in FEATURES.items()}
     if folder == "data":
-        expected = get_hf_features_from_features(features)
+        expected = get_hf_features_from_features(FEATURES_OF_LEROBOT)
         assert datasets.Features.from_arrow_schema(our_schema) == expected
     assert len(ours) == len(theirs)
     # Files are numbered in another way; statistics and images are compared elsewhere.
@@ -241,30 +233,17 @@ def test_statistics_are_those_of_all_frames(dataset, root):
             np.testing.assert_allclose(statistics[name], expected, rtol=1e-9, atol=1e-9)
 
 
-def test_statistics_of_the_dataset_are_lerobots_aggregate_of_its_episodes(dataset, root):
-    expected = aggregate_stats(episode_statistics(root))
-    assert expected.keys() == dataset.meta.stats.keys()
-    for feature, statistics in expected.items():
-        for name, value in statistics.items():
-            stored = dataset.meta.stats[feature][name]
-            assert stored.shape == value.shape
-            np.testing.assert_allclose(stored, value, rtol=1e-9, atol=1e-12)
-
-
-def test_statistics_of_an_episode_agree_with_lerobots(root, episodes, tmp_path):
-    for episode, ours in zip(episodes, episode_statistics(root), strict=True):
-        paths = []
-        for i, image in enumerate(episode.frames["observation.image"]):
-            paths.append(str(tmp_path / f"{i}.png"))
-            Image.fromarray(image).save(paths[-1])
-        theirs = compute_episode_stats({**episode.frames, "observation.image": paths}, FEATURES)
-        for feature, statistics in theirs.items():
-            scale = 255 if feature == "observation.image" else 1
-            values = episode.frames[feature].astype(np.float64) / scale
+def test_statistics_agree_with_lerobots(dataset, root, reference):
+    ours, theirs = episode_statistics(root), episode_statistics(reference)
+    ours.append(dataset.meta.stats)
+    theirs.append(LeRobotDatasetMetadata(REPO_ID, root=reference).stats)
+    for found, expected in zip(ours, theirs, strict=True):
+        assert found.keys() == expected.keys()
+        for feature, statistics in expected.items():
+            spread = np.ptp([statistics["min"], statistics["max"]])
             for name, value in statistics.items():
-                assert ours[feature][name].shape == value.shape, (feature, name)
+                assert found[feature][name].shape == value.shape, (feature, name)
                 # LeRobot computes in single precision, and estimates quantiles from 5000 bins.
-                atol = np.ptp(values) / 2000 + 1e-3 * np.abs(values).max() * (name == "std") + 1e-6
-                np.testing.assert_allclose(
-                    ours[feature][name], value, rtol=1e-5, atol=atol, err_msg=f"{feature} {name}"
-                )
+                atol = spread / 2000 + 1e-3 * np.abs(statistics["max"]).max() * (name == "std") + 1e-6
+                message = f"{feature} {name}"
+                np.testing.assert_allclose(found[feature][name], value, rtol=1e-5, atol=atol, err_msg=message)

@@ -98,9 +98,7 @@ def test_frames_between_the_ends_are_drawn_from_equal_parts_of_the_time():
 
 
 def test_demonstrations_that_do_not_exist_are_errors(bank, dataset, tmp_path, make):
-    with pytest.raises(
-        ValueError, match="no demonstration of the task 'sing'.*of 3 tasks, such as 'stack th"
-    ):
+    with pytest.raises(ValueError, match="no demonstration of the task 'sing'.*of 3 tasks, such as 'stac"):
         bank.of_task("sing")
     with pytest.raises(ValueError, match="`demo_episode` is 9.*They are the episodes 0, 1, 2, 3, 4, 5"):
         bank.of_episode(9)
@@ -164,15 +162,6 @@ def test_paraphrases_are_drawn_evenly():
     assert Paraphrases(SENTENCES, is_complete=False).draw(["sing"], torch.Generator()) == ["sing"]
 
 
-def test_checkpoints_do_not_keep_paraphrases(make, dataset, tmp_path):
-    policy, before, _ = make()
-    policy.paraphrases = Paraphrases(SENTENCES, 0.5)
-    policy(before(batch_of(dataset, list(range(30)))))
-    assert not policy.instructions.rows.keys() <= SENTENCES.keys()
-    policy.save_pretrained(tmp_path)
-    assert type(policy).from_pretrained(tmp_path).instructions.rows.keys() <= SENTENCES.keys()
-
-
 def test_training_embeds_paraphrases_of_its_tasks_alone(make, dataset, tmp_path):
     file = tmp_path / "sentences.csv"
     file.write_text("task_id,instruction\n4,first\n4,second\n")
@@ -187,6 +176,9 @@ def test_training_embeds_paraphrases_of_its_tasks_alone(make, dataset, tmp_path)
     embedded = [text for call in fake_encoder.calls for text in call]
     assert len(embedded) == len(set(embedded))  # each once
     assert set(embedded) == {text for own in SENTENCES.values() for text in own}
+    assert set(policy.instructions.rows) == set(embedded)
+    policy.save_pretrained(tmp_path)  # keeps the templates alone
+    assert type(policy).from_pretrained(tmp_path).instructions.rows.keys() <= SENTENCES.keys()
     with pytest.raises(ValueError, match=r"Cannot read the paraphrases missing\.csv"):
         make(paraphrases="missing.csv")
 
@@ -204,7 +196,7 @@ def test_novel_task_is_served_by_its_banked_demonstration(acting, dataset):
     assert torch.equal(policy.select_action(before(observation(dataset, ["", ""]))), action)
 
 
-def test_set_tasks_holds_until_reset(acting, dataset):
+def test_set_tasks_holds_until_reset_by_any_thread(acting, dataset):
     policy, before = acting(method="demo_only")
     waving = before(observation(dataset, [WAVE]))
     expected = {task: policy.select_action(before(observation(dataset, [task]))) for task in TASKS}
@@ -214,8 +206,12 @@ def test_set_tasks_holds_until_reset(acting, dataset):
         policy.set_tasks(["in other words"], [policy.demonstrations.of_task(task)])
         for _ in range(2):
             assert torch.equal(policy.select_action(waving), expected[task])
-    policy.reset()
+    # As in LeRobot's policy server, whose requests come in threads of their own.
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(policy.reset).result()
     assert torch.equal(policy.select_action(waving), expected[WAVE])
+    with ThreadPoolExecutor(1) as pool:
+        assert torch.equal(pool.submit(policy.select_action, waving).result(), expected[WAVE])
 
 
 def test_encoders_run_once_an_episode(acting, dataset, monkeypatch):
@@ -231,20 +227,6 @@ def test_encoders_run_once_an_episode(acting, dataset, monkeypatch):
     policy.select_action(before(observation(dataset, [POUR])))
     assert len(calls) == 3
     assert fake_encoder.calls == [[STACK], [POUR]]
-
-
-def test_reset_in_another_thread_begins_a_new_episode(acting, dataset):
-    """As in LeRobot's policy server, whose requests come in threads of their own."""
-    policy, before = acting(method="demo_only")
-    batch = before(observation(dataset, [WAVE]))
-    expected = policy.select_action(batch)
-    policy.set_tasks([""], [policy.demonstrations.of_task(STACK)])
-    assert not torch.equal(policy.select_action(batch), expected)
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(policy.reset).result()
-    assert torch.equal(policy.select_action(batch), expected)
-    with ThreadPoolExecutor(1) as pool:
-        assert torch.equal(pool.submit(policy.select_action, batch).result(), expected)
 
 
 def test_policy_acts_with_the_weights_that_were_trained_last(acting, dataset):
@@ -296,23 +278,20 @@ def test_mcil_takes_an_instruction_or_a_demonstration(acting, dataset):
         policy.set_tasks([instruction] * 3, [demonstrations] * 3)
         torch.testing.assert_close(policy.select_action(seen)[0], expected)
     assert fake_encoder.calls == []
-    policy.set_tasks([""] * 3, [[]] * 3)
-    with pytest.raises(ValueError, match="'mcil' is missing an input"):
-        policy.select_action(seen)
 
 
 def test_inputs_that_the_method_needs_cannot_be_left_out(acting, dataset):
     shown = DemonstrationBank(torch.zeros(1, 2, 3, 16, 16, dtype=torch.uint8), [POUR], [0])[0]
-    for method, instruction, demonstrations in (
-        ("deltaco", "", [shown]),
-        ("deltaco", POUR, []),
-        ("language_only", "", [shown]),
-        ("demo_only", POUR, []),
+    for methods, instruction, demonstrations in (
+        (("deltaco", "language_only"), "", [shown]),
+        (("deltaco", "demo_only"), POUR, []),
+        (("mcil",), "", []),
     ):
-        policy, before = acting(method=method)
-        policy.set_tasks([instruction], [demonstrations])
-        with pytest.raises(ValueError, match=f"{method!r} is missing an input. Pass an instruction and a de"):
-            policy.select_action(before(observation(dataset, [POUR])))
+        for method in methods:
+            policy, before = acting(method=method)
+            policy.set_tasks([instruction], [demonstrations])
+            with pytest.raises(ValueError, match=f"{method!r} is missing an input. Pass an instruction and"):
+                policy.select_action(before(observation(dataset, [POUR])))
 
 
 def test_missing_tasks_are_errors(acting, make, dataset):
@@ -326,9 +305,7 @@ def test_missing_tasks_are_errors(acting, make, dataset):
     with pytest.raises(ValueError, match="as many lists of demonstrations as instructions. Got 0 and 1"):
         policy.set_tasks([WAVE], [])
     without, _, _ = make()
-    with pytest.raises(
-        ValueError, match="no demonstrations. Name a dataset of them with --policy.demo_repo_"
-    ):
+    with pytest.raises(ValueError, match="no demonstrations. Name a dataset of them with --policy.demo_re"):
         without.eval().select_action(seen)
     without._meta, batch = None, before(batch_of(dataset, [0]))
     with pytest.raises(ValueError, match="needs the metadata of the dataset"):

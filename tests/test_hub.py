@@ -7,10 +7,11 @@ import shutil
 from dataclasses import asdict
 
 import pytest
+import torch
 import tyro
-from fake_hub import USER, FakeHub, Repo
-from fresh_python import run_python
+from fake_hub import TOKEN, USER, FakeHub, Repo
 from huggingface_hub import DatasetCard
+from lerobot.datasets import LeRobotDataset
 from PIL import Image
 
 from gym_deltaco.env import ACTION_SCALE
@@ -19,21 +20,11 @@ from gym_deltaco.tasks import TASKS
 from lerobot_deltaco.cards import TASKS_IMAGE, dataset_card
 from lerobot_deltaco.collect import CollectionPlan, collect
 from lerobot_deltaco.dataset_writer import INFO_FILE
+from lerobot_deltaco.hub import HubError, create_repository, push
 
 REPO_ID = f"{USER}/three.tasks"
 KEY = "dataset", REPO_ID
 PLAN = CollectionPlan("4,32,90", 4)
-
-PUSH = """
-import sys
-from pathlib import Path
-from lerobot_deltaco.hub import HubError, create_repository, push
-try:
-    create_repository(sys.argv[2], private=True)
-    print(push(Path(sys.argv[1]), sys.argv[2]))
-except HubError as error:
-    sys.exit(str(error))
-"""
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +40,10 @@ def copy(dataset, tmp_path):
     return shutil.copytree(dataset, tmp_path / "copy")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def hub():
     with FakeHub() as hub:
         yield hub
-
-
-def run_push(hub, home, root, repo_id=REPO_ID, **options):
-    return run_python(PUSH, root, repo_id, env=hub.environment(home, **options))
 
 
 # The card
@@ -130,15 +117,14 @@ def test_card_of_other_scenes_says_so(dataset, copy):
 # The Hub
 
 
-def test_pushed_dataset_is_fetched_by_its_name(hub, copy, tmp_path):
+def test_pushed_dataset_is_fetched_by_its_name(hub, copy, tmp_path, monkeypatch, capsys):
+    hub.connect(monkeypatch, tmp_path / "home")
     # An earlier, larger dataset in the same repository.
     earlier = {"data/chunk-000/file-009.parquet": b"", "meta/notes.json": b"", "notes": b""}
-    repo = hub.repos[KEY] = Repo(files=earlier)
+    repo = hub.repos[KEY] = Repo(earlier)
     repo.revisions["v3.0"] = earlier
-    result = run_push(hub, tmp_path / "a", copy)
-    assert result.returncode == 0, result.stderr
-    assert f"{hub.url}/datasets/{REPO_ID}" in result.stdout
-
+    create_repository(REPO_ID, private=True)
+    assert push(copy, REPO_ID) == f"{hub.url}/datasets/{REPO_ID}"
     stored = repo.files("v3.0")
     local = {str(path.relative_to(copy)) for path in copy.rglob("*") if path.is_file()}
     assert set(stored) - {".gitattributes"} == {*local, "notes"}
@@ -149,35 +135,26 @@ def test_pushed_dataset_is_fetched_by_its_name(hub, copy, tmp_path):
     assert stored == repo.files()
 
     example = re.search(r"```python\n(.+?)```", dataset_card(copy, REPO_ID), re.DOTALL)[1]
-    compare = f"""{example}
-import sys, torch
-local = LeRobotDataset("any/name", root=sys.argv[1])
-assert len(dataset) == len(local) == 360
-for fetched, kept in zip(dataset, local, strict=True):
-    assert fetched.keys() == kept.keys()
-    for name, value in kept.items():
-        assert torch.equal(fetched[name], value) if torch.is_tensor(value) else fetched[name] == value, name
-"""
-    result = run_python(compare, copy, env=hub.environment(tmp_path / "b"))
-    assert result.returncode == 0, result.stderr
-    assert TASKS[4].instruction in result.stdout
+    exec(example, found := {})
+    assert TASKS[4].instruction in capsys.readouterr().out
+    dataset, local = found["dataset"], LeRobotDataset("any/name", root=copy)
+    assert len(dataset) == len(local) == 360
+    for frame, kept in zip(dataset, local, strict=True):
+        assert frame.keys() == kept.keys()
+        for name, value in kept.items():
+            assert torch.equal(frame[name], value) if torch.is_tensor(value) else frame[name] == value, name
 
 
-@pytest.mark.parametrize(
-    ("repo_id", "options", "reason"),
-    [
-        (REPO_ID, {}, "This Hub does not do that"),
-        (REPO_ID, {"token": None}, "HF_TOKEN a token with write access"),
-        ("us er/name", {}, "The repository id is USER/NAME"),
-    ],
-    ids=["refused", "no token", "invalid id"],
-)
-def test_what_cannot_be_pushed_is_one_line(copy, tmp_path, repo_id, options, reason):
-    with FakeHub() as hub:
-        hub.refused = "POST /api/datasets/.*/commit/"
-        result = run_push(hub, tmp_path, copy, repo_id, **options)
-    assert result.returncode == 1
-    *_, last = result.stderr.splitlines()
-    assert last.startswith(f"Cannot push to '{repo_id}': ")
-    assert reason in last
-    assert last.endswith("A push can be repeated.")
+def test_what_cannot_be_pushed_is_one_line(hub, copy, tmp_path, monkeypatch):
+    hub.repos[KEY] = Repo()
+    hub.refused = "POST /api/datasets/.*/commit/"
+    for repo_id, token, reason in (
+        (REPO_ID, TOKEN, "This Hub does not do that"),
+        (REPO_ID, None, "HF_TOKEN a token with write access"),
+        ("us er/name", TOKEN, "The repository id is USER/NAME"),
+    ):
+        hub.connect(monkeypatch, tmp_path, token)
+        with pytest.raises(HubError, match=f"^Cannot push to '{repo_id}': .*{reason}.* can be repeated.$"):
+            push(copy, repo_id)
+    with pytest.raises(HubError, match="USER/NAME"):
+        create_repository("us er/name")

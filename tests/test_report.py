@@ -2,6 +2,7 @@
 
 import re
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,19 +11,10 @@ import update_docs
 from example_records import make_record
 
 from gym_deltaco.tasks import TASKS, get_task
+from lerobot_deltaco import report
 from lerobot_deltaco.recipes import experiment_names
 from lerobot_deltaco.records import scene_columns, write_records
-from lerobot_deltaco.report import (
-    calibration_rows,
-    counterfactual_rows,
-    difference_rows,
-    escape,
-    evaluation_rows,
-    make_table,
-    outcome_rows,
-    success_rows,
-    write_report,
-)
+from lerobot_deltaco.report import escape, make_table, write_report
 from lerobot_deltaco.results import PAPER, ReportError, collect_results, paper_row
 from lerobot_deltaco.statistics import (
     Estimate,
@@ -97,9 +89,8 @@ def counterfactual_record(counterfactual, follows):
     for task_id, scene in zip(record.episodes["task_id"], scene_columns(record).itertuples(), strict=True):
         own, number = get_task(task_id), (scene.target_object + 1) % 3
         other = TASKS[50 + scene.objects[number]]  # red; the scene's task says green
-        held, task = {"scene": (scene.target_object, own), "other": (number, other), "none": (-1, own)}[
-            follows
-        ]
+        choices = {"scene": (scene.target_object, own), "other": (number, other), "none": (-1, own)}
+        held, task = choices[follows]
         containers = [int(task.container == "red") if n == held else -1 for n in range(3)]
         columns["grasped_object"].append(held)
         columns["object_containers"].append(containers)
@@ -132,33 +123,25 @@ def test_followed_counts_conflicts(counterfactual, follows, column):
 
 
 def test_other_settings_are_results_of_their_own():
-    plans = [
-        {},
-        {"without": "instruction"},
-        {"n_demonstrations": 5},
-        {"joint_noise": 1.0},
-        {"tasks": "0-3", "trials": 4},
-        {"instruction": "put it there"},
-        {"counterfactual": "demonstration"},
-    ]
-    records = [make_record(seed=seed, plan=plan) for plan in plans for seed in (0, 1)]
+    plans = {
+        "": {},
+        "counterfactual demonstration": {"counterfactual": "demonstration"},
+        "joint noise 1.0": {"joint_noise": 1.0},
+        "n demonstrations 5": {"n_demonstrations": 5},
+        "without instruction": {"without": "instruction"},
+        "wording put it there": {"instruction": "put it there"},
+        "tasks 0-3, trials 4": {"tasks": "0-3", "trials": 4},
+    }
+    drawn = np.random.default_rng(0).permutation(list(plans))
+    records = [make_record(seed=seed, plan=plans[name]) for name in drawn for seed in (0, 1)]
     # Most of the group's are main settings.
     records += [make_record("scenario_a/mcil", step=step) for step in (1, 2)]
     results = collect_results(records)
-    assert [result.variant for result in results] == [
-        "",
-        "counterfactual demonstration",
-        "joint noise 1.0",
-        "n demonstrations 5",
-        "without instruction",
-        "wording put it there",
-        "tasks 0-3, trials 4",
-        "",
-    ]
+    assert [result.variant for result in results] == [*plans, ""]
     assert [list(result.last.index) for result in results] == [[0, 1]] * 7 + [[0]]
-    assert len(make_table(results, counterfactual_rows)) == 2
-    assert len(make_table(results, evaluation_rows)) == 7 * 2 + 2
-    assert make_table(collect_results(records[:1]), evaluation_rows).empty
+    assert len(make_table(results, report.counterfactual_rows)) == 2
+    assert len(make_table(results, report.evaluation_rows)) == 7 * 2 + 2
+    assert make_table(collect_results([make_record()]), report.evaluation_rows).empty
 
 
 def test_only_steps_of_all_seeds_count():
@@ -213,12 +196,9 @@ def test_a_variant_is_compared_with_the_same_trainings():
         make_record(seed=1, plan={"without": "instruction", "n_demonstrations": 3}, succeeds=succeeds(2)),
         make_record("scenario_a/mcil", succeeds=succeeds(2)),
     ]
-    table = make_table(collect_results([*main, *others]), difference_rows)
-    assert table["compared_with"].tolist() == [
-        "scenario_a/deltaco",
-        "scenario_a/deltaco, without instruction",
-        "scenario_a/deltaco",
-    ]
+    table = make_table(collect_results([*main, *others]), report.difference_rows)
+    name = "scenario_a/deltaco"
+    assert table["compared_with"].tolist() == [name, f"{name}, without instruction", name]
     # Seed 1 alone succeeds in half of the episodes, as all three seeds do.
     assert table["difference"].tolist() == [Estimate(*[difference] * 3) for difference in (-0.5, 1.0, 0.5)]
 
@@ -231,7 +211,9 @@ def test_outcomes():
         "right_container": [True, False, False, False] * 3,
         "success": [True, False, False, False] * 3,
     }
-    (row,) = make_table(collect_results([make_record(columns=columns)]), outcome_rows).to_dict("records")
+    (row,) = make_table(collect_results([make_record(columns=columns)]), report.outcome_rows).to_dict(
+        "records"
+    )
     # By name the tasks 24 and 124, by color 32 and 132, by shape 45 and 145; two trials of each.
     assert (row["name"], row["color"], row["shape"]) == (0.25, 0.25, 0.25)
     assert row["grasped_anything"] == 0.75
@@ -242,7 +224,7 @@ def test_outcomes():
 def test_calibration_counts_grasps_by_the_policys_probability():
     columns = {"p_pick": [0.6] * 4 + [0.99] * 8, "grasped_object": [0] * 11 + [-1]}
     record = make_record(succeeds=lambda task_id, trial: trial == 0, columns=columns)
-    table = make_table(collect_results([record]), calibration_rows)
+    table = make_table(collect_results([record]), report.calibration_rows)
     assert table["sure"].tolist() == ["50 to 70 %", "97 to 100 %"]
     assert table["grasps"].tolist() == [4, 7]
     assert table["right_object"].tolist() == [0.5, 4 / 7]
@@ -250,7 +232,7 @@ def test_calibration_counts_grasps_by_the_policys_probability():
 
 def test_success_stands_beside_the_papers():
     records = [make_record("small_a/deltaco", seed, step) for seed in (0, 1) for step in (1000, 2000)]
-    (row,) = make_table(collect_results(records), success_rows).to_dict("records")
+    (row,) = make_table(collect_results(records), report.success_rows).to_dict("records")
     assert (row["paper"], row["paper_sd"], row["best_sets"], row["best_sets_sd"]) == (0.258, 0.034, 0.5, 0.0)
     assert (row["training_seeds"], row["step"], row["each_seed"]) == ("0 1", 2000, "50.0, 50.0")
     assert (row["episodes"], row["scenes"]) == (24, "1000")
@@ -261,11 +243,8 @@ def test_success_stands_beside_the_papers():
 
 def test_a_report_has_the_tables_of_its_records(tmp_path):
     name = r"=mine/a|b_*c*_$x$"
-    records = [
-        make_record(name, seed, step, policy={"seed": seed, "lr": seed / 10})
-        for seed in (0, 1)
-        for step in (1000, 2000)
-    ]
+    runs = [(seed, step) for seed in (0, 1) for step in (1000, 2000)]
+    records = [make_record(name, *run, policy={"seed": run[0], "lr": run[0] / 10}) for run in runs]
     records.append(make_record(name, plan={"counterfactual": "instruction"}))
     write_records(tmp_path / "records.parquet", records)
     page = write_report([tmp_path], tmp_path / "out")
@@ -286,17 +265,14 @@ def test_a_report_has_the_tables_of_its_records(tmp_path):
     assert links(page) == {path.name for path in page.parent.iterdir()} - {"report.md"}
 
 
-@pytest.mark.parametrize(
-    "folder", sorted(path for path in RESULTS.iterdir() if path.is_dir()), ids=lambda path: path.name
-)
+@pytest.mark.parametrize("folder", sorted(filter(Path.is_dir, RESULTS.iterdir())), ids=lambda path: path.name)
 def test_committed_reports_are_what_the_records_give(tmp_path, folder):
     write_report([folder], tmp_path)
     for path in tmp_path.iterdir():
         if path.suffix != ".png":
             assert path.read_bytes() == (folder / path.name).read_bytes(), path.name
-    assert {path.name for path in folder.iterdir()} - {path.name for path in folder.glob("*.parquet")} == {
-        path.name for path in tmp_path.iterdir()
-    }
+    committed = {path.name for path in folder.iterdir() if path.suffix != ".parquet"}
+    assert committed == {path.name for path in tmp_path.iterdir()}
 
 
 @pytest.mark.parametrize("page", update_docs.PAGES, ids=lambda page: page.name)

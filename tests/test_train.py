@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -23,11 +24,6 @@ from lerobot_deltaco.deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 
 EPISODE_LENGTH = 30
-
-
-class FakeFrames(SimpleNamespace):
-    def __len__(self):
-        return len(self.columns["action"])
 
 
 CLASSES = {"deltaco": DeltacoPolicy, "deltaco_match": DeltacoMatchPolicy, "act": ACTPolicy}
@@ -144,16 +140,10 @@ def test_a_training_evaluates_itself(train, policy, in_memory, capfd):
 def test_two_processes_train_alike_from_the_disk_and_from_memory(benchmark, tmp_path):
     """Both end with the same weights, by gloo on a CPU, and other ones than a process alone."""
     options = {
-        **DELTACO,
+        **{**DELTACO, "policy.tasks_per_batch": 0, "policy.device": "cpu"},
         "policy.method": "one_hot",  # needs no language encoder
-        "policy.tasks_per_batch": 0,
-        "policy.device": "cpu",
-        "dataset.repo_id": "test/small",
-        "dataset.root": benchmark,
-        "batch_size": 6,
-        "steps": 3,
-        "save_freq": 3,
-        "num_workers": 0,
+        **{"dataset.repo_id": "test/small", "dataset.root": benchmark},
+        **{"batch_size": 6, "steps": 3, "save_freq": 3, "num_workers": 0},
     }
     launch = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     programs = {
@@ -200,14 +190,13 @@ def test_episodes_and_the_split_are_respected(train, seen, monkeypatch, policy):
 def test_batches_hold_the_tasks_that_are_wanted(train, seen):
     instructions = [get_task(task_id).instruction for task_id in TASK_IDS]
     pattern = instructions[1].split(" in ")[0]
-    train({**DELTACO, "policy.upsampled_tasks": pattern, "policy.upsampled_fraction": 0.5})
+    train({**DELTACO, "policy.upsampled_tasks": pattern, "policy.upsampled_fraction": 0.5}, steps=2)
     for _, batch in seen:
         assert batch["task"].count(instructions[1]) == 3
         assert len(set(batch["task"])) == 2
-
-
-def test_as_many_tasks_are_in_a_batch_as_divide_it(train, seen):
-    train({**DELTACO, "policy.tasks_per_batch": 16}, batch_size=9)  # of 4 tasks
+    seen.clear()
+    # As many of the four tasks are in a batch as divide it.
+    train({**DELTACO, "policy.tasks_per_batch": 16}, "divided", batch_size=9, steps=2)
     assert {len(set(batch["task"])) for _, batch in seen} == {3}
 
 
@@ -215,14 +204,14 @@ def test_as_many_tasks_are_in_a_batch_as_divide_it(train, seen):
 def test_pauses_and_frames_long_after_the_release_are_left_out(train, monkeypatch, n_after):
     used, held = [], []
     sampler, in_memory = train_module.TaskBatchSampler, train_module.FramesInMemory
-    monkeypatch.setattr(
-        train_module,
-        "TaskBatchSampler",
-        lambda *arguments, use, **options: used.append(use) or sampler(*arguments, use=use, **options),
-    )
-    monkeypatch.setattr(
-        train_module, "FramesInMemory", lambda *arguments: held.append(in_memory(*arguments)) or held[0]
-    )
+
+    def noted(*arguments, use, **options):
+        used.append(use)
+        return sampler(*arguments, use=use, **options)
+
+    monkeypatch.setattr(train_module, "TaskBatchSampler", noted)
+    hold = lambda *arguments: held.append(in_memory(*arguments)) or held[0]  # noqa: E731
+    monkeypatch.setattr(train_module, "FramesInMemory", hold)
     step = np.arange(EPISODE_LENGTH)
     monkeypatch.setattr(train_module, "paused_frames", lambda data, fps: np.tile(step == 5, len(data.spans)))
     train({**MATCH, "policy.frames_after_release": n_after, "policy.chunk_size": 2}, steps=1)
@@ -241,7 +230,8 @@ def test_frames_after_the_release_are_as_many_seconds_at_any_rate():
     policy = SimpleNamespace(frames_after_release=12, gripper_index=0, gripper_opening=lambda a: a[:, 0])
     last = []
     for fps in (24, 48):
-        frames = FakeFrames(columns={"action": actions}, spans={0: (0, 99)}, fps=fps)
+        frames = MagicMock(columns={"action": actions}, spans={0: (0, 99)}, fps=fps)
+        frames.__len__.return_value = len(actions)
         last.append(int(np.flatnonzero(train_module._until_release(frames, policy))[-1]))
     assert 48 <= last[0] - 12 <= 50
     assert last[1] - last[0] == 12
@@ -259,8 +249,7 @@ def test_a_checkpoint_names_its_policy_and_no_folder_of_the_demonstrations(train
     policy = DeltacoPolicy.from_pretrained(folder)
     assert set(policy.demonstrations.tasks) == {get_task(task_id).instruction for task_id in TASK_IDS}
     printed = "".join(capfd.readouterr())
-    for name in ("gripper_accuracy", "grdn", "loss"):
-        assert name in printed
+    assert all(name in printed for name in ("gripper_accuracy", "grdn", "loss"))
 
 
 @pytest.mark.parametrize(
@@ -291,32 +280,26 @@ def test_a_loss_that_is_not_finite_ends_the_training(train, tmp_path, monkeypatc
 # Errors
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({**DELTACO, "policy.upsampled_tasks": "dance"}, "is found in no task of the dataset"),
-        ({**ACT, "dataset.image_transforms.enable": True}, "cannot be transformed at random"),
-        ({**ACT, "dataset.streaming": True}, "use `lerobot-train`"),
-        ({**DELTACO, "dataset.root": "mistyped"}, "--dataset.root is mistyped, but there is no dataset"),
-        (
-            {**DELTACO, "policy.demo_repo_id": "a/b", "policy.demo_root": "mistyped"},
-            "--policy.demo_root is mistyped, but there is no dataset",
-        ),
-        ({**MATCH, "dataset.episodes": "[0,1,2]"}, "at least 24 episodes"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_a_mistake_ends_the_command_in_one_line(benchmark, tmp_path, monkeypatch, options, message):
+MISTAKES = {
+    "is found in no task of the dataset": {**DELTACO, "policy.upsampled_tasks": "dance"},
+    "cannot be transformed at random": {**ACT, "dataset.image_transforms.enable": True},
+    "use `lerobot-train`": {**ACT, "dataset.streaming": True},
+    "--dataset.root is no_data, but there is no dataset": {**DELTACO, "dataset.root": "no_data"},
+    "--policy.demo_root is no_data, but there is no dataset": {
+        **DELTACO,
+        **{"policy.demo_repo_id": "a/b", "policy.demo_root": "no_data"},
+    },
+    "at least 24 episodes": {**MATCH, "dataset.episodes": "[0,1,2]"},
+}
+
+
+@pytest.mark.parametrize("message", MISTAKES)
+def test_a_mistake_ends_the_command_in_one_line(benchmark, tmp_path, monkeypatch, message):
     monkeypatch.chdir(tmp_path)
-
-    def train(name, arguments):
-        run_training(benchmark, tmp_path / "run", options)
-
+    train = lambda *_: run_training(benchmark, tmp_path / "run", MISTAKES[message])  # noqa: E731
     monkeypatch.setattr(cli, "_run", train)
     monkeypatch.setattr(sys, "argv", ["deltaco", "train"])
-    with pytest.raises(SystemExit) as error:
+    with pytest.raises(SystemExit, match=f"^deltaco train: .*{message}") as error:
         cli.main()
-    assert str(error.value).startswith("deltaco train: ")
-    assert message in str(error.value)
     assert "\n" not in str(error.value)
-    assert not (tmp_path / "mistyped").exists()
+    assert not (tmp_path / "no_data").exists()
