@@ -6,18 +6,7 @@ import sys
 
 
 def run_python(program, *arguments, env=None, cwd=None, timeout=300):
-    """Runs a program in a new process.
-
-    Args:
-        program: Source of the program.
-        arguments: Its arguments, for `sys.argv`.
-        env: Environment; None for this process's.
-        cwd: Working directory; None for this process's.
-        timeout: Time limit, s.
-
-    Returns:
-        The `subprocess.CompletedProcess`, with output and errors as text.
-    """
+    """Runs a program, with arguments for `sys.argv`; returns the process with output and errors as text."""
     return subprocess.run(
         [sys.executable, "-c", program, *map(str, arguments)],
         env=os.environ if env is None else env,

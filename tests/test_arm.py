@@ -39,14 +39,9 @@ def rotation_about(axis, angle):
 def published_forward(joints):
     """Computes the pose of the end effector along the published chain of joints."""
     x, y, z = np.eye(3)
-    chain = [  # origin, rolled by pi, axis
-        ((0, 0, 0.0716), False, z),
-        ((0, 0, 0.03865), False, y),
-        ((0.04975, 0, 0.25), True, y),
-        ((0.175, 0, 0), False, x),
-        ((0.075, 0, 0), False, y),
-        ((0.065, 0, 0), True, x),
-    ]
+    # Origin, whether rolled by pi, and axis of each joint
+    chain = [((0, 0, 0.0716), False, z), ((0, 0, 0.03865), False, y), ((0.04975, 0, 0.25), True, y)]
+    chain += [((0.175, 0, 0), False, x), ((0.075, 0, 0), False, y), ((0.065, 0, 0), True, x)]
     pose = np.eye(4)
     pose[:3, 3] = [0.6, 0, -0.4]
     for (origin, is_rolled, axis), angle in zip(chain, joints, strict=True):
@@ -55,9 +50,6 @@ def published_forward(joints):
         joint[:3, :3] = rotation_about(x, np.pi if is_rolled else 0) @ rotation_about(axis, angle)
         pose = pose @ joint
     return pose[:3, 3] + pose[:3, 0] * 0.043, pose[:3, :3]
-
-
-# Kinematics
 
 
 def test_forward_follows_the_published_chain():
@@ -98,7 +90,7 @@ def test_joints_do_not_jump_along_a_path():
             joints = following
 
 
-def test_position_out_of_reach_is_moved_towards_the_shoulder():
+def test_position_out_of_reach_is_moved_into_reach():
     for point in ((0.4, 0.4, -0.1), (0.8, 0.4, -0.12), (0.6, 0.9, -0.3), (3, 4, 5)):
         wrist = np.array(point) + [0, 0, HAND] - SHOULDER
         position, rotation = kin.forward(kin.inverse(point))
@@ -107,17 +99,12 @@ def test_position_out_of_reach_is_moved_towards_the_shoulder():
         assert reached @ wrist > 0
         assert 0.995 * REACH < np.linalg.norm(reached) <= REACH
         np.testing.assert_allclose(rotation[:, 0], [0, 0, -1], atol=1e-9)
-
-
-def test_position_on_the_axis_of_the_waist_keeps_the_waist():
+    # On the axis of the waist, it keeps the waist.
     joints = kin.inverse([0.6, 0.0, -0.2])
     assert joints[0] == kin.REST_JOINTS[0]
     position = kin.forward(joints)[0]
     assert position[2] == pytest.approx(-0.2)
     assert np.linalg.norm(position[:2] - [0.6, 0]) < 0.031
-
-
-# Simulation
 
 
 @pytest.fixture(scope="module")
@@ -135,8 +122,9 @@ def env(shared_env):
 
 def link_pose(env, link):
     """Returns position and rotation of a link's frame, from PyBullet."""
+    client = env.scene._simulation._client
     state = pybullet.getLinkState(
-        env.scene.arm.body, link, computeForwardKinematics=1, physicsClientId=env.scene._simulation._client
+        env.scene.arm.body, link, computeForwardKinematics=1, physicsClientId=client
     )
     return np.array(state[4]), np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
 

@@ -110,9 +110,6 @@ def test_equal_policies_are_equal_files(saved, tmp_path):
         assert (tmp_path / "later" / name).read_bytes() == (saved[0] / name).read_bytes()
 
 
-# Parts that do not belong together
-
-
 def edit_json(name, change):
     def edit(folder):
         content = json.loads((folder / name).read_text())
@@ -187,9 +184,6 @@ def test_training_continues_on_other_data_than_that_of_its_checkpoint(checkpoint
     DeltacoPolicy.from_pretrained(tmp_path / "new")
 
 
-# Weights
-
-
 def test_weights_that_do_not_fit_are_an_error(checkpoint):
     edit(checkpoint / "model.safetensors", lambda tensors, _: tensors.pop("model.raw_log_std"))
     with pytest.raises(ValueError, match="not have the weights of this policy: .*raw_log_std.*config.js"):
@@ -215,9 +209,6 @@ def test_one_hot_policy_remembers_its_tasks(make, dataset, tmp_path):
     assert loaded.config.one_hot_tasks == TASKS
     with pytest.raises(ValueError, match="does not know the task 'juggle'. It knows the 3 tasks .*'stack"):
         loaded.select_action(before(observation(dataset, ["juggle"])))
-
-
-# The card
 
 
 def card_of(dataset, policy_type="deltaco", train_config=None, **options):
@@ -259,9 +250,6 @@ def test_card_names_options_demonstrations_and_training(dataset):
     assert (data.datasets, data.model_name) == ([REPO_ID], "deltaco")
     assert {"lerobot", "robotics", "deltaco", "cups"} <= set(data.tags)
     assert len(data.tags) == len(set(data.tags))
-
-
-# The Hub
 
 
 def test_pushed_policy_is_fetched_by_its_id(dataset, tmp_path, monkeypatch):

@@ -130,9 +130,6 @@ def test_depth_and_other_cameras_are_refused_with_a_remedy():
             check_image_shapes({"rgb": (3, 48, 48), "depth": (channels, 48, 48)})
 
 
-# Forms of names
-
-
 def test_names_are_read_in_any_form_or_an_error():
     for names in (
         ["x", "y", "gripper"],
@@ -156,9 +153,6 @@ def test_the_gripper_that_moves_is_chosen(stds, index, caplog):
     assert config.gripper == str(index)
     name = features["action"]["names"][index]
     assert f"moves most, dimension {index} of the action ({name})" in caplog.text
-
-
-# Instructions
 
 
 @pytest.mark.parametrize(
@@ -187,9 +181,6 @@ def test_instructions_that_the_policy_cannot_tell_apart(tmp_path, monkeypatch, c
         expected = "2 of 3 tasks" if "🍎" in tasks[0] else ""
     assert caplog.text.count("cannot tell") == bool(expected)
     assert expected in caplog.text
-
-
-# Episodes and names of the command line
 
 
 @pytest.fixture

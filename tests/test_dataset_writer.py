@@ -120,9 +120,6 @@ def episode_statistics(root):
     ]
 
 
-# Files
-
-
 def test_files_are_named_and_numbered_as_lerobots():
     assert writer.CODEBASE_VERSION == dataset_metadata.CODEBASE_VERSION
     assert writer.FILES_PER_CHUNK == lerobot_files.DEFAULT_CHUNK_SIZE
@@ -182,9 +179,6 @@ def test_shard_whose_writing_fails_is_absent(tmp_path, episodes):
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
-# Reading and editing
-
-
 def test_every_frame_reads_like_one_that_lerobot_wrote(dataset, reference):
     expected = LeRobotDataset(REPO_ID, root=reference)
     assert len(dataset) == len(expected) == sum(LENGTHS)
@@ -212,9 +206,6 @@ def test_lerobot_deletes_and_merges_episodes(dataset, episodes, tmp_path):
         image = (frame["observation.image"].permute(1, 2, 0) * 255).round()
         np.testing.assert_array_equal(image, episodes[episode].frames["observation.image"][0])
         start += LENGTHS[episode]
-
-
-# Statistics
 
 
 def test_statistics_are_those_of_all_frames(dataset, root):

@@ -34,13 +34,10 @@ def commands(monkeypatch):
 
     def record_scene(checkpoint, seed):
         files = {"video": "data:video/mp4", "maps": "data:image/jpeg"}
-        episodes = [
-            {"sentence": sentence, "success": n == 0, **files} for n, sentence in enumerate(demo.SENTENCES)
-        ]
-        return [
-            {"name": name, "images": ["data:image/jpeg"] * 2, "episodes": episodes}
-            for name in demo.DEMONSTRATION_TASKS
-        ]
+        sentences = enumerate(demo.SENTENCES)
+        episodes = [{"sentence": sentence, "success": n == 0, **files} for n, sentence in sentences]
+        shown = {"images": ["data:image/jpeg"] * 2, "episodes": episodes}
+        return [{"name": name, **shown} for name in demo.DEMONSTRATION_TASKS]
 
     monkeypatch.setattr(demo, "record_scene", record_scene)
     return fake
@@ -63,12 +60,12 @@ def test_the_page_shows_the_result(tmp_path, commands):
 
 
 def test_finished_steps_are_skipped(tmp_path, commands):
-    commands.failing = ("evaluate",)
+    commands.failing = "evaluate"
     with pytest.raises(ExperimentError):
         demo.run_demo(8, tmp_path)
     times = tmp_path / "8_minutes" / "minutes.json"
     first = json.loads(times.read_text())["evaluate"]
-    commands.failing = ()
+    commands.failing = None
     for names in (["evaluate"] * 3, []):
         commands.called.clear()
         demo.run_demo(8, tmp_path)

@@ -52,9 +52,6 @@ def commands(path: Path) -> Iterator[list[str]]:
                 yield words
 
 
-# Commands
-
-
 def parse_deltaco(name: str, arguments: list[str]) -> dict[str, object]:
     """Parses the arguments of a subcommand, and runs nothing."""
     kind = cli.command_arguments(name)
@@ -151,9 +148,6 @@ def test_the_quick_start_lists_every_command():
     assert all(f"`deltaco {name}`" in text for name in cli.COMMANDS)
 
 
-# Python
-
-
 @pytest.mark.parametrize("path", PAGES, ids=page_name)
 def test_the_imports_of_snippets_exist(path):
     for snippet in fences(path, "python"):
@@ -167,9 +161,6 @@ def test_the_gymnasium_snippet_of_the_readme_runs():
     snippet = next(block for block in fences(ROOT / "README.md", "python") if "gymnasium.make" in block)
     result = subprocess.run([sys.executable, "-c", snippet], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines()[-1] in ("True", "False")
-
-
-# Pages, links and tables
 
 
 def slugs(path: Path) -> set[str]:

@@ -1,6 +1,7 @@
 """Frozen encoders of sentences and images: the packaged ones, tiny models of transformers, and errors."""
 
 import functools
+from unittest import mock
 
 import numpy as np
 import onnxruntime
@@ -16,22 +17,8 @@ from lerobot_deltaco import efficientnet_lite, language, vision
 from lerobot_deltaco.deltaco.demo_encoders import encode_bank
 from lerobot_deltaco.deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.demonstrations import DemonstrationBank
-from lerobot_deltaco.efficientnet_lite import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    EfficientNetLite0,
-    PretrainedWeightsError,
-)
-from lerobot_deltaco.language import (
-    CLIP,
-    LANGUAGE_ENCODERS,
-    MINILM_L3,
-    MINILM_L6,
-    InstructionEmbeddings,
-    LanguageEncoderError,
-    LanguageEncoderSpec,
-    load_language_encoder,
-)
+from lerobot_deltaco.efficientnet_lite import IMAGENET_MEAN, IMAGENET_STD, PretrainedWeightsError
+from lerobot_deltaco.language import CLIP, LANGUAGE_ENCODERS, MINILM_L3, MINILM_L6, load_language_encoder
 from lerobot_deltaco.vision import VISION_ENCODERS, load_vision_encoder
 
 # Sentences
@@ -40,9 +27,8 @@ from lerobot_deltaco.vision import VISION_ENCODERS, load_vision_encoder
 def test_packaged_l3_computes_what_its_published_graph_does():
     instructions = [task.instruction for task in BENCHMARK_TASKS[::10]]
     session = onnxruntime.InferenceSession(str(language.l3_onnx_file()))
-    tokens = AutoTokenizer.from_pretrained(language._l6_folder())(
-        instructions, padding=True, return_tensors="np"
-    )
+    tokenizer = AutoTokenizer.from_pretrained(language._l6_folder())
+    tokens = tokenizer(instructions, padding=True, return_tensors="np")
     inputs = {name: tokens[name].astype(np.int64) for name in ("input_ids", "attention_mask")}
     (expected,) = (out for out in session.run(None, inputs) if out.shape == (30, 384))
     np.testing.assert_allclose(load_language_encoder(MINILM_L3)(instructions).numpy(), expected, atol=1e-5)
@@ -64,18 +50,13 @@ def test_packaged_encoders_need_no_network(monkeypatch, name):
 
 
 def test_instructions_are_embedded_once_as_unit_vectors(monkeypatch):
-    calls = []
-
-    def encode(sentences):
-        calls.append(list(sentences))
-        return torch.full((len(sentences), 384), 3.0)
-
+    encode = mock.Mock(side_effect=lambda sentences: torch.full((len(sentences), 384), 3.0))
     monkeypatch.setattr(language, "load_language_encoder", lambda _: encode)
-    instructions = InstructionEmbeddings(MINILM_L3)
+    instructions = language.InstructionEmbeddings(MINILM_L3)
     embeddings = instructions(["wave", "sing", "wave", ""], "cpu")
     torch.testing.assert_close(embeddings.norm(dim=1), torch.tensor([1.0, 1, 1, 0]))
     assert torch.equal(instructions(["", "wave"], "cpu"), embeddings[[3, 2]])
-    assert calls == [["wave", "sing"]]
+    encode.assert_called_once_with(["wave", "sing"])
     assert list(instructions.rows) == ["wave", "sing"]
 
 
@@ -84,22 +65,18 @@ def test_error_without_network_and_packages_says_what_to_do(monkeypatch, name):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr(language, "_l6_folder", lambda: None)
     monkeypatch.setattr(language, "l3_onnx_file", lambda: None)
-    with pytest.raises(LanguageEncoderError, match=f"{name} cannot be loaded.*extra `offline`"):
+    with pytest.raises(language.LanguageEncoderError, match=f"{name} cannot be loaded.*extra `offline`"):
         load_language_encoder(name)
-
-
-# CLIP, in a tiny version
 
 
 @pytest.fixture(scope="module")
 def clip_folder(tmp_path_factory):
     torch.manual_seed(0)
     size = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
+    size["projection_dim"] = 8
     text = {**size, "vocab_size": 40, "bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 0}
-    vision_config = {**size, "image_size": 32, "patch_size": 16, "projection_dim": 8}
-    config = CLIPConfig(
-        text_config={**text, "projection_dim": 8}, vision_config=vision_config, projection_dim=8
-    )
+    images = {**size, "image_size": 32, "patch_size": 16}
+    config = CLIPConfig(text_config=text, vision_config=images, projection_dim=8)
     folder = tmp_path_factory.mktemp("clip")
     CLIPModel(config).save_pretrained(folder)
     return folder
@@ -125,15 +102,12 @@ def test_clip_encodes_sentences(clip_folder, monkeypatch):
     tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
     tokenizer = PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", unk_token="<unk>")
     tokenizer.save_pretrained(clip_folder)
-    specs = {**LANGUAGE_ENCODERS, CLIP: LanguageEncoderSpec(str(clip_folder), 8)}
+    specs = {**LANGUAGE_ENCODERS, CLIP: language.LanguageEncoderSpec(str(clip_folder), 8)}
     monkeypatch.setattr(language, "LANGUAGE_ENCODERS", specs)
     embeddings = load_language_encoder(CLIP)(["put it there", "it there put", "put " * 200])
     assert embeddings.shape == (3, 8)
     assert embeddings.isfinite().all()
     assert not torch.allclose(embeddings[0], embeddings[1], atol=1e-5)
-
-
-# R3M and EfficientNet-Lite0
 
 
 def test_r3m_is_read_from_its_file(monkeypatch):
@@ -169,7 +143,7 @@ PUBLISHED_MAPS = {
 
 
 def test_maps_of_efficientnet_are_those_of_its_publishers():
-    network = EfficientNetLite0().train()
+    network = efficientnet_lite.EfficientNetLite0().train()
     network.load_imagenet_weights()
     found = network.maps(ramp(), (5, 7))
     assert torch.equal(found[-1], network(ramp()))
@@ -181,10 +155,7 @@ def test_maps_of_efficientnet_are_those_of_its_publishers():
 
 
 def test_encoders_that_cannot_be_loaded_are_explained(monkeypatch):
-    def refuse(*_, **__):
-        raise OSError("no network")
-
-    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", mock.Mock(side_effect=OSError("no network")))
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr(efficientnet_lite, "_PACKAGE", "no_such_package")
     messages = ["needs the package no-such-package", *["Without a network, choose efficientnet-lite0"] * 2]
@@ -192,9 +163,6 @@ def test_encoders_that_cannot_be_loaded_are_explained(monkeypatch):
     for name, message in zip(names, messages, strict=True):
         with pytest.raises(PretrainedWeightsError, match=message):
             load_vision_encoder(name)
-
-
-# Features of demonstrations
 
 
 def test_bank_is_encoded_without_a_shift_and_in_random_variants():

@@ -43,9 +43,6 @@ def acting(make, demos):
     return acting
 
 
-# Banks of demonstrations
-
-
 @pytest.fixture(scope="module")
 def bank(dataset):
     return read_demonstrations(dataset, "observation.images.top", 16, 2)
@@ -109,9 +106,6 @@ def test_demonstrations_that_do_not_exist_are_errors(bank, dataset, tmp_path, ma
         read_demonstrations(dataset, "observation.image", 16, 2)
     with pytest.raises(FileNotFoundError, match="--policy.demo_root is .*/nothing, but there is no dataset"):
         make(demo_repo_id="me/demos", demo_root=str(tmp_path / "nothing"))
-
-
-# Training
 
 
 def test_draws_are_a_function_of_the_seed_and_the_step(make, dataset):
@@ -181,9 +175,6 @@ def test_training_embeds_paraphrases_of_its_tasks_alone(make, dataset, tmp_path)
     assert type(policy).from_pretrained(tmp_path).instructions.rows.keys() <= SENTENCES.keys()
     with pytest.raises(ValueError, match=r"Cannot read the paraphrases missing\.csv"):
         make(paraphrases="missing.csv")
-
-
-# Evaluation
 
 
 def test_novel_task_is_served_by_its_banked_demonstration(acting, dataset):

@@ -78,9 +78,6 @@ def run_command(*arguments):
         cli.main()
 
 
-# Scenes and outcomes
-
-
 def test_outcomes_depend_neither_on_batches_nor_on_processes(shipped, monkeypatch):
     plan = EvaluationPlan(TEST_TASKS, trials=2)
     assert len(Evaluation(shipped, plan).batches) == 4
@@ -150,9 +147,6 @@ def test_outcomes_are_those_of_the_scene_at_the_end(loaded, monkeypatch):
             assert (row.right_object, row.right_container) == (True, True)
             assert row.grasped_object == layout.target_object
             assert row.object_containers[row.grasped_object] == layout.target_container
-
-
-# What the policy receives
 
 
 @pytest.fixture
@@ -275,9 +269,6 @@ def test_joint_noise_is_a_function_of_the_episode(loaded, monkeypatch):
     np.testing.assert_array_equal(noisy[:1], alone)
 
 
-# The command and its records
-
-
 def test_the_command_records_each_checkpoint_once(run, tmp_path, capsys, monkeypatch):
     arguments = [run, "--tasks", "4,14", "--trials", 1, "--out", tmp_path, *BRIEFLY]
     run_command(*arguments)
@@ -365,9 +356,6 @@ def test_checkpoints_are_those_that_are_complete(run, tmp_path):
     (copy / "checkpoints" / "000001" / "pretrained_model" / "config.json").write_text("{}")
     with pytest.raises(ValueError, match="configuration of the policy in .* cannot be read"):
         find_checkpoints(copy)
-
-
-# Policies of other types
 
 
 def test_act_is_evaluated_with_other_names_of_cameras(act_checkpoint, tmp_path):

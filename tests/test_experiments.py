@@ -1,5 +1,7 @@
+import itertools
 import json
 import re
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -16,19 +18,14 @@ SMALL = ("training.steps=20", "training.save_freq=10")
 
 
 class FakeCommands:
-    """Leaves what the commands would leave.
+    """Leaves what the commands would leave. `failing` is the name of one that fails before its end."""
 
-    Args:
-        failing: Name of a command that fails before its end, and a word of its arguments.
-    """
-
-    def __init__(self, failing=()):
-        self.failing = failing
-        self.called = []
+    def __init__(self):
+        self.failing, self.called = None, []
 
     def __call__(self, arguments):
         self.called.append(arguments)
-        fails = arguments[0] in self.failing[:1] and " ".join(self.failing[1:]) in " ".join(arguments)
+        fails = arguments[0] == self.failing
         getattr(self, f"_{arguments[0]}")(arguments, fails)
         if fails:
             raise ExperimentError("failed")
@@ -50,14 +47,16 @@ class FakeCommands:
             options = json.loads(config.read_text())
         run = Path(options["output_dir"])
         for step in range(int(options["save_freq"]), int(options["steps"]) + 1, int(options["save_freq"])):
-            for name in (f"{step:06}", "last"):
-                checkpoint = run / "checkpoints" / name
-                (checkpoint / "training_state").mkdir(parents=True, exist_ok=True)
-                (checkpoint / "pretrained_model").mkdir(exist_ok=True)
-                (checkpoint / "pretrained_model" / "train_config.json").write_text(json.dumps(options))
-                (checkpoint / "pretrained_model" / "config.json").write_text(json.dumps(CONFIG))
-                (checkpoint / "pretrained_model" / "model.safetensors").touch()
-                (checkpoint / "training_state" / "training_step.json").write_text(json.dumps({"step": step}))
+            contents = {
+                "pretrained_model/train_config.json": options,
+                "pretrained_model/config.json": CONFIG,
+                "pretrained_model/model.safetensors": {},
+                "training_state/training_step.json": {"step": step},
+            }
+            for name, (file, content) in itertools.product((f"{step:06}", "last"), contents.items()):
+                path = run / "checkpoints" / name / file
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(json.dumps(content))
             if fails:
                 break
 
@@ -92,9 +91,6 @@ def _run(out, *names, settings=SMALL, **options):
     return run_experiments(names or ("scenario_a/deltaco",), out=out, settings=settings, **options)
 
 
-# Recipes
-
-
 def test_all_recipes_are_valid_and_make_commands(tmp_path):
     for name in experiment_names():
         recipe = read_recipe(name)
@@ -124,17 +120,11 @@ def test_layers_add_up():
     assert "upsampled_tasks" in read_recipe("scenario_b/deltaco").policy
     assert "upsampled_tasks" not in small.policy  # taken back by a null
     assert read_recipe("ambiguity_object/deltaco").evaluation.scene.ambiguity == "object"
-    own = read_recipe(
-        "random_objects/deltaco_match",
-        settings=["data.scene.objects=random:200", "policy.optimizer_lr=1e-4", "policy.demo_episodes=[1, 2]"],
-    )
+    settings = ["data.scene.objects=random:200", "policy.optimizer_lr=1e-4", "policy.demo_episodes=[1, 2]"]
+    own = read_recipe("random_objects/deltaco_match", settings=settings)
     assert (own.data.scene.objects, own.data.tasks) == ("random:200", "random_train")
-    assert own.policy == {
-        "type": "deltaco_match",
-        "device": "cpu",
-        "optimizer_lr": 1e-4,
-        "demo_episodes": [1, 2],
-    }
+    changed = {"optimizer_lr": 1e-4, "demo_episodes": [1, 2]}
+    assert own.policy == {"type": "deltaco_match", "device": "cpu", **changed}
 
 
 @pytest.mark.parametrize(
@@ -184,22 +174,16 @@ def test_a_wrong_file_is_refused(tmp_path, old, new, message):
         read_recipe("scenario_a/deltaco", path=path)
 
 
-def test_an_unreadable_file_is_refused(tmp_path):
+def test_unreadable_files_and_unknown_names_and_scales_are_refused(tmp_path):
     path = tmp_path / "recipes.yaml"
     path.write_bytes(b"families: \xff")
     for file in (path, tmp_path / "nothing.yaml"):
         with pytest.raises(ExperimentError, match="Cannot read"):
             read_recipe("scenario_a/deltaco", path=file)
-
-
-def test_unknown_names_and_scales_are_refused():
     with pytest.raises(ExperimentError, match="no experiment 'deltaco'. Valid are scenario_a/deltaco"):
         read_recipe("deltaco")
     with pytest.raises(ExperimentError, match="no scale 'paper'"):
         read_recipe("random_objects/deltaco_match", "paper")
-
-
-# Runs
 
 
 def test_steps_run_once(tmp_path, commands):
@@ -220,24 +204,21 @@ def test_an_interrupted_run_continues(tmp_path, commands):
     }
     for failing, names in expected.items():
         commands.called.clear()
-        commands.failing = (failing,)
-        if failing is None:
+        commands.failing = failing
+        with pytest.raises(ExperimentError) if failing else nullcontext():
             _run(tmp_path)
-        else:
-            with pytest.raises(ExperimentError):
-                _run(tmp_path)
         assert commands.names == names
 
 
 def test_training_resumes_from_its_last_checkpoint(tmp_path, commands):
     run = Run(read_recipe("scenario_a/deltaco", settings=SMALL), 0, tmp_path)
     run.folder.mkdir(parents=True)  # left by a training that stopped before its first checkpoint
-    commands.failing = ("train",)
+    commands.failing = "train"
     with pytest.raises(ExperimentError):
         _run(tmp_path)
     assert last_step(run.folder) == 10
     assert "--resume=true" in next(run.commands())
-    commands.failing = ()
+    commands.failing = None
     _run(tmp_path)
     assert last_step(run.folder) == 20
     assert run.unevaluated_steps() == []

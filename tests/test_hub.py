@@ -46,9 +46,6 @@ def hub():
         yield hub
 
 
-# The card
-
-
 def test_metadata_are_what_the_hub_searches(dataset):
     text = dataset_card(dataset)
     assert text.startswith("---\n")
@@ -112,9 +109,6 @@ def test_card_of_other_scenes_says_so(dataset, copy):
         assert text in card
         assert text not in usual
     assert "Test objects are visible" not in card
-
-
-# The Hub
 
 
 def test_pushed_dataset_is_fetched_by_its_name(hub, copy, tmp_path, monkeypatch, capsys):

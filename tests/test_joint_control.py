@@ -1,6 +1,7 @@
 """Joint control: the interface, times and speeds of a robot, in the scenes of the benchmark."""
 
 from contextlib import closing
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -34,9 +35,6 @@ def episodes():
         return {task_id: list(expert_episode(env, task_id, seed=task_id)) for task_id in range(4, 300, 60)}
 
 
-# Environment
-
-
 def test_scenes_are_those_of_position_control(env):
     with closing(PickPlaceEnv(4, SceneConfig(image_size=16))) as other:
         for seed in range(3):
@@ -48,20 +46,12 @@ def test_scenes_are_those_of_position_control(env):
 
 
 def test_a_step_lasts_a_thirtieth_of_a_second_and_keeps_the_limits_of_speed(env, monkeypatch):
-    rng, n_steps = np.random.default_rng(0), 0
-    simulation = env.scene._simulation
-    step = simulation.step
-
-    def counted():
-        nonlocal n_steps
-        n_steps += 1
-        step()
-
-    monkeypatch.setattr(simulation, "step", counted)
+    rng, counted = np.random.default_rng(0), mock.Mock(side_effect=env.scene._simulation.step)
+    monkeypatch.setattr(env.scene._simulation, "step", counted)
     states = [env._observation()["agent_pos"]]
     for n in range(1, 40):
         observation, *_ = env.step(env.action_space.low if n < 20 else rng.uniform(-9, 9, 7))
-        assert n_steps == 8 * n
+        assert counted.call_count == 8 * n
         assert observation in env.observation_space
         states.append(observation["agent_pos"])
     speeds = 30 * np.abs(np.diff(states, axis=0))
@@ -80,19 +70,14 @@ def test_joints_reach_their_targets(env):
         env.step(np.zeros(4))
 
 
-# Expert
-
-
 def test_expert_succeeds_at_its_own_speed_in_every_episode(episodes):
     lengths = [len(steps) for steps in episodes.values()]
     assert sum(steps[-1].info["is_success"] for steps in episodes.values()) >= len(episodes) - 1
     assert len(set(lengths)) > len(episodes) // 2
     assert 100 < np.median(lengths) < 200
     for steps in episodes.values():
-        actions, states = (
-            np.stack(values)
-            for values in ([s.action for s in steps], [s.observation["agent_pos"] for s in steps])
-        )
+        actions = np.stack([step.action for step in steps])
+        states = np.stack([step.observation["agent_pos"] for step in steps])
         assert 30 * np.abs(np.diff(states[:, :6], axis=0)).max() < 3
         assert 0.02 < 30 * np.abs(np.diff(actions[:, 6])).max() < 2.6
         # The object keeps the gripper open.
@@ -103,12 +88,8 @@ def test_expert_succeeds_at_its_own_speed_in_every_episode(episodes):
 def test_expert_repeats_to_the_last_bit(episodes, env):
     for step, expected in zip(expert_episode(env, 64, seed=64), episodes[64], strict=True):
         np.testing.assert_array_equal(step.action, expected.action)
-        np.testing.assert_array_equal(
-            step.observation["pixels"]["wrist"], expected.observation["pixels"]["wrist"]
-        )
-
-
-# LeRobot
+        images = [each.observation["pixels"]["wrist"] for each in (step, expected)]
+        np.testing.assert_array_equal(*images)
 
 
 def test_dataset_and_environment_have_the_names_of_a_robot(tmp_path):
@@ -117,9 +98,8 @@ def test_dataset_and_environment_have_the_names_of_a_robot(tmp_path):
     dataset = LeRobotDataset("user/joints", root=tmp_path)
     config = DeltacoEnv(task="4", scene=SCENE)
     assert config.fps == dataset.fps == 30
-    inputs = {
-        name: feature for name, feature in dataset.features.items() if name.startswith(("action", "obs"))
-    }
+    named = dataset.features.items()
+    inputs = {name: feature for name, feature in named if name.startswith(("action", "obs"))}
     assert {name: tuple(feature["shape"]) for name, feature in inputs.items()} == {
         "observation.images.front": (16, 16, 3),
         "observation.images.wrist": (16, 16, 3),

@@ -87,18 +87,13 @@ def test_the_expert_records_a_demonstration_of_any_task(tmp_path):
 def write_robot_dataset(root, task_ids, size=96):
     """Episodes of the expert in scenes of the benchmark, as a dataset of any robot."""
     env = PickPlaceEnv(0, SceneConfig(image_size=size))
+
+    def frame(step):
+        image, state = step.observation["pixels"], step.observation["agent_pos"]
+        return {"observation.image": image, "observation.state": state, "action": step.action}
+
     episodes = [
-        (
-            TASKS[task_id].instruction,
-            [
-                {
-                    "observation.image": step.observation["pixels"],
-                    "observation.state": step.observation["agent_pos"],
-                    "action": step.action,
-                }
-                for step in expert_episode(env, task_id, seed)
-            ],
-        )
+        (TASKS[task_id].instruction, [frame(step) for step in expert_episode(env, task_id, seed)])
         for seed, task_id in enumerate(task_ids)
     ]
     write_episodes(root, "test/robot", episodes, action=ACTION_NAMES)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from small_policies import TABLE_SIZE, draw_table, random_moves, state_at
 
+from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.calibration import StateToImage
 from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops, fit_perspective
 from lerobot_deltaco.deltaco_match.feature_matching import Candidates, FeatureMatching
@@ -183,9 +184,6 @@ def test_states_of_the_gripper_are_those_that_follow_its_commands():
     assert follows_gripper(states, gripper, [(0, 29), (30, 59)]).tolist() == [False, True, False, True]
 
 
-# Calibration and heights
-
-
 def stacked_images(images):
     return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
 
@@ -291,9 +289,6 @@ def test_height_of_a_demonstration_counts_as_far_as_it_can_be_trusted():
     assert change < 0.5 * (demonstrated - by_appearance)[~is_same].abs().mean()
 
 
-# Colors and maps
-
-
 def test_hue_augmentation_changes_a_fraction_of_the_samples_and_leaves_gray_gray():
     changes = random_color_changes(400, 0.7, torch.Generator().manual_seed(0))
     same = (changes == torch.eye(3)).all(dim=(1, 2))
@@ -313,8 +308,8 @@ def test_peak_of_a_map_is_its_location():
     locations = torch.rand(5, 2, 2, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
     maps = gaussian_maps(locations, 24, 32, 0.1)
     torch.testing.assert_close(peak_locations(20 * maps), locations, atol=0.03, rtol=0)
-    proposals, logits = torch.tensor([[[-0.5, 0.2], [0.6, -0.4]]]), torch.tensor([[0.2, 0.8]]).log()
-    candidates = Candidates(proposals, logits, torch.zeros(1, 2))
+    found, logits = torch.tensor([[[-0.5, 0.2], [0.6, -0.4]]]), torch.tensor([[0.2, 0.8]]).log()
+    candidates = Candidates(found, logits, torch.zeros(1, 2))
     maps = candidates.map((24, 30))
     assert maps.shape == (1, 24, 30)
     torch.testing.assert_close(peak_locations(maps[:, None])[0, 0], candidates.best[0][0], atol=0.05, rtol=0)
@@ -368,7 +363,10 @@ def matching(shapes):
     images, locations, tasks = (part[:24] for part in shapes)
     matching = FeatureMatching(vocabulary_of(SHAPE_TASKS), 0.25)
     sentences, heights = {task: [task] for task in tasks}, torch.zeros(24)
-    matching.fit(images, images, images, locations, heights, tasks, sentences, seed=0, steps=60)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proposals, "_SCENES_PER_STEP", 16)
+        patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
+        matching.fit(images, images, images, locations, heights, tasks, sentences, seed=0, steps=60)
     assert matching.fitted
     return matching
 
@@ -406,7 +404,7 @@ def test_fit_finds_shapes_of_one_color_by_demonstrations_and_by_words(matching, 
         assert fraction_found(matching, shapes, True, grasp=grasp) >= 0.9
 
 
-def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes):
+def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes, short_fit):
     images, locations, tasks = (part[:8] for part in shapes)
     state = torch.get_rng_state()
     fitted = []
@@ -414,7 +412,7 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes):
         matching = FeatureMatching(vocabulary_of(tasks), 0.25).train()
         torch.set_rng_state(state)
         sentences = {task: [task] for task in tasks}
-        matching.fit(images, images, images, locations, torch.zeros(8), tasks, sentences, seed, steps=2)
+        matching.fit(images, images, images, locations, torch.zeros(8), tasks, sentences, seed)
         assert torch.equal(torch.get_rng_state(), state)
         assert not any(weights.requires_grad for weights in matching.parameters())
         assert not any(module.training for module in matching.modules())
@@ -423,10 +421,11 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes):
     assert not torch.equal(fitted[0]["compare.hidden.weight"], fitted[2]["compare.hidden.weight"])
 
 
-def test_words_that_describe_the_container_do_not_count():
+def test_words_that_describe_the_container_do_not_count(monkeypatch):
     """The color of an object and that of its container vary independently."""
     tasks = [f"put the {color} cube in the {bin} bin" for color in ("red", "blue") for bin in ("red", "blue")]
     generator = torch.Generator().manual_seed(0)
+    monkeypatch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
     matching = FeatureMatching(vocabulary_of(tasks), 0.25)
     # Crops in which only the color can be seen, of two proposals.
     n_scenes = 64

@@ -22,6 +22,7 @@ from small_policies import (
     write_table,
 )
 
+from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.demonstrations import DemonstrationBank
 from lerobot_deltaco.normalization import StateLimits
@@ -59,14 +60,13 @@ def found_in(policy, scenes, instructions, demonstrations):
     return policy.found
 
 
-# Training
-
-
 @pytest.fixture(scope="module")
 def trained(table):
     """A policy that has learned, on 36 of the 48 episodes, to find the locations."""
     with pytest.MonkeyPatch.context() as patch:
         use_short_fit(patch, 60)
+        patch.setattr(proposals, "_SCENES_PER_STEP", 16)
+        patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
         patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._LOCATED_FRACTION", 1.0)
         patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._SHIFT_PADDING", 1)
         policy, before, _ = small_policy(table, "deltaco_match")
@@ -174,9 +174,6 @@ def test_validation_loss_of_held_back_episodes_finds_their_locations(make, table
     assert {"action_nll", "gripper_accuracy"} <= set(logged)
 
 
-# Feature matching
-
-
 def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
     policy = make()
     policy.save_pretrained(tmp_path)
@@ -196,9 +193,6 @@ def test_feature_matching_takes_images_of_any_size(table):
         found = found_in(policy.eval(), batch_of(table, [0, 0]), [RED, ""], [[0], [2]])
         assert found.locations.isfinite().all()
         assert found.locations.abs().max() <= 1
-
-
-# Acting
 
 
 def test_actions_that_cannot_be_carried_out_are_errors(make, table):
@@ -267,9 +261,6 @@ def test_height_bias_is_added_when_acting(make, table):
     policies = [make(grasp_height_bias=bias).eval() for bias in (0.0, 0.5)]
     heights = [found_in(policy, batch_of(table, [0]), [RED], [[0]]).heights for policy in policies]
     torch.testing.assert_close(heights[1], heights[0] + 0.5)
-
-
-# Errors
 
 
 def test_demonstrations_of_another_robot_and_a_missing_gripper_are_errors(table, dataset, tmp_path):

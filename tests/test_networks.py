@@ -11,12 +11,7 @@ from lerobot_deltaco.deltaco.demo_encoders import (
     frame_grid,
     shift_demonstrations,
 )
-from lerobot_deltaco.losses import (
-    imitation_loss,
-    join_action,
-    location_loss,
-    split_action,
-)
+from lerobot_deltaco.losses import imitation_loss, join_action, location_loss, split_action
 from lerobot_deltaco.networks import (
     BACKBONES,
     INITIAL_LOG_STD,
@@ -36,9 +31,6 @@ from lerobot_deltaco.networks import (
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)
-
-
-# Actions
 
 
 @pytest.mark.parametrize("gripper_index", [None, 1])
@@ -67,15 +59,12 @@ def test_mode_is_the_mean_of_the_likeliest_component():
     assert ActionDistribution(means, logits).mode.tolist() == [[[2.0]], [[3.0]]]
 
 
-@pytest.mark.parametrize("gripper_index", [None, 0, 1, 3])
-def test_join_action_reverts_split_action(gripper_index):
+def test_join_action_reverts_split_action():
     action = torch.rand(5, 4) * 2 - 1
-    rest, gripper = split_action(action, gripper_index)
-    assert rest.shape == (5, 4 - (gripper_index is not None))
-    torch.testing.assert_close(join_action(rest, gripper, gripper_index), action)
-
-
-# The policy network
+    for gripper_index in (None, 0, 1, 3):
+        rest, gripper = split_action(action, gripper_index)
+        assert rest.shape == (5, 4 - (gripper_index is not None))
+        torch.testing.assert_close(join_action(rest, gripper, gripper_index), action)
 
 
 def test_paper_networks_have_the_sizes_of_the_paper():
@@ -161,17 +150,11 @@ def test_initial_weights_of_the_authors():
     assert encoder.layers[-1].weight.grad.abs().max() > 0
 
 
-# Demonstration encoders
-
-
 @pytest.mark.parametrize(("height", "width", "rows", "stride"), [(25, 25, 1, 1), (26, 19, 2, 2)])
 def test_demonstrations_of_any_size_become_unit_vectors(height, width, rows, stride):
     frames = torch.rand(2, rows * 2, 3, height, width)
     for encoder in (FrameGridEncoder(height, width, rows, 2, 12, stride), AttentionEncoder(rows * 2, 12)):
         torch.testing.assert_close(encoder(frames).norm(dim=-1), torch.ones(2))
-
-
-# Images and maps
 
 
 def test_random_shifts_move_images_right_and_down_and_leave_black_edges():

@@ -11,7 +11,7 @@ from matplotlib.colors import rgb_to_hsv
 
 from gym_deltaco import objects
 from gym_deltaco.object_sets import MAX_OBJECTS, OBJECT_SETS, find_label, find_model, select_objects
-from gym_deltaco.objects import ObjectModel, object_model
+from gym_deltaco.objects import object_model
 from gym_deltaco.random_objects import FIRST_INDEX, random_label
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.simulation import _obj_text
@@ -41,7 +41,7 @@ MODELS = [*range(len(OBJECTS)), *SOME_RANDOM]
 
 
 @pytest.fixture(params=MODELS, ids=[find_label(index).name for index in MODELS])
-def model(request: pytest.FixtureRequest) -> ObjectModel:
+def model(request):
     return find_model(request.param)
 
 
@@ -65,12 +65,11 @@ def test_mesh_is_closed_and_faces_outward(model):
     np.testing.assert_array_equal(forth, back)
     np.testing.assert_array_equal(forth_count, back_count)
 
-    corners = mesh.triangles
-    doubled_areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert np.linalg.norm(doubled_areas, axis=1).min() > 1e-8
-    assert np.einsum("fi,fi->", corners[:, 0], doubled_areas) / 6 > 1e-6  # volume, m³
+    faces = doubled_areas(mesh)
+    assert np.linalg.norm(faces, axis=1).min() > 1e-8
+    assert np.einsum("fi,fi->", mesh.triangles[:, 0], faces) / 6 > 1e-6  # volume, m³
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-9)
-    assert np.einsum("fi,fci->fc", doubled_areas, mesh.normals[mesh.faces]).min() > 0
+    assert np.einsum("fi,fci->fc", faces, mesh.normals[mesh.faces]).min() > 0
     assert 12 <= len(mesh.faces) <= 260, "light enough to render"
     assert mesh.colors.shape == mesh.faces.shape
     assert 0 <= mesh.colors.min() <= mesh.colors.max() <= 1
@@ -82,16 +81,16 @@ def test_colors_have_16_levels_and_fit_into_one_palette():
     np.testing.assert_allclose(15 * colors, (15 * colors).round(), atol=1e-9)
 
 
-def _visible_areas(model: ObjectModel) -> np.ndarray:
-    """Returns areas of the faces as seen from the front and 40 degrees above, without occlusion, (F,)."""
-    corners = model.mesh.triangles
-    doubled_areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    towards_camera = np.array([0.0, np.cos(np.radians(40)), np.sin(np.radians(40))])
-    return np.maximum(doubled_areas @ towards_camera, 0.0) / 2.0
+def doubled_areas(mesh) -> np.ndarray:
+    """Returns normals of the faces, as long as their doubled areas, (F, 3)."""
+    corners = mesh.triangles
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def test_object_shows_the_color_of_its_label(model):
-    areas, colors = _visible_areas(model), model.mesh.colors
+    # As seen from the front and 40 degrees above, without occlusion.
+    towards_camera = np.array([0.0, np.cos(np.radians(40)), np.sin(np.radians(40))])
+    areas, colors = np.maximum(doubled_areas(model.mesh) @ towards_camera, 0), model.mesh.colors
     if model.label.color == "black and white":
         brightness = colors.mean(axis=1)
         assert areas[brightness < 0.2].sum() > 0.15 * areas.sum()
@@ -124,22 +123,17 @@ def test_origin_and_size(model):
     assert np.ptp(base, axis=0).min() >= 0.0239 or model.height < 0.03
 
 
-def _turned(points: np.ndarray, yaw: float) -> np.ndarray:
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    return points @ np.array([(cosine, sine, 0), (-sine, cosine, 0), (0, 0, 1)])
-
-
 def test_fits_between_the_open_fingers(model):
     corners = model.mesh.triangles
     fractions = np.linspace(0, 1, 25)[:, None, None, None]
     edges = np.roll(corners, -1, axis=1) - corners
     outline = (corners + fractions * edges).reshape(-1, 3)  # points along all edges
 
-    def width(yaw: float) -> float:
-        turned = _turned(outline, yaw)
-        return float(np.ptp(turned[np.abs(turned[:, 1]) <= PAD_REACH, 0]))
-
-    assert max(map(width, np.linspace(*model.yaw_range, 9))) <= GRIPPER_OPENING - 2 * GRASP_ERROR
+    for yaw in np.linspace(*model.yaw_range, 9):
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        turned = outline @ np.array([(cosine, sine, 0), (-sine, cosine, 0), (0, 0, 1)])
+        width = np.ptp(turned[np.abs(turned[:, 1]) <= PAD_REACH, 0])
+        assert width <= GRIPPER_OPENING - 2 * GRASP_ERROR
 
 
 def _slice_extent(part: np.ndarray, height: float) -> tuple[float, float]:
@@ -156,7 +150,7 @@ def _slice_extent(part: np.ndarray, height: float) -> tuple[float, float]:
 
 
 def test_pads_hold_vertical_sides(model):
-    """On both sides, a vertical band within reach of the pads touches the fingers first."""
+    # On both sides, a vertical band within reach of the pads touches the fingers first.
     assert model.grasp_height >= 0.01
     assert model.height - model.grasp_height <= 0.037  # clear of the palm
     lowest = model.grasp_height - 0.006  # half a pad
@@ -168,17 +162,11 @@ def test_pads_hold_vertical_sides(model):
     assert (extents[..., 1].max(axis=1) - extents[..., 0].min(axis=1)).max() <= 0.0475
 
 
-def _directions(count: int = 600) -> np.ndarray:
-    """Returns unit vectors spread over the sphere, (count, 3), with the coordinate axes among them."""
-    rng = np.random.default_rng(0)
-    vectors = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(count - 6, 3))])
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
 def test_collision_parts_approximate_the_mesh(model):
     assert 1 <= len(model.parts) <= 4
     assert all(4 <= len(part) <= 24 for part in model.parts)
-    directions = _directions()
+    directions = np.concatenate([np.eye(3), -np.eye(3), np.random.default_rng(0).normal(size=(594, 3))])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     reach_of_mesh = (model.mesh.vertices @ directions.T).max(axis=0)
     reach_of_parts = np.array([(part @ directions.T).max(axis=0) for part in model.parts])
     np.testing.assert_allclose(reach_of_parts.max(axis=0), reach_of_mesh, atol=COLLISION_TOLERANCE)
@@ -188,7 +176,7 @@ def test_collision_parts_approximate_the_mesh(model):
 
 
 @pytest.fixture(scope="module")
-def tilts(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+def tilts(tmp_path_factory):
     """Returns the tilts of objects after a fall of 5 cm, degrees, (objects, yaws)."""
     client = pybullet.connect(pybullet.DIRECT)
     pybullet.setGravity(0, 0, -10, physicsClientId=client)
@@ -215,9 +203,6 @@ def test_stands_after_a_drop(model, tilts):
     assert tilts[MODELS.index(model.label.index)].max() < 5
 
 
-# Random objects
-
-
 def test_random_objects_run_through_all_pairs_but_those_of_test_objects():
     labels = [random_label(index) for index in range(FIRST_INDEX, FIRST_INDEX + 144)]
     first, second = ([(label.color, label.shape) for label in part] for part in (labels[:72], labels[72:]))
@@ -226,9 +211,7 @@ def test_random_objects_run_through_all_pairs_but_those_of_test_objects():
     test_objects = [label for label in OBJECTS if label.index in SCENARIOS["a"].test_rows]
     assert len(test_objects) == 8
     assert not {(label.color, label.shape) for label in test_objects} & set(first)
-
-
-def test_random_objects_of_the_same_color_and_shape_differ():
+    # Those of the same color and shape differ.
     pairs = [(random_label(index).color, random_label(index).shape) for index in range(FIRST_INDEX, 400)]
     red_cups = [FIRST_INDEX + number for number, pair in enumerate(pairs) if pair == ("red", "cup")]
     meshes = {find_model(index).mesh.vertices.tobytes() for index in red_cups}

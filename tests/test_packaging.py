@@ -33,9 +33,6 @@ def imported_modules(path):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-# Imports
-
-
 @pytest.mark.parametrize(
     ("files", "forbidden"),
     [
@@ -101,9 +98,6 @@ def test_without_pybullet_the_environment_says_what_to_install():
     result = run_python(WITHOUT_SIMULATOR)
     assert result.returncode == 0, result.stderr
     assert '`pip install "lerobot_policy_deltaco[sim]"`' in result.stdout
-
-
-# The wheel
 
 
 @pytest.fixture(scope="module")

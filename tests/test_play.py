@@ -1,5 +1,6 @@
 """The verdict of `deltaco play`, and what is behind its page, which `test_play_browser.py` tests."""
 
+import importlib
 import re
 from types import SimpleNamespace
 from urllib.parse import parse_qsl
@@ -13,16 +14,6 @@ from gym_deltaco.phrases import paraphrase
 from gym_deltaco.tasks import COLOR_SHAPE_TASKS, OBJECTS, TASKS, get_task
 from gym_deltaco.workspace import Quadrant
 from lerobot_deltaco.verdict import judge, parse_instruction
-
-pytest.importorskip("gradio", reason="the extra `play` is not installed")
-from lerobot_deltaco.play import (
-    BOTH,
-    DEMONSTRATION,
-    INSTRUCTION,
-    Choice,
-    Player,
-    suggest_sentences,
-)
 
 # The parser
 
@@ -167,12 +158,15 @@ def test_the_verdict_says_what_was_moved_and_what_was_asked_for():
     assert outcome("bathtub", None).moved == "It grasped the gray bathtub, but put it into no bin."
 
 
-# The page
+@pytest.fixture(scope="module")
+def play():
+    pytest.importorskip("gradio", reason="the extra `play` is not installed")  # which takes 3 s to import
+    return importlib.import_module("lerobot_deltaco.play")
 
 
 @pytest.fixture(scope="module")
-def player(tmp_path_factory):
-    return Player(save_tiny_policy(tmp_path_factory.mktemp("play") / "policy"))
+def player(play, tmp_path_factory):
+    return play.Player(save_tiny_policy(tmp_path_factory.mktemp("play") / "policy"))
 
 
 def test_a_run_has_a_video_a_picture_and_a_verdict(player):
@@ -195,12 +189,12 @@ def test_every_task_has_a_demonstration(player):
         assert (player.demonstration(choice._replace(recorded=5)).frames != shown.frames).any()
 
 
-def test_either_input_can_be_left_out_if_the_policy_has_learned_it(player):
-    assert player.uses == (BOTH, DEMONSTRATION, INSTRUCTION)
+def test_either_input_can_be_left_out_if_the_policy_has_learned_it(play, player):
+    assert player.uses == (play.BOTH, play.DEMONSTRATION, play.INSTRUCTION)
     choice = player.default_choice(26, 3)._replace(sentence="Put it in the red bin.")
-    alone = player.run(choice._replace(use=DEMONSTRATION)).verdict.asked
+    alone = player.run(choice._replace(use=play.DEMONSTRATION)).verdict.asked
     assert alone == "The demonstration shows the blue t cup in the green bin."
-    assert "demonstration" not in player.run(choice._replace(use=INSTRUCTION)).verdict.asked
+    assert "demonstration" not in player.run(choice._replace(use=play.INSTRUCTION)).verdict.asked
     with pytest.raises(ValueError, match="Type an instruction first"):
         player.run(choice._replace(sentence=" "))
 
@@ -220,17 +214,17 @@ def test_the_comparison_crosses_two_demonstrations_with_two_sentences(player):
     assert {(choice.demonstrated, choice.recorded) for choice in again[:2]} == {(other.index, 3)}
 
 
-def test_the_address_holds_the_choice(player):
-    choice = Choice(26, 7, 4, 12, "Put it & wave.", INSTRUCTION)
+def test_the_address_holds_the_choice(play, player):
+    choice = play.Choice(26, 7, 4, 12, "Put it & wave.", play.INSTRUCTION)
     assert player.parse_choice(dict(parse_qsl(choice.query.removeprefix("?")))) == choice
     for query in ({}, {"task_id": "x", "seed": "-1", "demonstrated": "999", "recorded": "?", "use": "all"}):
         assert player.parse_choice(query).demonstrated < len(TASKS)
 
 
-def test_the_suggested_sentences_can_be_judged_in_their_scene(player):
+def test_the_suggested_sentences_can_be_judged_in_their_scene(play, player):
     for task_id in range(0, 300, 17):
         choice = player.default_choice(task_id, task_id)
         _, layout = player.show_scene(choice)
-        for sentence in suggest_sentences(choice, layout):
+        for sentence in play.suggest_sentences(choice, layout):
             verdict = judge(layout, frozenset(), -1, sentence, get_task(task_id).instruction)
             assert verdict.headline == "Not done", sentence

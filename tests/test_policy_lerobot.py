@@ -23,9 +23,6 @@ SHIPPED = Path(__file__).parents[1] / "checkpoints" / "pick_place"
 pytestmark = pytest.mark.usefixtures("fake_language", "short_fit")
 
 
-# Construction
-
-
 def test_features_of_the_dataset_become_inputs_and_outputs(make, dataset):
     config = make()[0].config
     assert {name: feature.shape for name, feature in config.image_features.items()} == {
@@ -39,9 +36,6 @@ def test_features_of_the_dataset_become_inputs_and_outputs(make, dataset):
     policy, before, _ = make(input_features=wrist)
     assert list(policy.config.input_features) == ["observation.images.wrist"]
     assert torch.isfinite(policy(before(batch_of(dataset, [0, 7])))[0])
-
-
-# Processors
 
 
 def test_processors_normalize_and_revert_it(make, dataset):
@@ -121,9 +115,6 @@ def test_rollouts_move_a_robot_by_the_demonstration_of_a_new_task(
     for action in FakeArm.sent:
         assert set(action) == set(MOTORS)
         assert 0 <= action["gripper.pos"] <= 40
-
-
-# The checkpoint of this project
 
 
 @pytest.fixture(scope="module")

@@ -76,9 +76,6 @@ def test_command_line_of_lerobot_logs_what_is_wrong(monkeypatch, caplog):
     assert "`crop_size` must be from 0.01" in caplog.text
 
 
-# What the dataset says
-
-
 def features_config(action=(3,), **options):
     return DeltacoConfig(
         device="cpu",
@@ -131,9 +128,6 @@ def test_actions_of_the_benchmark_are_not_scaled():
 def test_features_that_do_not_fit_are_errors(config, message):
     with pytest.raises(ValueError, match=message):
         config.validate_features()
-
-
-# Optimization
 
 
 def test_cosine_schedule_warms_up_and_ends_at_zero():

@@ -201,9 +201,6 @@ def test_checkpoint_acts_the_same_to_the_bit(make, tmp_path):
     assert loaded.config == PreTrainedConfig.from_pretrained(tmp_path) == made.config
 
 
-# The loss, in numbers
-
-
 def weights_of(policy, prefix):
     return {
         name.removeprefix(prefix): value.numpy().astype(np.float64)

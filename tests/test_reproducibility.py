@@ -103,9 +103,6 @@ def test_scenes_of_the_protocol_are_those_on_its_page():
             assert hashlib.sha256(observation["pixels"].tobytes()).hexdigest().startswith(image)
 
 
-# Episodes
-
-
 def absorb(digest, *values):
     """Adds numbers, arrays and dictionaries of them to a hash, to the last bit."""
     for value in values:
@@ -138,15 +135,12 @@ def actions_digest(env, seed, actions):
 
 def fresh_digest(ambiguity, task_id, seed):
     """Returns a hash of an expert episode in a new environment."""
-    env = PickPlaceEnv(scene=SceneConfig(ambiguity=ambiguity))
-    *_, digest = expert_digests(env, task_id, seed)
-    env.close()
+    with closing(PickPlaceEnv(scene=SceneConfig(ambiguity=ambiguity))) as env:
+        *_, digest = expert_digests(env, task_id, seed)
     return digest
 
 
-EPISODES = [
-    (ambiguity, task_id, seed) for ambiguity in AMBIGUITIES for seed, task_id in enumerate((4, 82, 146, 295))
-]
+EPISODES = [(own, task_id, seed) for own in AMBIGUITIES for seed, task_id in enumerate((4, 82, 146, 295))]
 
 
 @pytest.fixture(scope="module")
@@ -203,9 +197,8 @@ def test_rendering_and_global_random_state_change_nothing():
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_workers_of_vector_environments_agree_with_one_process(context):
     # With the module before the id, spawned workers register the environment.
-    make_env = functools.partial(
-        gym.make, f"gym_deltaco:{ENV_ID}", task_id=4, scene=SceneConfig(image_size=8)
-    )
+    options = {"task_id": 4, "scene": SceneConfig(image_size=8)}
+    make_env = functools.partial(gym.make, f"gym_deltaco:{ENV_ID}", **options)
     actions = np.random.default_rng(0).uniform(-1, 1, (3, 2, 4)).astype(np.float32)
     results = []
     for envs in (

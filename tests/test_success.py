@@ -20,10 +20,8 @@ SOME_TASKS = (4, 82, 146, 295)
 @pytest.fixture(scope="module")
 def small_envs():
     """An environment with small images for each ambiguity scheme, to be reset by the test."""
-    envs = {
-        ambiguity: PickPlaceEnv(scene=SceneConfig(ambiguity=ambiguity, image_size=8))
-        for ambiguity in AMBIGUITIES
-    }
+    scenes = [SceneConfig(ambiguity=ambiguity, image_size=8) for ambiguity in AMBIGUITIES]
+    envs = {scene.ambiguity: PickPlaceEnv(scene=scene) for scene in scenes}
     yield envs
     for env in envs.values():
         env.close()
@@ -34,10 +32,8 @@ def put(env, number, container, offset=(0.0, 0.0), height=0.002):
     half_height = env.scene.layout.objects[number].model.half_extents[2]
     center = env.scene.layout.containers[container].quadrant.container_center
     position = (*(center + offset), TRAY_FLOOR + 0.003 + half_height + height)
-    client = env.scene._simulation._client
-    pybullet.resetBasePositionAndOrientation(
-        env.scene.bodies[number], position, (0, 0, 0, 1), physicsClientId=client
-    )
+    body, client = env.scene.bodies[number], env.scene._simulation._client
+    pybullet.resetBasePositionAndOrientation(body, position, (0, 0, 0, 1), physicsClientId=client)
     env.scene._settle()
     return env.step(STAY_OPEN)[-1]
 

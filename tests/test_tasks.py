@@ -35,8 +35,8 @@ def test_tasks_have_the_instructions_of_their_rows_and_columns():
         assert task.container == CONTAINERS[column]
         assert task.is_position_task == (column >= 2)
         assert task.kind == ("name" if row < 32 else "color" if row < 40 else "shape")
-    assert TASKS[4].instruction == (
-        "Put black and white colored, chalice shaped smushed dumbbell in green bin."
+    assert (
+        TASKS[4].instruction == "Put black and white colored, chalice shaped smushed dumbbell in green bin."
     )
     assert TASKS[295].instruction == "Put cup shaped object in right bin."
 
@@ -64,9 +64,6 @@ def test_tasks_by_color_and_shape():
     assert tuple(task.index for task in tasks[:198]) == SCENARIOS["a"].train_tasks
     assert len({task.instruction for task in tasks}) == len(tasks) == 198 + 6 * 72
     assert not {target for task in tasks[198:] for target in task.targets} & set(range(24, 32))
-
-
-# Splits
 
 
 def test_scenarios_split_the_rows_as_published():
@@ -110,9 +107,6 @@ def test_clean_scenario_has_no_test_object_as_a_target_in_training():
     assert TASK_SETS["scenario_a_clean_test"] == SCENARIOS["a"].test_tasks
 
 
-# Selections
-
-
 def test_selection_keeps_its_order_and_names_each_task_once():
     expected = {
         "4": [4],
@@ -128,22 +122,18 @@ def test_selection_keeps_its_order_and_names_each_task_once():
     assert {selection: list(select_tasks(selection)) for selection in expected} == expected
 
 
-@pytest.mark.parametrize(
-    ("selections", "message"),
-    [
-        (["", " ", " , ,"], r"selection '.*' is empty\. Valid are the task sets all, scenario_a_train"),
-        (
-            ["4,scenario_c_test", "A", "4-", "-4", "4.0", "4-5-6"],
-            r"Unknown task selection '.*'\. Valid are the task sets all, .* from 0 to 299",
-        ),
-        (["4,73-50"], "'73-50' is empty"),
-        (["300", "0-300", "2000-2001", "290-1000"], r"integer from 0 to 299, .* Got (300|2000)\."),
-    ],
-)
-def test_invalid_selection_is_an_error_that_says_what_is_valid(selections, message):
-    for selection in selections:
-        with pytest.raises(ValueError, match=message):
-            select_tasks(selection)
+def test_invalid_selection_is_an_error_that_says_what_is_valid():
+    for message, selections in {
+        r"selection '.*' is empty\. Valid are the task sets all, scenario_a_train": ["", " ", " , ,"],
+        r"Unknown task selection '.*'\. Valid are the task sets all, .* from 0 to 299": [
+            *("4,scenario_c_test", "A", "4-", "-4", "4.0", "4-5-6")
+        ],
+        "'73-50' is empty": ["4,73-50"],
+        r"integer from 0 to 299, .* Got (300|2000)\.": ["300", "0-300", "2000-2001", "290-1000"],
+    }.items():
+        for selection in selections:
+            with pytest.raises(ValueError, match=message):
+                select_tasks(selection)
 
 
 def test_task_id_must_be_an_integer_in_range():
@@ -171,7 +161,5 @@ def test_seeds_are_distinct_and_valid_for_reset():
     assert len(set(seeds)) == len(arguments)
     assert all(type(seed) is int and 0 <= seed < 2**63 for seed in seeds)
     assert episode_seed(3, "train", 5, 7) == episode_seed(3, "train", 5, 7, attempt=0)
-
-
-def test_seeds_never_change():
+    # They never change.
     assert {arguments: episode_seed(*arguments) for arguments in PINNED_SEEDS} == PINNED_SEEDS

@@ -72,9 +72,6 @@ def assert_same(one, other):
     assert [name for name in one if not torch.equal(one[name], other[name])] == []
 
 
-# The same as LeRobot's own loop
-
-
 @pytest.mark.parametrize("policy", POLICIES)
 def test_training_equals_that_of_lerobot_train(train, policy):
     # The same seed gives the same weights, samples, and demonstrations; batches of tasks are ours alone.
@@ -161,9 +158,6 @@ def test_two_processes_train_alike_from_the_disk_and_from_memory(benchmark, tmp_
     assert any(not torch.equal(alone[name], tensor) for name, tensor in memory.items())
 
 
-# What is trained on
-
-
 @pytest.mark.parametrize("policy", ["deltaco", "act"])
 def test_episodes_and_the_split_are_respected(train, seen, monkeypatch, policy):
     banks = []
@@ -174,7 +168,7 @@ def test_episodes_and_the_split_are_respected(train, seen, monkeypatch, policy):
 
     monkeypatch.setattr(DeltacoPolicy, "set_training_data", noted)
     split = {"dataset.episodes": "[1,2,3,7,8,9]", "dataset.eval_split": 0.5, "eval_steps": 2}
-    train({**POLICIES[policy], **split}, batch_size=30)
+    train({**POLICIES[policy], **split}, batch_size=30, steps=2)
     trained, held_back = (
         {index for training, batch in seen if training == wanted for index in batch["episode_index"].tolist()}
         for wanted in (True, False)
@@ -237,9 +231,6 @@ def test_frames_after_the_release_are_as_many_seconds_at_any_rate():
     assert last[1] - last[0] == 12
 
 
-# Checkpoints and logs
-
-
 def test_a_checkpoint_names_its_policy_and_no_folder_of_the_demonstrations(train, benchmark, capfd):
     demos = {"policy.demo_repo_id": "test/small", "policy.demo_root": benchmark}
     checkpoints = train({**DELTACO, **demos}, steps=1, save_freq=1, job_name="small")
@@ -275,9 +266,6 @@ def test_a_loss_that_is_not_finite_ends_the_training(train, tmp_path, monkeypatc
     assert cause in str(error.value)
     assert "--resume=true" in str(error.value)
     assert [path.parent.parent.name for path in tmp_path.rglob("model.safetensors")] == ["000002"]
-
-
-# Errors
 
 
 MISTAKES = {
