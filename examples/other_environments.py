@@ -37,6 +37,8 @@ def make_so101(**options: Any) -> gym.Env:
 
         def __init__(self, **options: Any) -> None:
             super().__init__(**options)
+            pixels = gym.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+            self.observation_space["pixels"]["front"] = pixels
             # Without a GPU, these take nine tenths of the time of a picture.
             self.model.light_castshadow[:] = 0
             self.model.vis.quality.offsamples = 0
