@@ -202,8 +202,7 @@ def test_only_the_chosen_episodes_are_needed(root, tmp_path, banks, in_memory):
     assert banks[0].episodes.tolist() == [0, 2, 3]
 
 
-def test_held_out_episodes_are_not_demonstrations(root, tmp_path, monkeypatch):
-    banks = banks_of(monkeypatch)
+def test_held_out_episodes_are_not_demonstrations(root, tmp_path, banks):
     options = {**DELTACO, "dataset.eval_split": 0.5, "policy.demo_encoder": "attention"}
     run_training(root, tmp_path / "run", options, in_memory=False, steps=1, save_freq=1)
     tasks = [names[0] for names in open_dataset("", "test/small", root).meta.episodes["tasks"]]

@@ -123,6 +123,21 @@ def test_episode_without_a_grasp_teaches_nothing(make, table):
     assert not any(gradient.any() for gradient in gradients)
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.2])
+def test_the_policy_network_learns_from_locations_with_the_noise_that_is_set(make, table, noise, monkeypatch):
+    policy, given = make(location_noise=noise), []
+    acting_loss = policy._acting_loss
+
+    def seen(batch, images, locations, *args):
+        given.append(locations)
+        return acting_loss(batch, images, locations, *args)
+
+    monkeypatch.setattr(policy, "_acting_loss", seen)
+    policy(batch_of(table, first_frames(range(N_EPISODES))))
+    spread = (given[0] - policy.training_locations.locations).std().item()
+    assert spread == pytest.approx(noise, rel=0.3)
+
+
 def test_samples_outside_of_the_demonstrations_teach_nothing(make, table):
     policy = make()
     bank = policy.training_bank
