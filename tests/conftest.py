@@ -18,6 +18,22 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 @pytest.fixture
+def spy(monkeypatch):
+    """`spy(owner, name, note)` lets `note` have the arguments of a function, too, before its calls."""
+
+    def spy(owner, name, note):
+        function = getattr(owner, name)
+
+        def noted(*arguments, **options):
+            note(*arguments, **options)
+            return function(*arguments, **options)
+
+        monkeypatch.setattr(owner, name, noted)
+
+    return spy
+
+
+@pytest.fixture
 def fake_language(monkeypatch):
     """Replaces all sentence encoders by a fake one."""
     from small_policies import use_fake_encoder

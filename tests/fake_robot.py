@@ -1,7 +1,4 @@
-"""A robot without hardware, for LeRobot's commands.
-
-LeRobot finds the class of a robot beside its configuration, by the name without "Config".
-"""
+"""A robot without hardware, for LeRobot's commands, which find its class by the name of its configuration."""
 
 from dataclasses import dataclass
 
@@ -20,15 +17,11 @@ class FakeArmConfig(RobotConfig):
 
 
 class FakeArm(Robot):
-    """An arm that is at once where it is sent, and whose camera's image is as bright as its shoulder is high.
-
-    Attributes:
-        sent: Actions that all such robots got.
-    """
+    """An arm that is at once where it is sent; its camera's image is as bright as its shoulder is high."""
 
     config_class = FakeArmConfig
     name = "fake_arm"
-    sent = []
+    sent = []  # what all such robots got
     is_connected = False
     is_calibrated = True
 

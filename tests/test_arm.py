@@ -212,14 +212,12 @@ def test_fingers_stay_symmetric_and_within_their_stops(env):
     assert 0.006 < min(gaps) <= max(gaps) < 0.074, "an object is held"
 
 
-def test_physics_is_as_specified(env, monkeypatch):
+def test_physics_is_as_specified(env, spy):
     parameters = pybullet.getPhysicsEngineParameters(physicsClientId=env.scene._simulation._client)
     assert parameters["fixedTimeStep"] == 1 / 240
     assert [parameters[f"gravityAcceleration{axis}"] for axis in "XYZ"] == [0, 0, -10]
-    times = []
-    advance = Simulation.step
-    monkeypatch.setattr(Simulation, "step", lambda simulation: (times.append(1), advance(simulation)))
-    counts = []
+    times, counts = [], []
+    spy(Simulation, "step", times.append)
     for gripper in (OPEN, OPEN, CLOSED, CLOSED, OPEN, OPEN):
         times.clear()
         env.step(np.array([0.1, 0, 0, gripper]))

@@ -5,6 +5,7 @@ import json
 import shutil
 
 import pytest
+import small_policies as small
 import torch
 from fake_hub import USER, FakeHub
 from huggingface_hub import ModelCard
@@ -14,17 +15,6 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from small_policies import (
-    REPO_ID,
-    TASKS,
-    batch_of,
-    demos_of,
-    fake_encoder,
-    observation,
-    small_policy,
-    use_fake_encoder,
-    write_dataset,
-)
 
 from lerobot_deltaco.base_config import SOURCES
 from lerobot_deltaco.base_policy import TrainingDivergedError
@@ -42,20 +32,20 @@ WEIGHTS = {"config.json", "model.safetensors", TASK_BANK}
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """A checkpoint with two demonstrations, and the action of its policy for an observation."""
+    """A checkpoint with two demonstrations, and the action of its policy for an small.observation."""
     with pytest.MonkeyPatch.context() as patch:
-        use_fake_encoder(patch)
+        small.use_fake_encoder(patch)
         folder = tmp_path_factory.mktemp("checkpoint")
-        dataset = write_dataset(folder / "data", TASKS[:N_DEMONSTRATIONS])
-        policy, before, after = small_policy(dataset, **demos_of(dataset))
-        policy(before(batch_of(dataset, [0, 5])))
+        dataset = small.write_dataset(folder / "data", small.TASKS[:N_DEMONSTRATIONS])
+        policy, before, after = small.small_policy(dataset, **small.demos_of(dataset))
+        policy(before(small.batch_of(dataset, [0, 5])))
         policy.demonstrations.pick_states = torch.tensor([[0.0, 1.0], [torch.nan] * 2])
         policy.save_pretrained(folder / "policy")
         assert {path.name for path in (folder / "policy").iterdir()} == WEIGHTS
         assert policy.config.demo_root not in (folder / "policy" / "config.json").read_text()
         for processor in (before, after):
             processor.save_pretrained(folder / "policy")
-        seen = before(observation(dataset, TASKS[:N_DEMONSTRATIONS]))
+        seen = before(small.observation(dataset, small.TASKS[:N_DEMONSTRATIONS]))
         return folder / "policy", seen, policy.eval().select_action(seen)
 
 
@@ -80,12 +70,12 @@ def test_checkpoint_is_complete_and_names_no_sources(saved):
     assert [getattr(loaded.config, name) for name in SOURCES] == [None] * 3
     assert torch.equal(loaded.select_action(seen), expected)
     assert int(loaded.step) == 1
-    assert fake_encoder.calls == []
-    assert loaded.demonstrations.tasks == TASKS[:N_DEMONSTRATIONS]
+    assert small.fake_encoder.calls == []
+    assert loaded.demonstrations.tasks == small.TASKS[:N_DEMONSTRATIONS]
 
 
 def test_configuration_keeps_its_sources_when_it_is_saved(make, dataset, tmp_path):
-    policy, _, _ = make(**demos_of(dataset))
+    policy, _, _ = make(**small.demos_of(dataset))
     config = copy.deepcopy(policy.config)
     policy.save_pretrained(tmp_path)
     assert policy.config == config
@@ -95,9 +85,9 @@ def test_configuration_keeps_its_sources_when_it_is_saved(make, dataset, tmp_pat
 
 def test_demonstrations_of_the_command_line_come_before_those_of_the_checkpoint(saved, dataset):
     config = PreTrainedConfig.from_pretrained(saved[0])
-    config.demo_repo_id, config.demo_root = REPO_ID, str(dataset.root)
+    config.demo_repo_id, config.demo_root = small.REPO_ID, str(dataset.root)
     loaded = DeltacoPolicy.from_pretrained(saved[0], config=config)
-    assert set(loaded.demonstrations.tasks) == set(TASKS)
+    assert set(loaded.demonstrations.tasks) == set(small.TASKS)
 
 
 def test_equal_policies_are_equal_files(saved, tmp_path):
@@ -172,7 +162,7 @@ def test_damaged_processors_are_an_error(checkpoint):
 
 def test_training_continues_on_other_data_than_that_of_its_checkpoint(checkpoint, tmp_path):
     """States are normalized by the new dataset's statistics, and so are those of the new checkpoint."""
-    dataset = write_dataset(tmp_path / "data", [*TASKS, *TASKS])
+    dataset = small.write_dataset(tmp_path / "data", [*small.TASKS, *small.TASKS])
     edit(checkpoint / "model.safetensors", lambda tensors, _: tensors["state_limits.scale"].fill_(0.5))
     config = PreTrainedConfig.from_pretrained(checkpoint)
     config.pretrained_path = checkpoint
@@ -206,15 +196,15 @@ def test_one_hot_policy_remembers_its_tasks(make, dataset, tmp_path):
     policy, before, _ = make(method="one_hot")
     policy.save_pretrained(tmp_path)
     loaded = DeltacoPolicy.from_pretrained(tmp_path)
-    assert loaded.config.one_hot_tasks == TASKS
+    assert loaded.config.one_hot_tasks == small.TASKS
     with pytest.raises(ValueError, match="does not know the task 'juggle'. It knows the 3 tasks .*'stack"):
-        loaded.select_action(before(observation(dataset, ["juggle"])))
+        loaded.select_action(before(small.observation(dataset, ["juggle"])))
 
 
 def card_of(dataset, policy_type="deltaco", train_config=None, **options):
-    policy, _, _ = small_policy(dataset, policy_type, repo_id=POLICY_ID, **options)
+    policy, _, _ = small.small_policy(dataset, policy_type, repo_id=POLICY_ID, **options)
     described = policy.config.type, policy.config.license, policy.config.tags
-    return policy.generate_model_card(REPO_ID, *described, train_config, dataset.meta)
+    return policy.generate_model_card(small.REPO_ID, *described, train_config, dataset.meta)
 
 
 @pytest.mark.parametrize(
@@ -224,7 +214,7 @@ def card_of(dataset, policy_type="deltaco", train_config=None, **options):
 def test_every_kind_of_policy_has_a_card(dataset, policy_type, options):
     card = card_of(dataset, policy_type, **options)
     name = options.get("method", "both")
-    assert f"# {policy_type}, trained on {REPO_ID}\n" in card.text
+    assert f"# {policy_type}, trained on {small.REPO_ID}\n" in card.text
     assert "3 tasks" in card.text
     if policy_type == "deltaco":
         assert f"| method | {name} |".replace("_", r"\_") in card.text
@@ -236,8 +226,8 @@ def test_every_kind_of_policy_has_a_card(dataset, policy_type, options):
 
 
 def test_card_names_options_demonstrations_and_training(dataset):
-    train_config = TrainPipelineConfig(DatasetConfig(REPO_ID), steps=12_345, batch_size=24, seed=77)
-    options = {"license": "mit", "tags": ["cups", "lerobot"], "shift_padding": 2, **demos_of(dataset)}
+    train_config = TrainPipelineConfig(DatasetConfig(small.REPO_ID), steps=12_345, batch_size=24, seed=77)
+    options = {"license": "mit", "tags": ["cups", "lerobot"], "shift_padding": 2, **small.demos_of(dataset)}
     card = card_of(dataset, train_config=train_config, **options)
     for row in ("| steps | 12345 |", "| batch\\_size | 24 |", "| shift\\_padding | 2 |"):
         assert row.replace("\\_", "_") in card.text.replace("\\_", "_")
@@ -247,30 +237,34 @@ def test_card_names_options_demonstrations_and_training(dataset):
     assert "@inproceedings{yu2023deltaco" in card.text
     data = ModelCard(str(card)).data
     assert (data.library_name, data.pipeline_tag, data.license) == ("lerobot", "robotics", "mit")
-    assert (data.datasets, data.model_name) == ([REPO_ID], "deltaco")
+    assert (data.datasets, data.model_name) == ([small.REPO_ID], "deltaco")
     assert {"lerobot", "robotics", "deltaco", "cups"} <= set(data.tags)
     assert len(data.tags) == len(set(data.tags))
 
 
 def test_pushed_policy_is_fetched_by_its_id(dataset, tmp_path, monkeypatch):
-    demos = write_dataset(tmp_path / "demos", [*TASKS, "juggle"])
-    policy, before, after = small_policy(dataset, repo_id=POLICY_ID, push_to_hub=True, **demos_of(demos))
-    policy(before(batch_of(dataset, [0, 7])))
-    seen = observation(dataset, ["juggle", "wave"])
+    demos = small.write_dataset(tmp_path / "demos", [*small.TASKS, "juggle"])
+    policy, before, after = small.small_policy(
+        dataset, repo_id=POLICY_ID, push_to_hub=True, **small.demos_of(demos)
+    )
+    policy(before(small.batch_of(dataset, [0, 7])))
+    seen = small.observation(dataset, ["juggle", "wave"])
     expected = after(policy.eval().select_action(before(seen)))
     with FakeHub() as hub:
         hub.connect(monkeypatch, tmp_path / "home")
         # As `lerobot-train` does at its end.
-        config = TrainPipelineConfig(DatasetConfig(REPO_ID, root=str(dataset.root)), policy=policy.config)
+        config = TrainPipelineConfig(
+            DatasetConfig(small.REPO_ID, root=str(dataset.root)), policy=policy.config
+        )
         policy.push_model_to_hub(config, dataset_meta=dataset.meta)
         before.push_to_hub(POLICY_ID)
         after.push_to_hub(POLICY_ID)
-        fake_encoder.calls = []
+        small.fake_encoder.calls = []
         fetched = type(policy).from_pretrained(POLICY_ID)
         before, after = make_pre_post_processors(fetched.config, POLICY_ID)
         files = hub.repos["model", POLICY_ID].files()
     assert torch.equal(after(fetched.select_action(before(seen))), expected)
-    assert fake_encoder.calls == []
+    assert small.fake_encoder.calls == []
     assert fetched.demonstrations.tasks == policy.demonstrations.tasks
     processors = {"policy_preprocessor.json", "policy_postprocessor.json"}
     assert {*WEIGHTS, *processors, "train_config.json", "README.md"} <= set(files)

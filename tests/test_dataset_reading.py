@@ -7,18 +7,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import small_policies as small
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy_config
-from small_policies import (
-    DELTACO,
-    EPISODES,
-    batch_of,
-    run_training,
-    small_policy,
-    use_fake_encoder,
-    write_dataset,
-)
 
 from lerobot_deltaco import language
 from lerobot_deltaco.base_config import check_image_shapes, dimension_names
@@ -98,7 +90,7 @@ def test_missing_files_and_statistics_are_named(root, tmp_path):
         with pytest.raises(FileNotFoundError, match=f"copy/{file} is missing"):
             open_dataset("--dataset.root", "test/foreign", root)
         with pytest.raises(FileNotFoundError, match=f"copy/{file} is missing"):
-            run_training(root, tmp_path / "run", DELTACO)
+            small.run_training(root, tmp_path / "run", small.DELTACO)
         (tmp_path / "moved").rename(root / file)
 
 
@@ -165,30 +157,29 @@ def test_the_gripper_that_moves_is_chosen(stds, index, caplog):
     ],
 )
 def test_instructions_that_the_policy_cannot_tell_apart(tmp_path, monkeypatch, caplog, policy, tasks):
-    use_fake_encoder(monkeypatch)
-    dataset = write_dataset(tmp_path / "data", tasks)
+    small.use_fake_encoder(monkeypatch)
+    dataset = small.write_dataset(tmp_path / "data", tasks)
     if policy == "deltaco":
         same = torch.nn.functional.normalize(torch.ones(384), dim=0)
         encode = {"wave": same, "dance": same, "sing": -same}
         encoder = lambda texts: torch.stack([encode[text] for text in texts])  # noqa: E731
         monkeypatch.setattr(language, "load_language_encoder", lambda name: encoder)
-        made, before, _ = small_policy(dataset, "deltaco", method="language_only")
+        made, before, _ = small.small_policy(dataset, "deltaco", method="language_only")
         for _ in range(2):
-            made(before(batch_of(dataset, [0, 5])))
+            made(before(small.batch_of(dataset, [0, 5])))
         expected = "2 of 3 tasks from others by their instructions, such as 'wave' and 'dance'"
     else:
-        small_policy(dataset, policy)
+        small.small_policy(dataset, policy)
         expected = "2 of 3 tasks" if "🍎" in tasks[0] else ""
     assert caplog.text.count("cannot tell") == bool(expected)
     assert expected in caplog.text
 
 
 @pytest.fixture
-def banks(monkeypatch):
+def banks(spy):
     """Demonstrations that policies are trained with."""
-    banks, given = [], TaskConditionedPolicy.set_training_data
-    noted = lambda self, bank, robot_data: (banks.append(bank), given(self, bank, robot_data))  # noqa: E731
-    monkeypatch.setattr(TaskConditionedPolicy, "set_training_data", noted)
+    banks = []
+    spy(TaskConditionedPolicy, "set_training_data", lambda _, bank, robot_data: banks.append(bank))
     return banks
 
 
@@ -197,8 +188,8 @@ def test_only_the_chosen_episodes_are_needed(root, tmp_path, banks, in_memory):
     # As the files of other episodes are, theirs are damaged.
     change(root / DATA, TOP, lambda values: values.__setitem__(5, cut(values[5])))
     change(root / DATA, "action", put(7, np.nan, 1))
-    options = {**DELTACO, "dataset.episodes": "[0,2,3]", "policy.demo_encoder": "attention"}
-    run_training(root, tmp_path / "run", options, in_memory, steps=1, save_freq=1)
+    options = {**small.DELTACO, "dataset.episodes": "[0,2,3]", "policy.demo_encoder": "attention"}
+    small.run_training(root, tmp_path / "run", options, in_memory, steps=1, save_freq=1)
     assert banks[0].episodes.tolist() == [0, 2, 3]
 
 
@@ -212,33 +203,35 @@ def test_held_out_episodes_are_not_demonstrations(root, tmp_path, banks):
 
 @pytest.mark.parametrize("in_memory", [True, False])
 def test_fine_tuning_honors_the_rename_map(root, tmp_path, banks, in_memory):
-    first = run_training(root, tmp_path / "first", {**DELTACO, "policy.demo_encoder": "attention"}, steps=2)
+    first = small.run_training(
+        root, tmp_path / "first", {**small.DELTACO, "policy.demo_encoder": "attention"}, steps=2
+    )
     banks.clear()
-    other = write_dataset(tmp_path / "other", EPISODES, ("front", "hand")).root
+    other = small.write_dataset(tmp_path / "other", small.EPISODES, ("front", "hand")).root
     names = {"observation.images.front": TOP, "observation.images.hand": "observation.images.wrist"}
     options = {"policy.path": first / "000002" / "pretrained_model", "rename_map": json.dumps(names)}
     options |= {"policy.demo_repo_id": "test/small", "policy.demo_root": other}
-    tuned = run_training(other, tmp_path / "tuned", options, in_memory, steps=1, save_freq=1)
+    tuned = small.run_training(other, tmp_path / "tuned", options, in_memory, steps=1, save_freq=1)
     assert (tuned / "000001").is_dir()
     expected = read_demonstrations(open_dataset("", "test/small", other), "observation.images.front", 48, 2)
     assert torch.equal(banks[0].frames, expected.frames)
 
 
 def test_demonstrations_in_other_units_are_warned_of(root, dataset, monkeypatch, caplog):
-    use_fake_encoder(monkeypatch)
+    small.use_fake_encoder(monkeypatch)
     demos = {"demo_repo_id": "test/shown", "demo_root": str(root), "demo_encoder": "attention"}
-    small_policy(dataset, "deltaco", **demos)
+    small.small_policy(dataset, "deltaco", **demos)
     assert not [record for record in caplog.records if record.name.startswith("lerobot_deltaco")]
     stats = json.loads((root / "meta/stats.json").read_text())
     for name in stats["action"].keys() - {"count"}:
         stats["action"][name][2] *= 57.3
     (root / "meta/stats.json").write_text(json.dumps(stats))
     change(root / DATA, "action", lambda rows: [row.__setitem__(2, row[2] * 57.3) for row in rows])
-    small_policy(dataset, "deltaco", **demos)
+    small.small_policy(dataset, "deltaco", **demos)
     assert "`action` does not fit: its dimension 2 is between" in caplog.text
     caplog.clear()
     info = json.loads((root / "meta/info.json").read_text())
     info["features"]["action"]["names"] = ["a", "b_gripper", "c"]
     (root / "meta/info.json").write_text(json.dumps(info))
-    small_policy(dataset, "deltaco", **demos)
+    small.small_policy(dataset, "deltaco", **demos)
     assert "but ['a', 'b_gripper', 'c'] in the demonstrations in test/shown" in caplog.text

@@ -9,7 +9,6 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -29,19 +28,18 @@ PAGES = [
 ]
 
 
-def page_name(path: Path) -> str:
+def page_name(path):
     return path.relative_to(ROOT).as_posix()
 
 
-def fences(path: Path, language: str) -> Iterator[str]:
+def fences(path, language):
     """Yields the fenced blocks of a page in a language, without the indentation of a list."""
-    for indent, block in re.findall(
-        rf"^( *)```{language}\n(.*?)^ *```$", path.read_text(), re.MULTILINE | re.DOTALL
-    ):
+    pattern = rf"(?ms)^( *)```{language}\n(.*?)^ *```$"
+    for indent, block in re.findall(pattern, path.read_text()):
         yield "\n".join(line.removeprefix(indent) for line in block.splitlines())
 
 
-def commands(path: Path) -> Iterator[list[str]]:
+def commands(path):
     """Yields the commands in a page's bash blocks, as words."""
     for block in fences(path, "bash"):
         for line in block.replace("\\\n", " ").splitlines():
@@ -52,14 +50,14 @@ def commands(path: Path) -> Iterator[list[str]]:
                 yield words
 
 
-def parse_deltaco(name: str, arguments: list[str]) -> dict[str, object]:
+def parse_deltaco(name, arguments):
     """Parses the arguments of a subcommand, and runs nothing."""
     kind = cli.command_arguments(name)
     if isinstance(kind, type):
         return vars(tyro.cli(kind, args=arguments))
 
     @functools.wraps(kind)
-    def bind(*args: object, **kwargs: object) -> dict[str, object]:
+    def bind(*args, **kwargs):
         return inspect.signature(kind).bind(*args, **kwargs).arguments
 
     return tyro.cli(bind, args=arguments)
@@ -81,7 +79,7 @@ def draccus_parser(configuration):
     return ArgumentParser(configuration)
 
 
-def parse_lerobot(command: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def parse_lerobot(command, arguments, monkeypatch):
     """Parses a command's configuration with draccus, as LeRobot does, but reads no checkpoint."""
     from lerobot.configs import PreTrainedConfig
 
@@ -107,7 +105,7 @@ def parse_lerobot(command: str, arguments: list[str], monkeypatch: pytest.Monkey
     draccus_parser(configuration).parse_args(arguments)
 
 
-def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def check(words, monkeypatch):
     """Checks that a command parses."""
     command, *arguments = words
     if command == "deltaco":
@@ -163,7 +161,7 @@ def test_the_gymnasium_snippet_of_the_readme_runs():
     assert result.stdout.splitlines()[-1] in ("True", "False")
 
 
-def slugs(path: Path) -> set[str]:
+def slugs(path):
     """Returns the anchors of a page's headings, as GitHub and MyST make them."""
     text = re.sub(r"^```.*?^```$", "", path.read_text(), flags=re.MULTILINE | re.DOTALL)
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)

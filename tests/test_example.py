@@ -33,16 +33,15 @@ def checkpoint(benchmark, tmp_path_factory):
 
 
 @pytest.fixture
-def received(monkeypatch):
+def received(spy):
     """What the network of the example receives: sentence, and ends of the demonstration."""
-    found, find = set(), ExamplePolicy.find
+    found = set()
 
-    def noted(self, scenes, sentences, ends):
+    def note(self, scenes, sentences, ends):
         pixels = (255 * ends).round().byte().contiguous().numpy()
         found.update((text, own.tobytes()) for text, own in zip(sentences, pixels, strict=True))
-        return find(self, scenes, sentences, ends)
 
-    monkeypatch.setattr(ExamplePolicy, "find", noted)
+    spy(ExamplePolicy, "find", note)
     return found
 
 
@@ -63,16 +62,9 @@ def test_evaluations_give_the_demonstrations_of_the_protocol(checkpoint, receive
     by_set_tasks = set(received)
     received.clear()
     options = {
-        "policy.path": checkpoint,
-        "policy.device": "cpu",
-        "env.type": "deltaco",
-        "env.task": TASKS,
-        "env.demonstrations": True,
-        "env.scene.episode_length": 2,
-        "env.render_size": 16,
-        "eval.n_episodes": 1,
-        "eval.batch_size": 1,
-        "output_dir": tmp_path / "eval",
+        **{"policy.path": checkpoint, "policy.device": "cpu", "output_dir": tmp_path / "eval"},
+        **{"env.type": "deltaco", "env.task": TASKS, "env.demonstrations": True, "env.render_size": 16},
+        **{"env.scene.episode_length": 2, "eval.n_episodes": 1, "eval.batch_size": 1},
     }
     monkeypatch.setattr(sys, "argv", ["eval", *as_options(options)])
     lerobot_eval.main()

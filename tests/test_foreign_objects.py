@@ -24,9 +24,8 @@ def test_each_object_is_the_target_of_one_task():
     assert len(targets) == len(set(targets)) == 96
     containers = [get_task(index).container for index in TASKS]
     assert {containers.count(word) for word in CONTAINER_WORDS} == {16}
-    assert {get_task(index).instruction for index in TASKS} == {
-        f"Put thing in {word} bin." for word in CONTAINER_WORDS
-    }
+    instructions = {f"Put thing in {word} bin." for word in CONTAINER_WORDS}
+    assert {get_task(index).instruction for index in TASKS} == instructions
     assert all(target - 20_000 in MESHES and find_label(target).index == target for target in targets)
 
 

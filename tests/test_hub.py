@@ -1,5 +1,6 @@
 """A dataset's card, and the way to the Hub and back, with real clients and a fake Hub."""
 
+import functools
 import json
 import re
 import shlex
@@ -97,14 +98,14 @@ def test_card_of_other_scenes_says_so(dataset, copy):
     scene = SceneConfig("object", "scenario_a_train", 0.2, "scene", image_size=64)
     path.write_text(json.dumps({**origin, "plan": {**origin["plan"], "scene": asdict(scene)}}))
     card = " ".join(dataset_card(copy).split())
+    options = "image_size=64 ambiguity=object objects=scenario_a_train adversarial_probability=0.2"
+    words = [f"--env.scene.{option}" for option in [*options.split(), "adversarial_draw=scene"]]
     for text in (
         "two of the objects are identical",
         "Scenes are made of the objects `scenario_a_train`",
         "with probability 0.2** instead of the paper's 0.6",
         "One draw decides for both distractors",
-        "--env.task=4 --env.scene.image_size=64 --env.scene.ambiguity=object "
-        "--env.scene.objects=scenario_a_train --env.scene.adversarial_probability=0.2 "
-        "--env.scene.adversarial_draw=scene --eval.n_episodes",
+        f"--env.task=4 {' '.join(words)} --eval.n_episodes",
     ):
         assert text in card
         assert text not in usual
@@ -142,13 +143,15 @@ def test_pushed_dataset_is_fetched_by_its_name(hub, copy, tmp_path, monkeypatch,
 def test_what_cannot_be_pushed_is_one_line(hub, copy, tmp_path, monkeypatch):
     hub.repos[KEY] = Repo()
     hub.refused = "POST /api/datasets/.*/commit/"
-    for repo_id, token, reason in (
-        (REPO_ID, TOKEN, "This Hub does not do that"),
-        (REPO_ID, None, "HF_TOKEN a token with write access"),
-        ("us er/name", TOKEN, "The repository id is USER/NAME"),
+    push_copy = functools.partial(push, copy)
+    for repo_id, token, calls, reason in (
+        (REPO_ID, TOKEN, [push_copy], "This Hub does not do that"),
+        (REPO_ID, None, [create_repository, push_copy], "HF_TOKEN a token with write access"),
+        ("us er/name", TOKEN, [create_repository, push_copy], "The repository id is USER/NAME"),
     ):
         hub.connect(monkeypatch, tmp_path, token)
-        with pytest.raises(HubError, match=f"^Cannot push to '{repo_id}': .*{reason}.* can be repeated.$"):
-            push(copy, repo_id)
-    with pytest.raises(HubError, match="USER/NAME"):
-        create_repository("us er/name")
+        for call in calls:
+            with pytest.raises(
+                HubError, match=f"^Cannot push to '{repo_id}': .*{reason}.* can be repeated.$"
+            ):
+                call(repo_id)

@@ -4,23 +4,9 @@ import copy
 
 import numpy as np
 import pytest
+import small_policies as small
 import torch
 from lerobot.utils.constants import OBS_STATE
-from small_policies import (
-    TABLE_LENGTH,
-    TABLE_SIZE,
-    TABLE_TASKS,
-    batch_of,
-    demos_of,
-    draw_table,
-    observation,
-    random_moves,
-    small_policy,
-    state_at,
-    use_short_fit,
-    write_episodes,
-    write_table,
-)
 
 from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
@@ -30,8 +16,8 @@ from lerobot_deltaco.normalization import StateLimits
 pytestmark = pytest.mark.usefixtures("short_fit")
 
 N_EPISODES, N_TRAINED = 48, 36
-MOVES = random_moves(N_EPISODES)  # of `table`
-RED, BLUE = TABLE_TASKS  # the tasks of the even and the odd episodes
+MOVES = small.random_moves(N_EPISODES)  # of `table`
+RED, BLUE = small.TABLE_TASKS  # the tasks of the even and the odd episodes
 
 
 @pytest.fixture
@@ -40,7 +26,7 @@ def make(table):
 
     def make(**options):
         torch.manual_seed(0)
-        policy, _, _ = small_policy(table, "deltaco_match", **options)
+        policy, _, _ = small.small_policy(table, "deltaco_match", **options)
         policy._prepare_training()
         return policy
 
@@ -48,7 +34,7 @@ def make(table):
 
 
 def first_frames(episodes):
-    return [episode * TABLE_LENGTH for episode in episodes]
+    return [episode * small.TABLE_LENGTH for episode in episodes]
 
 
 def found_in(policy, scenes, instructions, demonstrations):
@@ -64,16 +50,16 @@ def found_in(policy, scenes, instructions, demonstrations):
 def trained(table):
     """A policy that has learned, on 36 of the 48 episodes, to find the locations."""
     with pytest.MonkeyPatch.context() as patch:
-        use_short_fit(patch, 60)
+        small.use_short_fit(patch, 60)
         patch.setattr(proposals, "_SCENES_PER_STEP", 16)
         patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
         patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._LOCATED_FRACTION", 1.0)
         patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._SHIFT_PADDING", 1)
-        policy, before, _ = small_policy(table, "deltaco_match")
+        policy, before, _ = small.small_policy(table, "deltaco_match")
         optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
         rng = np.random.default_rng(0)
         for _ in range(50):
-            batch = before(batch_of(table, first_frames(rng.choice(N_TRAINED, 16))))
+            batch = before(small.batch_of(table, first_frames(rng.choice(N_TRAINED, 16))))
             loss, _ = policy(batch)
             optimizer.zero_grad()
             loss.backward()
@@ -83,13 +69,13 @@ def trained(table):
 
 def test_training_learns_to_find_what_a_demonstration_moved_and_an_instruction_names(trained, table):
     held_out = range(N_TRAINED, N_EPISODES)
-    scenes, tasks = batch_of(table, first_frames(held_out)), [MOVES[n][0] for n in held_out]
+    scenes, tasks = small.batch_of(table, first_frames(held_out)), [MOVES[n][0] for n in held_out]
     shown = [[n - 2] for n in held_out]  # another episode of the same task
     true = torch.tensor(np.stack([MOVES[n][1::2] for n in held_out])).float()  # picks and places
     no_words, none_shown = [""] * len(tasks), [[]] * len(tasks)
     for instructions, demonstrations in ((tasks, shown), (no_words, shown), (tasks, none_shown)):
         found = found_in(trained, scenes, instructions, demonstrations)
-        errors = (found.locations - true).abs() * TABLE_SIZE / 2  # px
+        errors = (found.locations - true).abs() * small.TABLE_SIZE / 2  # px
         assert (errors[:, 0].amax(dim=1) < 3).float().mean() > 0.8
         # The tasks say on which side the object is placed; its y is that of the object.
         assert (errors[:, 1, 0] < 3).float().mean() > 0.8
@@ -100,13 +86,13 @@ def test_locations_of_training_episodes_are_where_objects_were_moved(make):
     known = make().training_locations
     true = torch.tensor(np.stack([move[1::2] for move in MOVES])).float().clamp(-1, 1)
     assert known.found.all()
-    errors = (known.locations - true).norm(dim=2) * TABLE_SIZE / 2
+    errors = (known.locations - true).norm(dim=2) * small.TABLE_SIZE / 2
     assert errors.median() < 1.5  # px
 
 
 def test_episode_without_a_grasp_teaches_nothing(make, table):
     policy = make()
-    batch = batch_of(table, first_frames([0, 1]))
+    batch = small.batch_of(table, first_frames([0, 1]))
 
     def losses():
         policy.step.zero_()
@@ -143,28 +129,28 @@ def test_samples_outside_of_the_demonstrations_teach_nothing(make, table):
     bank = policy.training_bank
     others = torch.where(bank.episodes == 0, 10_000, bank.episodes)
     policy.training_bank = DemonstrationBank(bank.frames, bank.tasks, others)
-    losses, _ = policy(batch_of(table, first_frames([0, 1])), reduction="none")
+    losses, _ = policy(small.batch_of(table, first_frames([0, 1])), reduction="none")
     assert losses[0] == 0
     assert losses[1] > 0
 
 
 def test_too_few_grasps_are_an_error_before_training(table):
-    policy, _, _ = small_policy(table, "deltaco_match", demo_episodes=list(range(8)))
+    policy, _, _ = small.small_policy(table, "deltaco_match", demo_episodes=list(range(8)))
     remedy = r"Collect more, or train --policy.type=deltaco with --policy.demo_encoder=attention"
     gripper = r"dimension 2 of the action \(gripper\), whose low values"
     with pytest.raises(ValueError, match=rf"at least 24 episodes .* Got 8\. {remedy}.* {gripper}"):
-        policy(batch_of(table, [0]))
+        policy(small.batch_of(table, [0]))
 
 
 def test_greater_values_of_the_gripper_may_mean_closed(table, caplog):
     frames = table.meta.frames_in_memory
-    bank = frames.demonstrations("observation.image", TABLE_SIZE, 2)
+    bank = frames.demonstrations("observation.image", small.TABLE_SIZE, 2)
     robot = frames.robot_data("observation.image")
     inverted = robot._replace(actions=robot.actions * torch.tensor([1, 1, -1]))
 
     def locations(data, **options):
         caplog.clear()
-        policy, _, _ = small_policy(table, "deltaco_match", **options)
+        policy, _, _ = small.small_policy(table, "deltaco_match", **options)
         policy.set_training_data(copy.deepcopy(bank), data)
         return policy.training_locations.locations
 
@@ -178,7 +164,7 @@ def test_greater_values_of_the_gripper_may_mean_closed(table, caplog):
 
 def test_validation_loss_of_held_back_episodes_finds_their_locations(make, table):
     policy = make().eval()
-    batch = batch_of(table, first_frames([0, 1]))
+    batch = small.batch_of(table, first_frames([0, 1]))
     known, _ = policy(batch, reduction="none")
     policy.training_locations.found[:] = False  # as of episodes that are held back
     found, logged = policy(batch, reduction="none")
@@ -195,7 +181,7 @@ def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
     before = copy.deepcopy(policy.feature_matching.state_dict())
     resumed = DeltacoMatchPolicy.from_pretrained(tmp_path, dataset_meta=table.meta).train()
     resumed.config.seed = 5
-    resumed(batch_of(table, [0]))
+    resumed(small.batch_of(table, [0]))
     after = resumed.feature_matching.state_dict()
     assert all(torch.equal(before[name], value) for name, value in after.items())
     assert resumed.config.known_words == ["blue", "left", "move", "object", "red", "right", "the"]
@@ -203,15 +189,15 @@ def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
 
 def test_feature_matching_takes_images_of_any_size(table):
     for size in (16, 19):
-        policy, _, _ = small_policy(table, "deltaco_match", image_size=size)
-        policy(batch_of(table, [0]))
-        found = found_in(policy.eval(), batch_of(table, [0, 0]), [RED, ""], [[0], [2]])
+        policy, _, _ = small.small_policy(table, "deltaco_match", image_size=size)
+        policy(small.batch_of(table, [0]))
+        found = found_in(policy.eval(), small.batch_of(table, [0, 0]), [RED, ""], [[0], [2]])
         assert found.locations.isfinite().all()
         assert found.locations.abs().max() <= 1
 
 
 def test_actions_that_cannot_be_carried_out_are_errors(make, table):
-    policy, scene = make().eval(), batch_of(table, [0])
+    policy, scene = make().eval(), small.batch_of(table, [0])
     assert found_in(policy, scene, [RED], [[0]]) is not None
     unknown = {**scene, OBS_STATE: torch.full_like(scene[OBS_STATE], torch.nan)}
     with pytest.raises(FloatingPointError, match=r"`observation\.state` has numbers that are not finite"):
@@ -238,7 +224,7 @@ def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):
 
 def test_what_is_left_out_does_not_matter(make, table):
     policy = make().eval()
-    scene = batch_of(table, [0])
+    scene = small.batch_of(table, [0])
 
     def found(instruction, *episodes):
         return found_in(policy, scene, [instruction], [list(episodes)])
@@ -256,12 +242,12 @@ def test_what_is_left_out_does_not_matter(make, table):
     with pytest.raises(ValueError, match="Neither a demonstration nor an instruction is given"):
         found("")
     with pytest.raises(ValueError, match=r"as many demonstrations each. Got \[0, 1\]"):
-        found_in(policy, batch_of(table, [0, 0]), ["", ""], [[0], []])
+        found_in(policy, small.batch_of(table, [0, 0]), ["", ""], [[0], []])
 
 
 def test_several_demonstrations_are_combined(make, table):
     policy = make(n_demonstrations=2).eval()
-    scene = batch_of(table, [0])
+    scene = small.batch_of(table, [0])
     one, other, both = (found_in(policy, scene, [RED], [episodes]) for episodes in ([0], [2], [0, 2]))
     for single in (one, other):
         assert not torch.equal(both.maps[:, 0], single.maps[:, 0])
@@ -274,30 +260,34 @@ def test_several_demonstrations_are_combined(make, table):
 
 def test_height_bias_is_added_when_acting(make, table):
     policies = [make(grasp_height_bias=bias).eval() for bias in (0.0, 0.5)]
-    heights = [found_in(policy, batch_of(table, [0]), [RED], [[0]]).heights for policy in policies]
+    heights = [found_in(policy, small.batch_of(table, [0]), [RED], [[0]]).heights for policy in policies]
     torch.testing.assert_close(heights[1], heights[0] + 0.5)
 
 
 def test_demonstrations_of_another_robot_and_a_missing_gripper_are_errors(table, dataset, tmp_path):
-    other = write_table(tmp_path / "other", MOVES[:2], n_joints=5)
+    other = small.write_table(tmp_path / "other", MOVES[:2], n_joints=5)
     with pytest.raises(ValueError, match="of another robot: their states and actions have 5 and 3 numbers"):
-        small_policy(table, "deltaco_match", **demos_of(other))
-    with pytest.raises(ValueError, match="have no camera 'observation.image', only observation.images.top"):
-        small_policy(table, "deltaco_match", **demos_of(dataset))
+        small.small_policy(table, "deltaco_match", **small.demos_of(other))
+    with pytest.raises(
+        ValueError, match="have no camera 'observation.image', only small.observation.images.top"
+    ):
+        small.small_policy(table, "deltaco_match", **small.demos_of(dataset))
     with pytest.raises(ValueError, match=r"needs the feature 'observation.state' and a gripper"):
-        small_policy(table, "deltaco_match", gripper="none")
+        small.small_policy(table, "deltaco_match", gripper="none")
 
 
 def test_a_demonstration_may_be_given_by_hand_while_the_arm_rests(table, tmp_path):
     task, start, other, end = MOVES[0]
-    rest = {"observation.state": state_at(np.zeros(2)), "action": np.array([0, 0, 1], np.float32)}
-    frames = [{"observation.image": draw_table(task, at, other), **rest} for at in (start, start, end, end)]
+    rest = {"observation.state": small.state_at(np.zeros(2)), "action": np.array([0, 0, 1], np.float32)}
+    frames = [
+        {"observation.image": small.draw_table(task, at, other), **rest} for at in (start, start, end, end)
+    ]
     named = {"observation.state": list("abc"), "action": ["a", "b", "gripper"]}
-    demos = write_episodes(tmp_path / "demos", "test/hand", [(task, frames)], **named)
-    policy, before, _ = small_policy(table, "deltaco_match", **demos_of(demos))
+    demos = small.write_episodes(tmp_path / "demos", "test/hand", [(task, frames)], **named)
+    policy, before, _ = small.small_policy(table, "deltaco_match", **small.demos_of(demos))
     policy._prepare_training()
     policy.eval()
     assert policy.demonstrations.pick_states.isnan().all()
-    action = policy.select_action(before(observation(table, [task])))
+    action = policy.select_action(before(small.observation(table, [task])))
     assert torch.isfinite(action).all()
     assert policy.found.by_demonstration[0]

@@ -99,14 +99,11 @@ def test_rollouts_move_a_robot_by_the_demonstration_of_a_new_task(
         part.save_pretrained(tmp_path / "policy")
     options = {
         "policy.path": tmp_path / "policy",
-        "policy.demo_repo_id": "me/demos",
-        "policy.demo_root": demos.root,
         "robot.type": "fake_arm",
         "robot.calibration_dir": tmp_path,
-        "fps": 20,
-        "duration": 1,
-        "return_to_initial_position": False,
     }
+    options |= {"policy.demo_repo_id": "me/demos", "policy.demo_root": demos.root}
+    options |= {"fps": 20, "duration": 1, "return_to_initial_position": False}
     monkeypatch.setattr("sys.argv", ["lerobot-rollout", *as_options(options), *task])
     monkeypatch.setattr("signal.signal", lambda *_: None)  # leave Ctrl+C to pytest
     FakeArm.sent.clear()
@@ -117,37 +114,23 @@ def test_rollouts_move_a_robot_by_the_demonstration_of_a_new_task(
         assert 0 <= action["gripper.pos"] <= 40
 
 
-@pytest.fixture(scope="module")
-def shipped():
-    return load_policy(SHIPPED, ["--device=cpu"])
-
-
-def test_shipped_checkpoint_knows_the_test_tasks(shipped):
+def test_shipped_checkpoint_knows_the_test_tasks_and_acts_offline(monkeypatch):
+    monkeypatch.setattr("socket.socket.connect", lambda *_: pytest.fail("asked the network"))
+    shipped = load_policy(SHIPPED, ["--device=cpu"])
     policy = shipped.policy
     assert isinstance(policy, DeltacoMatchPolicy)
     assert len(policy.demonstrations.rows) == len(TASK_SETS["scenario_a_test"])
     assert {"green", "bin", "gray", "bowl"} < set(policy.config.known_words)
     for file in SHIPPED.glob("*.json"):
-        settings = json.loads(file.read_text(encoding="utf-8"))
-        assert settings.get("demo_root") is None
-
-
-def test_shipped_checkpoint_loads_offline_and_acts(shipped, monkeypatch):
-    monkeypatch.setattr("socket.socket.connect", lambda *_: pytest.fail("asked the network"))
+        assert json.loads(file.read_text(encoding="utf-8")).get("demo_root") is None
     config = PreTrainedConfig.from_pretrained(SHIPPED)
     config.pretrained_path = SHIPPED  # as `--policy.path` does
     config.device = "cpu"
-    environment = DeltacoEnv(task="4")
-    policy = make_policy(config, env_cfg=environment).eval()
-    task_id = TASK_SETS["scenario_a_test"][0]
-    generator = torch.Generator().manual_seed(0)
-    batch = shipped.preprocessor(
-        {
-            "observation.image": torch.rand(2, 3, 48, 48, generator=generator),
-            "observation.state": torch.zeros(2, 10),
-            "task": [get_task(task_id).instruction] * 2,
-        }
-    )
+    policy = make_policy(config, env_cfg=DeltacoEnv(task="4")).eval()
+    images = torch.rand(2, 3, 48, 48, generator=torch.Generator().manual_seed(0))
+    seen = {"observation.image": images, "observation.state": torch.zeros(2, 10)}
+    tasks = [get_task(TASK_SETS["scenario_a_test"][0]).instruction] * 2
+    batch = shipped.preprocessor({**seen, "task": tasks})
     shipped.policy.reset()
     action = policy.select_action(batch)
     assert action.shape == (2, 4)

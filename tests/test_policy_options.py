@@ -118,17 +118,14 @@ def test_actions_of_the_benchmark_are_not_scaled():
         assert other(device="cpu").normalization_mapping["ACTION"] is NormalizationMode.MIN_MAX
 
 
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [
+def test_features_that_do_not_fit_are_errors():
+    for config, message in [
         (features_config(gripper="3"), "only the dimensions 0 to 2"),
         (features_config(demo_camera="observation.wrist"), "one of the dataset's cameras, observation.image"),
         (DeltacoConfig(device="cpu"), "needs at least one camera"),
-    ],
-)
-def test_features_that_do_not_fit_are_errors(config, message):
-    with pytest.raises(ValueError, match=message):
-        config.validate_features()
+    ]:
+        with pytest.raises(ValueError, match=message):
+            config.validate_features()
 
 
 def test_cosine_schedule_warms_up_and_ends_at_zero():
@@ -146,16 +143,14 @@ def test_cosine_schedule_warms_up_and_ends_at_zero():
     assert rates[20] == pytest.approx(0)
 
 
-@pytest.mark.parametrize(
-    ("n_frames", "fps", "expected"),
-    [(30, 24, 1), (150, 30, 20), (400, 50, 33), (90, 1, 1), (57, 10, 7), (900, 200, 50)],
-)
-def test_a_chunk_lasts_two_thirds_of_a_second_where_steps_are_small(n_frames, fps, expected):
-    meta = SimpleNamespace(total_frames=7 * n_frames, total_episodes=7, fps=fps)
-    config = DeltacoMatchConfig(device="cpu")
-    config.set_dataset_length(meta)
-    assert config.chunk_size == expected
-    assert config.action_delta_indices == (None if expected == 1 else list(range(expected)))
+def test_a_chunk_lasts_two_thirds_of_a_second_where_steps_are_small():
+    cases = [(30, 24, 1), (150, 30, 20), (400, 50, 33), (90, 1, 1), (57, 10, 7), (900, 200, 50)]
+    for n_frames, fps, expected in cases:
+        meta = SimpleNamespace(total_frames=7 * n_frames, total_episodes=7, fps=fps)
+        config = DeltacoMatchConfig(device="cpu")
+        config.set_dataset_length(meta)
+        assert config.chunk_size == expected
+        assert config.action_delta_indices == (None if expected == 1 else list(range(expected)))
     fixed = DeltacoMatchConfig(device="cpu", chunk_size=3)
     fixed.set_dataset_length(meta)
     assert fixed.chunk_size == 3

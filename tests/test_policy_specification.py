@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import numpy_reference as reference
 import pytest
+import small_policies as small
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
@@ -14,17 +15,6 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import get_policy_class
-from small_policies import (
-    TABLE_LENGTH,
-    TABLE_TASKS,
-    TASKS,
-    batch_of,
-    demos_of,
-    hold_in_memory,
-    observation,
-    small_policy,
-    with_chunks,
-)
 
 from lerobot_deltaco import base_policy
 from lerobot_deltaco.dataset_reading import open_dataset
@@ -53,13 +43,16 @@ VARIANTS = [
     ("deltaco_match", {"frames_after_release": None, "num_mixture_components": 1}),
 ]
 # Frames that are trained on, of all tasks.
-FRAMES = {"deltaco": [0, 7, 16, 22, 29], "deltaco_match": list(range(0, 20 * TABLE_LENGTH, TABLE_LENGTH + 1))}
+FRAMES = {
+    "deltaco": [0, 7, 16, 22, 29],
+    "deltaco_match": list(range(0, 20 * small.TABLE_LENGTH, small.TABLE_LENGTH + 1)),
+}
 
 
 @pytest.fixture(scope="module")
 def short_table(table):
     """As many episodes of the table as `deltaco_match` needs."""
-    return hold_in_memory(LeRobotDataset(table.repo_id, root=table.root), episodes=list(range(24)))
+    return small.hold_in_memory(LeRobotDataset(table.repo_id, root=table.root), episodes=list(range(24)))
 
 
 # Opening a dataset takes longer than a training step.
@@ -75,16 +68,16 @@ def make(request, dataset, short_table, fake_language, short_fit, monkeypatch):
 
     def make(with_demos=False):
         torch.manual_seed(0)
-        demos = demos_of(data) if with_demos else {}
-        policy, before, after = small_policy(data, policy_type, **demos, **options)
+        demos = small.demos_of(data) if with_demos else {}
+        policy, before, after = small.small_policy(data, policy_type, **demos, **options)
         return SimpleNamespace(
             policy=policy,
             config=policy.config,
             before=before,
             after=after,
             data=data,
-            tasks=TASKS if policy_type == "deltaco" else TABLE_TASKS,
-            batch=before(batch_of(with_chunks(data, policy.config), FRAMES[policy_type])),
+            tasks=small.TASKS if policy_type == "deltaco" else small.TABLE_TASKS,
+            batch=before(small.batch_of(small.with_chunks(data, policy.config), FRAMES[policy_type])),
         )
 
     return make
@@ -140,7 +133,7 @@ def test_acting_in_batches_of_any_size_leaves_the_batch_unchanged(make):
     made.policy.eval()
     for tasks in (made.tasks[:1], made.tasks):
         made.policy.reset()
-        batch = made.before(observation(made.data, tasks))
+        batch = made.before(small.observation(made.data, tasks))
         kept = copy.deepcopy(batch)
         chunk = made.policy.predict_action_chunk(batch)
         assert chunk.shape == (len(tasks), made.config.chunk_size, 3)
@@ -150,7 +143,7 @@ def test_acting_in_batches_of_any_size_leaves_the_batch_unchanged(make):
         assert torch.equal(second, chunk[:, 1 % (made.config.n_action_steps or made.config.chunk_size)])
         assert_same(kept, batch)
     # The first sample acts as it does alone, also where LeRobot's training evaluates in bfloat16.
-    alone = made.before(observation(made.data, made.tasks[:1]))
+    alone = made.before(small.observation(made.data, made.tasks[:1]))
     for together in (False, True):
         made.policy.reset()
         with torch.autocast("cpu", torch.bfloat16):
@@ -189,7 +182,7 @@ def test_checkpoint_acts_the_same_to_the_bit(make, tmp_path):
     made = make(with_demos=True)
     train(made, n_steps=1)
     made.policy.eval()
-    batch = made.before(observation(made.data, made.tasks))
+    batch = made.before(small.observation(made.data, made.tasks))
     action = made.policy.select_action(batch)
     made.policy.save_pretrained(tmp_path)
     loaded = get_policy_class(made.config.type).from_pretrained(tmp_path)
@@ -214,8 +207,8 @@ def weights_of(policy, prefix):
 def test_loss_matches_the_papers_formulas(dataset, method):
     # Each of these samples has exactly one episode that can demonstrate it.
     samples, rows, task = [16, 22, 27], [4, 3, 5], np.array([0, 0, 1])
-    policy, before, _ = small_policy(dataset, method=method, shift_padding=0, demo_shift_padding=0)
-    batch = before(batch_of(dataset, samples))
+    policy, before, _ = small.small_policy(dataset, method=method, shift_padding=0, demo_shift_padding=0)
+    batch = before(small.batch_of(dataset, samples))
     distinct = list(dict.fromkeys(batch["task"]))
     loss, _ = policy(batch, reduction="none")
 

@@ -38,9 +38,8 @@ def test_held_out_sentences_are_not_trained_on(tmp_path):
         read_paraphrases(path, "test")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_invalid_file_is_an_error_that_names_the_line(tmp_path):
+    for text, message in [
         ("", "line 1: expected the columns task_id,instruction or"),
         ("4,a sentence\n", r"line 1: .* Got '4,a sentence'"),
         ("task_id,instruction\n", "has no instructions"),
@@ -49,15 +48,11 @@ def test_held_out_sentences_are_not_trained_on(tmp_path):
         ("task_id,instruction\nfour,a\n", r"line 2: .*from 0 to 299.* Got 'four'"),
         ("task_id,instruction\n4,  \n", "line 2: the instruction is empty"),
         ('task_id,instruction\n4,"put it\n', "line 2: "),
-    ],
-)
-def test_invalid_file_is_an_error_that_names_the_line(tmp_path, text, message):
-    path = write(tmp_path / "mine.csv", text)
-    with pytest.raises(ValueError, match=f"mine.csv.*{message}"):
-        read_paraphrases(path)
-
-
-def test_unreadable_file_is_an_error(tmp_path):
+    ]:
+        path = write(tmp_path / "mine.csv", text)
+        with pytest.raises(ValueError, match=f"mine.csv.*{message}"):
+            read_paraphrases(path)
+    # So is a file that cannot be read.
     (tmp_path / "latin.csv").write_bytes("task_id,instruction\n4,caf\xe9\n".encode("latin-1"))
     for path in (tmp_path / "missing.csv", tmp_path / "latin.csv", tmp_path):
         with pytest.raises(ValueError, match=f"Cannot read the paraphrases {path}"):
@@ -68,10 +63,8 @@ def test_instructions_are_templates_a_file_or_one_sentence(tmp_path):
     path = write(tmp_path / "shared.csv", SHARED)
     assert choose_instructions([0, 1]) is None
     assert choose_instructions([1], path, "held_out") == {1: ("e",)}
-    assert choose_instructions([4, 0], instruction=" put it  there ") == {
-        4: ("put it there",),
-        0: ("put it there",),
-    }
+    chosen = choose_instructions([4, 0], instruction=" put it  there ")
+    assert chosen == {4: ("put it there",), 0: ("put it there",)}
     with pytest.raises(ValueError, match=r"no instruction for task 2 \('Put .*'\) and 1 more tasks"):
         choose_instructions([0, 2, 3], path, "train")
     with pytest.raises(ValueError, match="not both"):

@@ -20,11 +20,9 @@ def test_a_new_task_is_found_in_the_current_image(table, chunk_size):
 
     def seen(row):
         """An observation as a robot gives it."""
-        image = table[row]["observation.image"].permute(1, 2, 0).numpy()
-        return {
-            "observation.image": np.round(255 * image).astype(np.uint8),
-            "observation.state": table[row]["observation.state"].numpy(),
-        }
+        image, state = (table[row][f"observation.{name}"].numpy() for name in ("image", "state"))
+        image = np.round(255 * image.transpose(1, 2, 0)).astype(np.uint8)
+        return {"observation.image": image, "observation.state": state}
 
     running = engine(TABLE_TASKS[0])
     running.reset()
