@@ -20,7 +20,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-IMAGE_SIZE = 128
+IMAGE_SIZE = 64
 ACTION_SCALE = 0.025  # m per unit, for which the package's controller is made
 TASK = "Put the block on the green disc."
 # LeRobot's parser loads modules for `--env.discover_packages_path` as packages.
@@ -37,6 +37,8 @@ def make_so101(**options: Any) -> gym.Env:
 
         def __init__(self, **options: Any) -> None:
             super().__init__(**options)
+            pixels = gym.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+            self.observation_space["pixels"]["front"] = pixels
             # Without a GPU, these take nine tenths of the time of a picture.
             self.model.light_castshadow[:] = 0
             self.model.vis.quality.offsamples = 0
@@ -47,14 +49,15 @@ def make_so101(**options: Any) -> gym.Env:
 
         def render(self) -> np.ndarray:
             if self._viewer is None:
-                self._viewer = mujoco.Renderer(self.model, IMAGE_SIZE, IMAGE_SIZE)
+                self._viewer = mujoco.Renderer(self.model, 2 * IMAGE_SIZE, 2 * IMAGE_SIZE)
             self._viewer.update_scene(self.data, camera="front")
             scene = self._viewer.scene
             position, size = [*self.goal_pos[:2], 0.001], [0.03, 0.001, 0]
             disc = (mujoco.mjtGeom.mjGEOM_CYLINDER, size, position, np.eye(3).ravel(), [0.1, 0.8, 0.1, 1])
             mujoco.mjv_initGeom(scene.geoms[scene.ngeom], *disc)
             scene.ngeom += 1
-            return self._viewer.render()
+            # The block and the disc are always in this quarter of the picture.
+            return self._viewer.render()[IMAGE_SIZE:, IMAGE_SIZE // 2 : -IMAGE_SIZE // 2]
 
     return SO101PickPlace(image_obs=True, random_block_position=True, action_scale=ACTION_SCALE, **options)
 

@@ -4,6 +4,7 @@
 
 import copy
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -134,6 +135,10 @@ class TaskConditionedConfig(PreTrainedConfig):
             chunk_size=(1, 1000),
             n_action_steps=(1, self.chunk_size or _MAX_CHUNK),
             optimizer_lr=(1e-12, 10),
+            optimizer_weight_decay=(0, 10),
+            grad_clip_norm=(0, math.inf),
+            tasks_per_batch=(0, 10**9),
+            seed=(0, 2**63 - 1),
         )
         if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
             raise ValueError(

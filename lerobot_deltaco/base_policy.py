@@ -25,6 +25,7 @@ from lerobot_deltaco.base_config import TaskConditionedConfig
 from lerobot_deltaco.dataset_reading import (
     check_episode_numbers,
     compare_robots,
+    episodes_trained_on,
     open_dataset,
     training_argument,
 )
@@ -296,9 +297,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             self.set_training_data(bank, frames.robot_data(self.config.cameras[0]))
             return
         meta = self._meta
-        chosen = self.config.demo_episodes or training_argument("dataset.episodes")
-        chosen = list(dict.fromkeys(chosen or range(meta.total_episodes)))
-        check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
+        if self.config.demo_episodes:
+            chosen = list(dict.fromkeys(self.config.demo_episodes))
+            check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
+        else:
+            chosen = episodes_trained_on(meta)
         dataset = open_dataset("--dataset.root", meta.repo_id, meta.root, chosen)
         bank = self._read_bank(dataset, chosen)
         robot_data = None

@@ -7,6 +7,7 @@ have a table of episodes, statistics or tasks that do not belong to the frames.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -145,6 +146,26 @@ def training_argument(name: str) -> Any:
     for part in name.split("."):
         value = value.get(part) if isinstance(value, dict) else None
     return value
+
+
+def episodes_trained_on(meta: LeRobotDatasetMetadata) -> list[int]:
+    """Returns the episodes of the dataset that the running `lerobot-train` trains on.
+
+    These are --dataset.episodes without those of --dataset.eval_split, which are the last ones of each task.
+
+    Raises:
+        ValueError: There is no such episode.
+    """
+    chosen = list(dict.fromkeys(training_argument("dataset.episodes") or range(meta.total_episodes)))
+    check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
+    eval_split = training_argument("dataset.eval_split") or 0
+    of_task: dict[str, list[int]] = {}
+    if eval_split:
+        for episode, tasks in enumerate(meta.episodes["tasks"]):
+            if episode in chosen:
+                of_task.setdefault(tasks[0], []).append(episode)
+    held_out = {n for own in of_task.values() for n in own[len(own) - math.ceil(len(own) * eval_split) :]}
+    return [episode for episode in chosen if episode not in held_out]
 
 
 def source_of(feature: str, available: Sequence[str]) -> str:

@@ -45,9 +45,10 @@ class StateLimits(nn.Module):
             still = (scale < 1).nonzero().flatten().tolist()
             if still:
                 logger.warning(
-                    "Dimensions %s of the robot's state hardly move in the training data, and are divided by "
-                    "%.2g instead of their smaller standard deviations.",
-                    ", ".join(map(str, still)),
+                    "In the training data, %s of the robot's state hardly %s. %.2g stands in for the "
+                    "smaller standard deviation.",
+                    f"the dimensions {', '.join(map(str, still))}" if still[1:] else f"dimension {still[0]}",
+                    "move" if still[1:] else "moves",
                     least.item(),
                 )
         self.register_buffer("scale", scale)

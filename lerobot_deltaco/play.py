@@ -312,13 +312,16 @@ def build_page(player: Player, name: str) -> gr.Blocks:
                     player.uses, label="The policy receives", interactive=len(player.uses) > 1, elem_id="use"
                 )
             with gr.Column(scale=6, min_width=340):
-                sentence = gr.Textbox(label="Instruction, in your own words", max_lines=3, elem_id="sentence")
+                # Nothing runs before the scene of the address is there.
+                sentence = gr.Textbox(
+                    label="Instruction, in your own words", max_lines=3, interactive=False, elem_id="sentence"
+                )
                 chips = gr.Dataset(
                     components=[gr.Textbox(visible=False)], samples=[], show_label=False, elem_id="chips"
                 )
                 with gr.Row():
-                    run = gr.Button("Run", variant="primary", min_width=100, elem_id="run")
-                    compare = gr.Button("Compare 2 × 2", min_width=100, elem_id="compare")
+                    run = gr.Button("Run", variant="primary", min_width=100, interactive=False, elem_id="run")
+                    compare = gr.Button("Compare 2 × 2", min_width=100, interactive=False, elem_id="compare")
                 result = gr.HTML("Press Run, or Enter in the instruction.", elem_id="result")
 
         inputs = [task, seed, demonstrated, recorded, sentence, use]
@@ -339,7 +342,9 @@ def build_page(player: Player, name: str) -> gr.Blocks:
             }
 
         def begin(request: gr.Request) -> dict[Any, Any]:
-            return show(player.parse_choice(dict(request.query_params)))
+            choice = player.parse_choice(dict(request.query_params))
+            ready = {button: gr.Button(interactive=True) for button in (run, compare)}
+            return show(choice) | ready | {sentence: gr.Textbox(choice.sentence, interactive=True)}
 
         def change_scene(before: tuple[int, int, list[str]], *values: Any) -> dict[Any, Any]:
             """Shows another scene, and replaces what the user did not make with what fits the scene."""
@@ -383,7 +388,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
             gr.on(triggers, function, taken, changed, concurrency_id="policy", concurrency_limit=1, **options)
 
         quiet: dict[str, Any] = {"show_progress": "hidden"}
-        on([page.load], begin, None, outputs, **quiet)
+        on([page.load], begin, None, [*outputs, run, compare], **quiet)
         on([task.input, seed.submit, seed.blur], change_scene, [seen, *inputs], outputs, **quiet)
         on([new_scene.click], draw_scene, [seen, *inputs], outputs, **quiet)
         on([demonstrated.input], change_demonstration, inputs, outputs, **quiet)

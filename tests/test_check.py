@@ -43,7 +43,7 @@ def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path):
     assert all(f"24 episodes, 24 with a grasp: {task}" in report for task in TABLE_TASKS)
     assert "for 100 steps of 4" in report
     # The training's own warning, of a joint that never moves.
-    assert report.count("warning:") == report.count("hardly move in the training data") == 1
+    assert report.count("warning:") == report.count("of the robot's state hardly move") == 1
     assert page.count("data:image/jpeg;base64") == 4 * 48
     assert "would refuse" not in page
 

@@ -83,7 +83,7 @@ def parse_lerobot(command, arguments, monkeypatch):
     """Parses a command's configuration with draccus, as LeRobot does, but reads no checkpoint."""
     from lerobot.configs import PreTrainedConfig
 
-    own = ("lerobot_policy_deltaco", "lerobot_policy_example", "other_environments")
+    own = ("lerobot_policy_deltaco", "lerobot_policy_example", "metaworld_small", "other_environments")
     for module in ("lerobot.policies", "lerobot.envs", *own):
         importlib.import_module(module)
     arguments = [word for word in arguments if not word.startswith("--env.discover_packages_path=")]

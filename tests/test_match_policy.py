@@ -123,6 +123,21 @@ def test_episode_without_a_grasp_teaches_nothing(make, table):
     assert not any(gradient.any() for gradient in gradients)
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.2])
+def test_the_policy_network_learns_from_locations_with_the_noise_that_is_set(make, table, noise, monkeypatch):
+    policy, given = make(location_noise=noise), []
+    acting_loss = policy._acting_loss
+
+    def seen(batch, images, locations, *args):
+        given.append(locations)
+        return acting_loss(batch, images, locations, *args)
+
+    monkeypatch.setattr(policy, "_acting_loss", seen)
+    policy(small.batch_of(table, first_frames(range(N_EPISODES))))
+    spread = (given[0] - policy.training_locations.locations).std().item()
+    assert spread == pytest.approx(noise, rel=0.3)
+
+
 def test_samples_outside_of_the_demonstrations_teach_nothing(make, table):
     policy = make()
     bank = policy.training_bank
@@ -211,7 +226,7 @@ def test_actions_that_cannot_be_carried_out_are_errors(make, table):
 def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):
     stats = {OBS_STATE: {"std": np.array([0.5, 0.2, 1e-5, 0.3])}}
     limits = StateLimits(4, stats)
-    assert "Dimensions 2 of the robot's state hardly move" in caplog.text
+    assert "In the training data, dimension 2 of the robot's state hardly moves" in caplog.text
     # Divided by 3 % of the median, 0.2, and clipped.
     limited = limits(torch.tensor([1.0, -9.0, 300.0, 0.0]))
     torch.testing.assert_close(limited, torch.tensor([1.0, -5.0, 0.5, 0.0]))

@@ -119,7 +119,8 @@ def test_the_verdict_is_about_the_typed_sentence_and_the_address_keeps_it(page):
     address = page.url.replace("demonstrated=26", "demonstrated=4")
     page.goto("about:blank")
     page.goto(address)
-    page.wait_for_function("document.querySelector('#sentence textarea')?.value.includes('blue goblet')")
+    text = run_sentence(page, "put the blue goblet into the red one")  # at once
+    assert "The scene's task 26" in text
     page.focus("#seed input")
     page.keyboard.press("Tab")  # changes nothing
     assert "Not judged" in run_sentence(page, "wave at me")

@@ -37,6 +37,7 @@ def test_invalid_options_say_what_is_valid():
         ({"language_encoder": "clip"}, "`language_encoder` must be one of paraphrase-MiniLM-L3-v2"),
         ({"num_mixture_components": 0}, "`num_mixture_components` must be from 1 to 1000. Got 0"),
         ({"optimizer_lr": float("nan")}, "`optimizer_lr` must be from"),
+        ({"tasks_per_batch": -1}, "`tasks_per_batch` must be from 0"),
         ({"n_action_steps": 2}, "`n_action_steps` must be from 1 to 1"),
         ({"gripper": "left"}, "`gripper` must be 'auto', 'none' or an index"),
         ({"film": "none", "concat": "none"}, "no demonstration is used"),
@@ -46,14 +47,17 @@ def test_invalid_options_say_what_is_valid():
         ({"vision_encoder": "dino"}, "`vision_encoder` must be one of clip-vit-base-patch32, r3m-resnet18"),
         ({"normalization_mapping": {"VISUAL": MEAN_STD}}, "`normalization_mapping` must be IDENTITY for VIS"),
         ({"p_hue_augmentation": 1.5}, "`p_hue_augmentation` must be from 0 to 1"),
+        ({"location_noise": -0.1}, "`location_noise` must be from 0 to 1"),
         ({"n_demonstrations": 0}, "`n_demonstrations` must be from 1"),
         ({"n_demonstrations": 5, "demo_episode": 0}, "names a single demonstration, but .* is 5"),
         ({"grasp_height_bias": float("nan")}, "`grasp_height_bias` must be from -10 to 10"),
         ({"frames_after_release": -1}, "`frames_after_release` must be from 0"),
     ]:
-        matching = {"p_hue_augmentation", "n_demonstrations", "grasp_height_bias", "frames_after_release"}
+        policy = (
+            DeltacoConfig if all(hasattr(DeltacoConfig, name) for name in options) else DeltacoMatchConfig
+        )
         with pytest.raises(ValueError, match=message):
-            (DeltacoMatchConfig if matching & options.keys() else DeltacoConfig)(device="cpu", **options)
+            policy(device="cpu", **options)
 
 
 def test_bfloat16_needs_instructions_of_the_processor(monkeypatch, caplog):

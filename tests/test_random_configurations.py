@@ -37,6 +37,7 @@ OPTIONS = {
         "gripper": ["auto", "2", "7", "left"],
         "crop_size": [0.17, 0.3, 0.0],
         "grasp_height_bias": [0.0, 0.75, 99],
+        "location_noise": [0.0, 0.01, -1],
         "p_hue_augmentation": [0.0, 0.5, 1.5],
         "frames_after_release": [None, 2, -1],
     },

@@ -24,6 +24,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         grasp_height_bias: Height offset that is added to the estimate when the policy acts, in standard
             deviations over the training episodes; larger is farther along the approach. A gripper that closes
             too early misses flat objects; on a robot, one that goes too far may touch the table.
+        location_noise: Standard deviation of the noise on the pick and place locations in training, where the
+            image's edges are at -1 and 1; by default, a pixel of 48. If that is more than the gripper's room
+            beside an object, choose less, but no less than the error of the locations.
         p_hue_augmentation: Probability that a training sample's observation and demonstration undergo the
             same random change of hue, saturation and brightness.
         frames_after_release: Number of frames after the gripper has opened for the last time in an episode
@@ -36,6 +39,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     n_demonstrations: int = 1
     num_mixture_components: int = 5
     grasp_height_bias: float = 0.5
+    location_noise: float = 0.04
     p_hue_augmentation: float = 0.7
     frames_after_release: int | None = 2
     paraphrases: str | None = "grammar"
@@ -58,6 +62,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             crop_size=(0.01, 1),
             n_demonstrations=(1, 1000),
             grasp_height_bias=(-10, 10),
+            location_noise=(0, 1),
             p_hue_augmentation=(0, 1),
             frames_after_release=(0, 1_000_000),
         )

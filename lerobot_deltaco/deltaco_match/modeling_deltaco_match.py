@@ -63,7 +63,6 @@ from lerobot_deltaco.networks import (
 
 _GRIPPER_LOSS = "cross_entropy"
 _LOCATED_FRACTION = 0.25  # of a batch's samples, on which the locations are learned to be found
-_LOCATION_NOISE = 0.04  # standard deviation in training: a pixel of 48
 _HEIGHT_NOISE = 0.1  # in standard deviations of heights
 _SHIFT_PADDING = 4  # px, of scenes and demonstrations when locations are learned to be found
 _P_PLACE_BY_DEMONSTRATION = 0.25  # in these samples; in the others, the instruction says where
@@ -215,7 +214,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             generator,
         )  # (some, 2)
         noise = torch.randn(known.locations[rows].shape, generator=generator).to(rows.device)
-        locations = known.locations[rows] + _LOCATION_NOISE * noise
+        locations = known.locations[rows] + config.location_noise * noise
         noise = torch.randn(len(rows), generator=generator).to(rows.device)
         heights = known.heights[rows] + _HEIGHT_NOISE * noise
         images = change_colors(images, changes)
