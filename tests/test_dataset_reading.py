@@ -202,8 +202,8 @@ def test_only_the_chosen_episodes_are_needed(root, tmp_path, banks, in_memory):
 
 
 def test_held_out_episodes_are_not_demonstrations(root, tmp_path, banks):
-    options = {**small.DELTACO, "dataset.eval_split": 0.5, "policy.demo_encoder": "attention"}
-    small.run_training(root, tmp_path / "run", options, in_memory=False, steps=1, save_freq=1)
+    options = {**DELTACO, "dataset.eval_split": 0.5, "policy.demo_encoder": "attention"}
+    run_training(root, tmp_path / "run", options, in_memory=False, steps=1, save_freq=1)
     tasks = [names[0] for names in open_dataset("", "test/small", root).meta.episodes["tasks"]]
     halves = [[n for n, own in enumerate(tasks) if own == task] for task in dict.fromkeys(tasks)]
     assert set(banks[0].episodes.tolist()) == {n for half in halves for n in half[: len(half) // 2]}

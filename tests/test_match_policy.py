@@ -133,7 +133,7 @@ def test_the_policy_network_learns_from_locations_with_the_noise_that_is_set(mak
         return acting_loss(batch, images, locations, *args)
 
     monkeypatch.setattr(policy, "_acting_loss", seen)
-    policy(small.batch_of(table, first_frames(range(N_EPISODES))))
+    policy(batch_of(table, first_frames(range(N_EPISODES))))
     spread = (given[0] - policy.training_locations.locations).std().item()
     assert spread == pytest.approx(noise, rel=0.3)
 
