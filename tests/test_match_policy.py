@@ -242,7 +242,7 @@ def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):
     torch.testing.assert_close(
         limits(torch.tensor([1.0, -9.0, 300.0, 0.0])), torch.tensor([1.0, -5.0, 0.5, 0.0])
     )
-    noise = limits.add_noise(torch.zeros(5000, 4), torch.Generator().manual_seed(0))
+    noise = limits.add_noise(torch.zeros(5000, 4), 0.1, torch.Generator().manual_seed(0))
     assert (noise == 0).float().mean() == pytest.approx(0.5, abs=0.02)
     assert (noise / 0.5**0.5).std(dim=0).tolist() == pytest.approx([0.1, 0.1, 1.0, 0.1], rel=0.1)
     assert StateLimits(3, None)(torch.ones(3)).tolist() == [1, 1, 1]
@@ -320,6 +320,7 @@ def test_a_gripper_and_a_state_are_needed(table):
     [
         ({"p_hue_augmentation": 1.5}, "`p_hue_augmentation` must be from 0 to 1"),
         ({"location_noise": -0.1}, "`location_noise` must be from 0 to 1"),
+        ({"state_noise": -1}, "`state_noise` must be from 0 to 10"),
         ({"n_demonstrations": 0}, "`n_demonstrations` must be from 1"),
         ({"n_demonstrations": 5, "demo_episode": 0}, "names a single demonstration, but .* is 5"),
         ({"grasp_height_bias": float("nan")}, "`grasp_height_bias` must be from -10 to 10"),
