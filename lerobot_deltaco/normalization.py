@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 # Least standard deviation of a dimension of the state, as a fraction of the median of all.
 MIN_STD_FRACTION = 0.03
 MAX_STATE = 5.0  # in standard deviations
-_NOISE, _P_NOISE = 0.1, 0.5  # of the noise in training, and probability that a number gets some
+_P_NOISE = 0.5  # probability that a number gets noise in training
 
 
 class StateLimits(nn.Module):
@@ -57,16 +57,17 @@ class StateLimits(nn.Module):
         """Maps normalized states, (..., state), to limited ones."""
         return (states * self.scale).clamp(-MAX_STATE, MAX_STATE)
 
-    def add_noise(self, states: Tensor, generator: torch.Generator) -> Tensor:
+    def add_noise(self, states: Tensor, noise: float, generator: torch.Generator) -> Tensor:
         """Adds noise to limited states (batch, state) in training, so that no number alone decides.
 
         Half of the numbers get little noise; dimensions that hardly move get more than they move.
 
         Args:
             states: Limited states, (batch, state).
+            noise: Standard deviation of the noise.
             generator: Source of the draws, on the CPU.
         """
-        std = torch.maximum(1 - self.scale, self.scale.new_tensor(_NOISE))
+        std = torch.maximum(1 - self.scale, self.scale.new_tensor(noise))
         is_noisy = torch.rand(states.shape, generator=generator) < _P_NOISE
-        noise = torch.randn(states.shape, generator=generator) * is_noisy
-        return states + std * noise.to(states)
+        drawn = torch.randn(states.shape, generator=generator) * is_noisy
+        return states + std * drawn.to(states)

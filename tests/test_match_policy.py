@@ -230,7 +230,7 @@ def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):
     # Divided by 3 % of the median, 0.2, and clipped.
     limited = limits(torch.tensor([1.0, -9.0, 300.0, 0.0]))
     torch.testing.assert_close(limited, torch.tensor([1.0, -5.0, 0.5, 0.0]))
-    noise = limits.add_noise(torch.zeros(5000, 4), torch.Generator().manual_seed(0))
+    noise = limits.add_noise(torch.zeros(5000, 4), 0.1, torch.Generator().manual_seed(0))
     assert (noise == 0).float().mean() == pytest.approx(0.5, abs=0.02)
     assert (noise / 0.5**0.5).std(dim=0).tolist() == pytest.approx([0.1, 0.1, 1.0, 0.1], rel=0.1)
     assert StateLimits(3, None)(torch.ones(3)).tolist() == [1, 1, 1]

@@ -48,6 +48,7 @@ def test_invalid_options_say_what_is_valid():
         ({"normalization_mapping": {"VISUAL": MEAN_STD}}, "`normalization_mapping` must be IDENTITY for VIS"),
         ({"p_hue_augmentation": 1.5}, "`p_hue_augmentation` must be from 0 to 1"),
         ({"location_noise": -0.1}, "`location_noise` must be from 0 to 1"),
+        ({"state_noise": -1}, "`state_noise` must be from 0 to 10"),
         ({"n_demonstrations": 0}, "`n_demonstrations` must be from 1"),
         ({"n_demonstrations": 5, "demo_episode": 0}, "names a single demonstration, but .* is 5"),
         ({"grasp_height_bias": float("nan")}, "`grasp_height_bias` must be from -10 to 10"),

@@ -38,6 +38,7 @@ OPTIONS = {
         "crop_size": [0.17, 0.3, 0.0],
         "grasp_height_bias": [0.0, 0.75, 99],
         "location_noise": [0.0, 0.01, -1],
+        "state_noise": [0.0, 0.5, -1],
         "p_hue_augmentation": [0.0, 0.5, 1.5],
         "frames_after_release": [None, 2, -1],
     },

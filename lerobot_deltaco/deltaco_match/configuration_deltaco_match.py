@@ -27,6 +27,8 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         location_noise: Standard deviation of the noise on the pick and place locations in training, where the
             image's edges are at -1 and 1; by default, a pixel of 48. If that is more than the gripper's room
             beside an object, choose less, but no less than the error of the locations.
+        state_noise: Standard deviation of the noise on half of the numbers of the robot's state in training,
+            in their standard deviations over the training episodes. Less is more precise.
         p_hue_augmentation: Probability that a training sample's observation and demonstration undergo the
             same random change of hue, saturation and brightness.
         frames_after_release: Number of frames after the gripper has opened for the last time in an episode
@@ -40,6 +42,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     num_mixture_components: int = 5
     grasp_height_bias: float = 0.5
     location_noise: float = 0.04
+    state_noise: float = 0.1
     p_hue_augmentation: float = 0.7
     frames_after_release: int | None = 2
     paraphrases: str | None = "grammar"
@@ -63,6 +66,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             n_demonstrations=(1, 1000),
             grasp_height_bias=(-10, 10),
             location_noise=(0, 1),
+            state_noise=(0, 10),
             p_hue_augmentation=(0, 1),
             frames_after_release=(0, 1_000_000),
         )

@@ -424,7 +424,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """Returns the robot's state, and its offsets from the states at the locations, (batch, 3 state)."""
         state = self.state_limits(batch[OBS_STATE])
         if generator is not None:
-            state = self.state_limits.add_noise(state, generator)
+            state = self.state_limits.add_noise(state, self.config.state_noise, generator)
         offsets = self.robot_states(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
 
