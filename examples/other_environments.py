@@ -47,7 +47,14 @@ def make_so101(**options: Any) -> gym.Env:
             observation, reward, terminated, truncated, info = super().step(action)
             return observation, reward, terminated, truncated, {"is_success": info["succeed"]}
 
+        def _compute_observation(self) -> dict[str, Any]:
+            self.picture = self.draw()
+            return super()._compute_observation()
+
         def render(self) -> np.ndarray:
+            return self.picture
+
+        def draw(self) -> np.ndarray:
             if self._viewer is None:
                 self._viewer = mujoco.Renderer(self.model, 2 * IMAGE_SIZE, 2 * IMAGE_SIZE)
             self._viewer.update_scene(self.data, camera="front")
