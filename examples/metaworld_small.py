@@ -1,4 +1,4 @@
-"""Tasks of Meta-World that fit a processor, for `lerobot-eval`, and a recorder of their scripted policies.
+"""Tasks of Meta-World with small pictures, for `lerobot-eval`, and a recorder of their scripted policies.
 
     python examples/metaworld_small.py --root data/metaworld --episodes-per-task 25
 

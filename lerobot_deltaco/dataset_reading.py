@@ -158,12 +158,13 @@ def episodes_trained_on(meta: LeRobotDatasetMetadata) -> list[int]:
     """
     chosen = list(dict.fromkeys(training_argument("dataset.episodes") or range(meta.total_episodes)))
     check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
-    eval_split = training_argument("dataset.eval_split") or 0
+    eval_split = training_argument("dataset.eval_split")
+    if not eval_split:
+        return chosen
+    # As LeRobot's `make_train_eval_datasets`, which does not tell.
     of_task: dict[str, list[int]] = {}
-    if eval_split:
-        for episode, tasks in enumerate(meta.episodes["tasks"]):
-            if episode in chosen:
-                of_task.setdefault(tasks[0], []).append(episode)
+    for episode, tasks in zip(chosen, meta.episodes.select(chosen)["tasks"], strict=True):
+        of_task.setdefault(next(iter(tasks), ""), []).append(episode)
     held_out = {n for own in of_task.values() for n in own[len(own) - math.ceil(len(own) * eval_split) :]}
     return [episode for episode in chosen if episode not in held_out]
 

