@@ -48,7 +48,14 @@ MAX_ATTEMPTS = 100
 # Outside `observation.`, so that no policy takes them as an input.
 PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_container", "benchmark.seed")
 # Held-out tasks, whose episodes are for validation.
-HELD_OUT = ("scenario_a_test", "scenario_a_clean_test", "scenario_a_validation", "scenario_b_test", "foreign")
+HELD_OUT = (
+    "scenario_a_test",
+    "scenario_a_clean_test",
+    "scenario_a_validation",
+    "scenario_b_test",
+    "foreign",
+    "foreign_validation",
+)
 
 
 class CollectionError(RuntimeError):

@@ -24,7 +24,14 @@ import tyro
 from gym_deltaco.atomic_files import read_json, write_json
 from lerobot_deltaco.checkpoints import find_checkpoints
 from lerobot_deltaco.collect import CollectionPlan, is_finished
-from lerobot_deltaco.recipes import ExperimentError, Recipe, Scale, experiment_names, read_recipe
+from lerobot_deltaco.recipes import (
+    ExperimentError,
+    Recipe,
+    Scale,
+    experiment_names,
+    experiments_named,
+    read_recipe,
+)
 from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord, read_records
 
 
@@ -230,7 +237,8 @@ def run_experiments(
     """Runs the steps of experiments that are not finished yet.
 
     Args:
-        names: Experiments, such as scenario_a/deltaco. Without any, their names are printed.
+        names: Experiments, such as scenario_a/deltaco, or whole families, such as folds. Without any, the
+            names of all experiments are printed.
         scale: Size of data, networks and training: small for a CPU, or the paper's.
         seed: Seeds of the training; each is a separate run.
         out: Folder of all outputs.
@@ -242,7 +250,8 @@ def run_experiments(
     """
     if not names:
         return "\n".join(experiment_names())
-    recipes = [read_recipe(name, scale, settings) for name in dict.fromkeys(names)]
+    names = experiments_named(names)
+    recipes = [read_recipe(name, scale, settings) for name in names]
     # Fine-tuning starts once the runs that it may start from are done.
     recipes.sort(key=lambda recipe: recipe.start_from in names)
     runs = [Run(recipe, each, out) for recipe in recipes for each in dict.fromkeys(seed)]

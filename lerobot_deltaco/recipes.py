@@ -6,6 +6,7 @@ mistakes are found before anything is collected.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, make_dataclass
 from functools import cache
@@ -81,6 +82,13 @@ def experiment_names(path: Path = RECIPES) -> list[str]:
     """Returns the names of all experiments, in the order of the file."""
     families = _read_file(path)["families"]
     return [f"{family}/{row}" for family, rows in families.items() for row in rows if row != SHARED]
+
+
+def experiments_named(names: Sequence[str]) -> list[str]:
+    """Returns the experiments that are meant by names of experiments and of families."""
+    every = experiment_names()
+    meant = ([each for each in every if each.startswith(f"{name}/")] or [name] for name in names)
+    return list(dict.fromkeys(itertools.chain.from_iterable(meant)))
 
 
 def read_recipe(

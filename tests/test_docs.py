@@ -16,7 +16,7 @@ import tyro
 
 from gym_deltaco.tasks import OBJECTS, TASK_SETS
 from lerobot_deltaco import cli
-from lerobot_deltaco.recipes import read_recipe
+from lerobot_deltaco.recipes import experiments_named, read_recipe
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -115,7 +115,7 @@ def check(words, monkeypatch):
             return
         parsed = parse_deltaco(name, arguments)
         if name == "experiment":
-            for experiment in parsed["names"]:
+            for experiment in experiments_named(parsed["names"]):
                 read_recipe(experiment, parsed.get("scale", "small"), parsed.get("settings", ()))
     elif command in LEROBOT_CONFIGURATIONS and arguments != ["--help"]:
         parse_lerobot(command, arguments, monkeypatch)

@@ -10,7 +10,13 @@ from example_records import make_record
 from lerobot_deltaco import experiments
 from lerobot_deltaco.checkpoints import find_checkpoints
 from lerobot_deltaco.experiments import Run, last_step, run_experiments
-from lerobot_deltaco.recipes import RECIPES, ExperimentError, experiment_names, read_recipe
+from lerobot_deltaco.recipes import (
+    RECIPES,
+    ExperimentError,
+    experiment_names,
+    experiments_named,
+    read_recipe,
+)
 from lerobot_deltaco.records import write_records
 
 CONFIG = {"type": "deltaco", "input_features": {"image": {"type": "VISUAL", "shape": [3, 48, 48]}}}
@@ -111,6 +117,14 @@ def test_rows_of_the_paper_are_there_at_its_scale(family):
     assert {recipe.training.steps for recipe in recipes} <= {800_000, 300_000}
     assert {recipe.evaluation.trials for recipe in recipes} == {2}
     assert all("backbone" not in recipe.policy for recipe in recipes if "paper_arch" not in recipe.name)
+
+
+def test_a_family_stands_for_its_experiments():
+    assert experiments_named(["folds", "folds/fold_0", "scenario_a/mcil"]) == [
+        *("folds/fold_0", "folds/fold_1", "folds/fold_2", "folds/meshes"),
+        "scenario_a/mcil",
+    ]
+    assert experiments_named(["fold"]) == ["fold"]  # which read_recipe refuses
 
 
 def test_layers_add_up():

@@ -18,14 +18,16 @@ from lerobot_deltaco.records import EvaluationPlan
 TASKS = TASK_SETS["foreign"]
 
 
-def test_each_object_is_the_target_of_one_task():
-    targets = [get_task(index).target_object for index in TASKS]
-    assert targets == [label.index for label in select_objects("foreign")]
+@pytest.mark.parametrize("name", ["foreign", "foreign_validation"])
+def test_each_object_is_the_target_of_one_task(name):
+    tasks = [get_task(index) for index in TASK_SETS[name]]
+    targets = [task.target_object for task in tasks]
+    assert targets == [label.index for label in select_objects(name)]
     assert len(targets) == len(set(targets)) == 96
-    containers = [get_task(index).container for index in TASKS]
+    containers = [task.container for task in tasks]
     assert {containers.count(word) for word in CONTAINER_WORDS} == {16}
     instructions = {f"Put thing in {word} bin." for word in CONTAINER_WORDS}
-    assert {get_task(index).instruction for index in TASKS} == instructions
+    assert {task.instruction for task in tasks} == instructions
     assert all(target - 20_000 in MESHES and find_label(target).index == target for target in targets)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from functools import cache
 from types import MappingProxyType
 
@@ -13,12 +14,18 @@ from gym_deltaco.tasks import (
     FIRST_FOREIGN_INDEX,
     FOLDS,
     FOREIGN_MESHES,
+    FOREIGN_VALIDATION_MESHES,
     MESHES,
     OBJECTS,
     SCENARIOS,
     ObjectLabel,
     fold_pairs,
 )
+
+
+def _foreign_labels(meshes: Iterable[int]) -> tuple[ObjectLabel, ...]:
+    return tuple(foreign_label(FIRST_FOREIGN_INDEX + mesh) for mesh in meshes)
+
 
 OBJECT_SETS = MappingProxyType(
     {
@@ -27,14 +34,21 @@ OBJECT_SETS = MappingProxyType(
         "all": OBJECTS,
         # Without the 8 test objects of scenario A.
         "scenario_a_train": tuple(label for label in OBJECTS if label.index in SCENARIOS["a"].train_rows),
-        "foreign": tuple(foreign_label(FIRST_FOREIGN_INDEX + mesh) for mesh in FOREIGN_MESHES),
+        "foreign": _foreign_labels(FOREIGN_MESHES),
+        "foreign_validation": _foreign_labels(FOREIGN_VALIDATION_MESHES),
         # Also those that the expert does not manage
-        "foreign_unchecked": tuple(foreign_label(FIRST_FOREIGN_INDEX + mesh) for mesh in MESHES),
+        "foreign_unchecked": _foreign_labels(MESHES),
     }
 )
 MAX_OBJECTS = 10_000
 # Default objects of task sets that do not draw their scenes from all objects
-_OBJECTS_OF_TASK_SETS = MappingProxyType({"scenario_a_clean_train": "scenario_a_train", "foreign": "foreign"})
+_OBJECTS_OF_TASK_SETS = MappingProxyType(
+    {
+        "scenario_a_clean_train": "scenario_a_train",
+        "foreign": "foreign",
+        "foreign_validation": "foreign_validation",
+    }
+)
 
 
 def select_objects(name: str) -> tuple[ObjectLabel, ...]:

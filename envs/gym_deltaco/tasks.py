@@ -363,9 +363,18 @@ def _fold_validation_tasks(fold: int) -> tuple[int, ...]:
     return tuple(task.index for task in TASKS if set(task.targets) & set(FOLDS[fold]))
 
 
-# The first meshes that the expert manages. Each is the target of one task, so that none is more likely than
-# the two distractors beside it.
-FOREIGN_MESHES: tuple[int, ...] = tuple(json.loads(FOREIGN_FILE.read_text(encoding="utf-8")))[:96]
+# Meshes that the expert manages: the first ones for the test, the next ones for choosing settings. Each is
+# the target of one task, so that none is more likely than the two distractors beside it.
+_MESHES_OF_EXPERT: tuple[int, ...] = tuple(json.loads(FOREIGN_FILE.read_text(encoding="utf-8")))
+FOREIGN_MESHES, FOREIGN_VALIDATION_MESHES = _MESHES_OF_EXPERT[:96], _MESHES_OF_EXPERT[96:192]
+
+
+def _foreign_tasks(meshes: tuple[int, ...]) -> tuple[int, ...]:
+    """Returns one task for each mesh, the containers in turn."""
+    return tuple(
+        _FOREIGN_TASKS.start + 1000 * (number % N_COLUMNS) + mesh for number, mesh in enumerate(meshes)
+    )
+
 
 TASK_SETS = MappingProxyType(
     {
@@ -381,11 +390,9 @@ TASK_SETS = MappingProxyType(
         # For the objects "fold_K:N", and for "scenario_a_train"
         **{f"scenario_a_fold_{fold}_train": _fold_train_tasks(fold) for fold in range(len(FOLDS))},
         **{f"scenario_a_fold_{fold}_validation": _fold_validation_tasks(fold) for fold in range(len(FOLDS))},
-        # For the objects "foreign": one task for each mesh, the containers in turn
-        "foreign": tuple(
-            _FOREIGN_TASKS.start + 1000 * (number % N_COLUMNS) + mesh
-            for number, mesh in enumerate(FOREIGN_MESHES)
-        ),
+        # For the objects of the same names
+        "foreign": _foreign_tasks(FOREIGN_MESHES),
+        "foreign_validation": _foreign_tasks(FOREIGN_VALIDATION_MESHES),
     }
 )
 
