@@ -55,7 +55,7 @@ _WORD_PENALTY = 0.03  # of each word's weight
 _COUNTS = 0.5  # weight from which on a word is shown as one that describes the object
 _MAP_STD = 0.8  # of a candidate, in cells
 _MAX_DISTANCE = 0.19  # from a grasp, of the proposal that stands for it: 4.5 px of 48
-_ENCODED_AT_A_TIME = 16
+_ENCODED_AT_A_TIME, _NORMALIZED_AT_A_TIME = 16, 256
 
 
 class Candidates(NamedTuple):
@@ -297,20 +297,22 @@ class FeatureMatching(nn.Module):
     ) -> None:
         pairs, device = _Pairs(tasks), features.device
         self.compare.set_statistics(features)
+        for some in features.split(_NORMALIZED_AT_A_TIME):  # once and in place: they are large
+            some.copy_(self.compare.inputs(some))
         said, first = self._encoded_sentences(tasks, sentences, device)
         groups: list[dict[str, Any]] = [
             {"params": self.compare.parameters(), "lr": _LEARNING_RATE, "weight_decay": _WEIGHT_DECAY},
             {"params": self.grasp_height.parameters(), "lr": _LEARNING_RATE, "weight_decay": _WEIGHT_DECAY},
             {"params": self.word_weights.parameters(), "lr": _WORD_LEARNING_RATE, "weight_decay": 0.0},
         ]
-        optimizer = torch.optim.AdamW(groups)
+        optimizer = torch.optim.AdamW(groups, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer, [group["lr"] for group in groups], steps, pct_start=_WARMUP_FRACTION
         )
         for _ in tqdm(range(steps), desc="Fitting the comparison", unit="step", leave=False):
             scenes, others = (rows.to(device) for rows in pairs.draw(_SCENES_PER_STEP, generator))
-            crops = torch.cat([features[scenes], features[others, target[others]][:, None]], dim=1)
-            described = self.compare(crops, generator)
+            crops = torch.cat([features[scenes], features[others, target[others]][:, None]], dim=1).float()
+            described = self.compare.describe(crops, generator)
             matches, _ = self.compare.match(described.among(slice(-1)), described.descriptors[:, -1])
             loss = F.nll_loss(matches, target[scenes])
             draws = torch.rand(len(scenes), generator=generator)
@@ -321,11 +323,11 @@ class FeatureMatching(nn.Module):
             loss = loss + self._word_losses(described.words[:, :-1], left, sentence, target[scenes])
             rows = torch.arange(len(scenes), device=device)
             with torch.no_grad():  # as similar as they are without dropout
-                plain = self.compare(crops)
-                _, similarity = self.compare.match(plain.among(slice(-1)), plain.descriptors[:, -1])
+                plain = self.compare.describe(torch.stack([crops[rows, target[scenes]], crops[:, -1]], dim=1))
+                _, similarity = self.compare.match(plain.among(slice(1)), plain.descriptors[:, 1])
             height_losses = self.grasp_height.losses(
                 described.hidden[rows, target[scenes]],
-                similarity[rows, target[scenes]],
+                similarity[:, 0],
                 heights[others],
                 heights[scenes],
             )
@@ -414,15 +416,22 @@ class Comparison(nn.Module):
         self.mean.copy_(some.mean(dim=0))
         self.std.copy_(some.std(dim=0).clamp_min(_MIN_STD))
 
-    def forward(self, features: Tensor, generator: torch.Generator | None = None) -> Crops:
+    def forward(self, features: Tensor) -> Crops:
+        """Describes crops by their features (batch, n, FEATURE_DIM)."""
+        return self.describe(self.inputs(features))
+
+    def inputs(self, features: Tensor) -> Tensor:
+        """Normalizes features, (batch, n, FEATURE_DIM)."""
+        inputs = ((features.float() - self.mean) / self.std).clamp(-_MAX_FEATURE, _MAX_FEATURE)
+        return torch.cat([inputs[..., :-COLOR_DIM], _COLOR_WEIGHT * inputs[..., -COLOR_DIM:]], dim=-1)
+
+    def describe(self, inputs: Tensor, generator: torch.Generator | None = None) -> Crops:
         """Describes crops.
 
         Args:
-            features: (batch, n, FEATURE_DIM).
+            inputs: Normalized features, (batch, n, FEATURE_DIM).
             generator: Source of dropout's draws, on the CPU; None for no dropout.
         """
-        inputs = ((features.float() - self.mean) / self.std).clamp(-_MAX_FEATURE, _MAX_FEATURE)
-        inputs = torch.cat([inputs[..., :-COLOR_DIM], _COLOR_WEIGHT * inputs[..., -COLOR_DIM:]], dim=-1)
         inputs = _dropout(inputs, generator)
         hidden = _dropout(F.relu(self.hidden(inputs)), generator)
         descriptors = self.linear(inputs) + self.from_hidden(hidden)
@@ -486,8 +495,8 @@ def _nearest(proposed: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
 def _dropout(values: Tensor, generator: torch.Generator | None) -> Tensor:
     if generator is None:
         return values
-    kept = torch.rand(values.shape, generator=generator).to(values) >= _DROPOUT
-    return values * kept / (1 - _DROPOUT)
+    scale = torch.rand(values.shape, generator=generator).ge_(_DROPOUT).div_(1 - _DROPOUT)
+    return values * scale.to(values)
 
 
 class _Pairs:

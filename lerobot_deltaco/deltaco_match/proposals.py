@@ -47,7 +47,9 @@ class ProposalNetwork(nn.Module):
             steps: Number of training steps.
         """
         self.layers.train()
-        optimizer = torch.optim.AdamW(self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+        optimizer = torch.optim.AdamW(
+            self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, fused=True
+        )
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer, _LEARNING_RATE, steps, pct_start=_WARMUP_FRACTION
         )
