@@ -106,36 +106,29 @@ class SO101PickPlaceConfig(EnvConfig):
         return {"max_episode_steps": self.episode_length}
 
 
-def scripted_episode(
-    env: Any, seed: int, noise: float = 0.0
-) -> Iterator[tuple[dict[str, Any], np.ndarray, bool]]:
+def scripted_episode(env: Any, seed: int) -> Iterator[tuple[dict[str, Any], np.ndarray, bool]]:
     """Yields each observation, the controller's action, and whether that succeeds.
 
-    The episode ends when the gripper has moved away from the block, a second after the success. Moves are
-    carried out with Gaussian noise of a standard deviation `noise`, so that the actions show corrections.
+    The episode ends when the gripper has moved away from the block, a second after the success.
     """
     from lerobot_env_so101.scripted.pick_place import PickPlaceController
 
     observation, _ = env.reset(seed=seed)
-    controller, rng = PickPlaceController(ACTION_SCALE), np.random.default_rng(seed)
+    controller = PickPlaceController(ACTION_SCALE)
     while not controller.done:
         block = env.data.sensor("block_pos").data.copy()
         action = controller.act(env.ik_point_pos, block, env.goal_pos)
-        disturbed = action.copy()
-        if action[:3].any():
-            disturbed[:3] += rng.normal(0, noise, 3)
-        following, _, _, _, info = env.step(disturbed.clip(-1, 1))
+        following, _, _, _, info = env.step(action)
         yield observation, action, info["is_success"]
         observation = following
 
 
-def main(root: Path, episodes: int = 100, noise: float = 0.2) -> None:
+def main(root: Path, episodes: int = 100) -> None:
     """Records successful episodes of the package's scripted controller.
 
     Args:
         root: Folder of the dataset.
         episodes: Number of episodes.
-        noise: Standard deviation of the noise with which moves are carried out, in units of 2.5 cm.
     """
     config = SO101PickPlaceConfig()
     dataset = LeRobotDataset.create(
@@ -155,7 +148,7 @@ def main(root: Path, episodes: int = 100, noise: float = 0.2) -> None:
     env, seed = make_so101(), 0
     while dataset.num_episodes < episodes:
         succeeded = False
-        for observation, action, is_success in scripted_episode(env, seed, noise):
+        for observation, action, is_success in scripted_episode(env, seed):
             succeeded |= is_success
             frame = {f"{OBS_IMAGES}.front": observation["pixels"]["front"], ACTION: action, "task": TASK}
             dataset.add_frame(frame | {OBS_STATE: observation["agent_pos"]})
