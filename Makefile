@@ -19,7 +19,7 @@ help: ## List the targets
 
 install: $(INSTALLED) ## Only set up the environment, in .venv
 
-demo: $(INSTALLED) ## Collect, train and evaluate, in 7 to 13 minutes, or make demo MINUTES=25: outputs/demo/index.html
+demo: $(INSTALLED) ## Collect, train and evaluate in minutes, or with more data by make demo MINUTES=25: outputs/demo/index.html
 	$(BIN)/deltaco demo --minutes $(MINUTES) $(ARGS)
 
 play: $(INSTALLED) ## Play with the trained policy in the browser: http://127.0.0.1:7860
