@@ -33,8 +33,8 @@ from lerobot_deltaco.statistics import followed, success_interval
 Minutes = Literal[8, 25]
 
 EXPERIMENT = "random_objects/deltaco_match"
-# Episodes of each of the 630 training tasks, and training steps, by minutes on two idle cores. 25 minutes are
-# enough for the full recipe.
+# Episodes of each of the 630 training tasks, and training steps, by the minutes that they take at most on two
+# fast, idle cores. 25 minutes are enough for the full recipe.
 BUDGETS: MappingProxyType[Minutes, tuple[int, int]] = MappingProxyType({8: (3, 1500), 25: (16, 8000)})
 
 # Success rates to compare with, on the novel tasks of scenario A, in %.
@@ -55,7 +55,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     """Collects, trains and evaluates the project's method, and writes a page.
 
     Args:
-        minutes: Duration on two idle cores; 25 is the full recipe.
+        minutes: Duration on two fast, idle cores; 25 is the full recipe.
         out: Folder of all outputs.
 
     Returns:
