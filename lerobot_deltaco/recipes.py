@@ -134,35 +134,9 @@ def read_recipe(
     return Recipe(name, scale, start_from=start_from, **{**parsed, "policy": given})
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML without duplicate keys."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [key.value for key, _ in node.value]
-        if twice := [key for key in keys if keys.count(key) > 1]:
-            raise yaml.MarkedYAMLError(problem=f"{twice[0]!r} is there twice", problem_mark=node.start_mark)
-        return super().construct_mapping(node, deep)
-
-
-def _read_yaml(text: str, source: str) -> Any:
-    try:
-        return yaml.load(text, _Loader)
-    except (yaml.YAMLError, RecursionError) as error:
-        reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
-        raise ExperimentError(f"Cannot read {source}: {reason}") from None
-
-
 @cache
 def _read_file(path: Path) -> dict[str, Any]:
-    try:
-        content = _read_yaml(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ExperimentError(f"Cannot read {path}: {error}") from None
-    for part in ("scales", "families"):
-        groups = content.get(part) if isinstance(content, dict) else None
-        if not isinstance(groups, dict) or not all(isinstance(group, dict) for group in groups.values()):
-            raise ExperimentError(f"{path} must have a mapping of mappings named {part!r}.")
-    return content
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
 def _read_setting(setting: str) -> dict[str, Any]:
@@ -171,7 +145,10 @@ def _read_setting(setting: str) -> dict[str, Any]:
         raise ExperimentError(
             f"A setting is SECTION.NAME=VALUE, such as training.steps=2000. Got {setting!r}."
         )
-    nested = _read_yaml(value, f"the value of {setting!r}")
+    try:
+        nested = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise ExperimentError(f"Cannot read the value of {setting!r}: {error}") from None
     for name in reversed(key.split(".")):
         nested = {name: nested}
     return nested

@@ -253,13 +253,13 @@ def _cell(value: Any) -> str:
 
 
 def csv_table(table: pd.DataFrame) -> str:
-    """Returns a table as CSV, estimates in three columns, and no text that a spreadsheet would compute."""
+    """Returns a table as CSV, with estimates in three columns."""
     columns: dict[str, pd.Series] = {}
     for name, values in table.items():
         if isinstance(values.iloc[0], Estimate):
             columns |= {name: values.str[0], f"{name}_low": values.str[1], f"{name}_high": values.str[2]}
         else:
-            columns[name] = values.replace(r"^(?=[=+\-@\t\r])", "'", regex=True)
+            columns[name] = values
     return pd.DataFrame(columns).round(6).to_csv(index=False, lineterminator="\n")
 
 

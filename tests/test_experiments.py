@@ -172,10 +172,6 @@ def test_a_wrong_setting_is_refused():
         ("deltaco: {}", "deltaco: {policy: 3}", "Got 'policy': 3"),
         ("deltaco: {}", "deltaco: 3", "must have the mappings"),
         ("deltaco: {}", "deltaco: {start_from: scenario_a/nothing}", "is not an experiment"),
-        ("deltaco: {}", "deltaco: {}\n    deltaco: {}", "'deltaco' is there twice"),
-        ("deltaco: {}", "deltaco: {", "Cannot read"),
-        ("deltaco: {}", "deltaco: " + "[" * 2000, "nested too deeply"),
-        ("families:", "family:", "'families'"),
     ],
 )
 def test_a_wrong_file_is_refused(tmp_path, old, new, message):
@@ -185,12 +181,7 @@ def test_a_wrong_file_is_refused(tmp_path, old, new, message):
         read_recipe("scenario_a/deltaco", path=path)
 
 
-def test_unreadable_files_and_unknown_names_and_scales_are_refused(tmp_path):
-    path = tmp_path / "recipes.yaml"
-    path.write_bytes(b"families: \xff")
-    for file in (path, tmp_path / "nothing.yaml"):
-        with pytest.raises(ExperimentError, match="Cannot read"):
-            read_recipe("scenario_a/deltaco", path=file)
+def test_unknown_names_and_scales_are_refused():
     with pytest.raises(ExperimentError, match="no experiment 'deltaco'. Valid are scenario_a/deltaco"):
         read_recipe("deltaco")
     with pytest.raises(ExperimentError, match="no scale 'paper'"):

@@ -230,7 +230,7 @@ def test_a_report_has_the_tables_of_its_records(tmp_path):
     assert links(page) == {"success.png", *(f"{table}.csv" for table in tables)}
     assert links(page) == {path.name for path in page.parent.iterdir()} - {"report.md"}
     row = pd.read_csv(page.parent / "success.csv").iloc[0]
-    assert row["experiment"] == f"'{name}"  # no formula in a spreadsheet
+    assert row["experiment"] == name
     assert row["success_low"] < row["success"] == 0.5 < row["success_high"]
     assert escape("a_b|*c*\n[d](e) `f` <g> &lt;") == r"a\_b\|\*c\* \[d\](e) \`f\` \<g\> \&lt;"
     # A later report leaves no tables of the earlier one.
