@@ -41,7 +41,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         chunk_size: Number of steps that the policy predicts at once. With None, training chooses two thirds
             of a second, or one step if episodes last less than 2.5 s.
         n_action_steps: Number of steps of a chunk that are carried out before the next one is predicted;
-            None for all.
+            None for all. If the gripper opens or closes in one of them, the whole chunk is carried out.
         temporal_ensemble_coeff: Coefficient of ACT's temporal ensembling, which predicts a chunk at every
             step and averages what the chunks say about it; None for none. It needs `n_action_steps=1`.
         trim_pauses: Whether `deltaco train` leaves out frames in which the robot has stood still for more

@@ -5,7 +5,6 @@
 import contextlib
 import copy
 import logging
-from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -21,6 +20,7 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
 from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
+from lerobot_deltaco.action_queues import ActionQueues
 from lerobot_deltaco.base_config import TaskConditionedConfig
 from lerobot_deltaco.dataset_reading import (
     check_episode_numbers,
@@ -108,8 +108,8 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.
         self._tasks: tuple[tuple[str, ...], DemonstrationsOfTasks] | None = None
         self._episode: Any = None
-        # The actions of the running chunk that are still to be carried out, and the average of all chunks.
-        self._actions: deque[Tensor] = deque()
+        # The actions of the running chunks that are still to be carried out, and the average of all chunks.
+        self._actions = ActionQueues(config.n_action_steps, config.gripper_index)
         self._ensemble: ACTTemporalEnsembler | None = None
         # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
@@ -166,10 +166,9 @@ class TaskConditionedPolicy(PreTrainedPolicy):
                 if self._ensemble is None:
                     self._ensemble = ACTTemporalEnsembler(coefficient, chunk.shape[1])
                 return self._ensemble.update(chunk)
-            if self._begins_episode(batch) or not self._actions:
-                chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
-                self._actions = deque(chunk.unbind(dim=1))
-            return self._actions.popleft()
+            if self._begins_episode(batch) or self._actions.need_chunks:
+                self._actions.refill(self.predict_action_chunk(batch))
+            return self._actions.pop()
 
     @property
     def p_pick(self) -> Tensor | None:
