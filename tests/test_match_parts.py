@@ -354,8 +354,8 @@ def shapes():
     return images, locations, [move[0] for move in moves]
 
 
-@pytest.fixture(scope="module")
-def matching(shapes):
+@pytest.fixture(scope="module", params=[False, True], ids=["float32", "bfloat16"])
+def matching(shapes, request):
     """A feature matching that is fitted to 24 of the episodes."""
     images, locations, tasks = (part[:24] for part in shapes)
     matching = FeatureMatching(vocabulary_of(SHAPE_TASKS), 0.25)
@@ -363,7 +363,12 @@ def matching(shapes):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proposals, "_SCENES_PER_STEP", 16)
         patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
-        matching.fit(images, images, images, locations, heights, tasks, sentences, seed=0, steps=60)
+        matching.fit(
+            *(images, images, images, locations, heights, tasks, sentences),
+            seed=0,
+            steps=60,
+            in_bfloat16=request.param,
+        )
     assert matching.fitted
     return matching
 
@@ -434,7 +439,10 @@ def test_words_that_describe_the_container_do_not_count(monkeypatch):
     matching.requires_grad_(True)
     sentences = {text: [text] for text in tasks}
     drawn = [tasks[n] for n in task]
-    matching._fit_comparison(features, target, torch.zeros(n_scenes), drawn, sentences, generator, 150)
+    autocast = torch.autocast("cpu", enabled=False)
+    matching._fit_comparison(
+        features, target, torch.zeros(n_scenes), drawn, sentences, generator, 150, autocast
+    )
     sentence = "Putt the red cubee in the red bin"
     weights = matching.word_weights(encode_words([sentence], matching.vocabulary))[0]
     assert weights[2] > 0.7

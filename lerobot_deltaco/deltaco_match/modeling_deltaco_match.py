@@ -479,6 +479,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 tasks,
                 self._sentences(tasks),
                 config.seed,
+                in_bfloat16=config.dtype == "bfloat16",
             )
 
     def _sentences(self, tasks: Iterable[str]) -> dict[str, list[str]]:

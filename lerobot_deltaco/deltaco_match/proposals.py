@@ -37,7 +37,14 @@ class ProposalNetwork(nn.Module):
         """Returns the proposals in scenes (batch, 3, H, W), the likeliest first: (batch, 5, 2) in -1..1."""
         return peaks(self.layers(channels_last(scenes))[:, 0].float(), N_PROPOSALS)
 
-    def fit(self, images: Tensor, locations: Tensor, generator: torch.Generator, steps: int) -> None:
+    def fit(
+        self,
+        images: Tensor,
+        locations: Tensor,
+        generator: torch.Generator,
+        steps: int,
+        autocast: torch.autocast,
+    ) -> None:
         """Fits the network.
 
         Args:
@@ -45,6 +52,7 @@ class ProposalNetwork(nn.Module):
             locations: Locations of their grasps, (episodes, 2) in -1..1.
             generator: Source of the draws, on the CPU.
             steps: Number of training steps.
+            autocast: Context of the forward pass.
         """
         self.layers.train()
         optimizer = torch.optim.AdamW(
@@ -55,7 +63,8 @@ class ProposalNetwork(nn.Module):
         )
         for _ in tqdm(range(steps), desc="Fitting the proposals", unit="step", leave=False):
             rows = torch.randint(len(images), (_SCENES_PER_STEP,), generator=generator).to(images.device)
-            maps = self.layers(channels_last(images[rows].float() / 255)).float()
+            with autocast:  # anew in each step, since it keeps the weights that it has converted
+                maps = self.layers(channels_last(images[rows].float() / 255)).float()
             loss = location_loss(maps, locations[rows, None]).mean()
             optimizer.zero_grad()
             loss.backward()
