@@ -363,12 +363,14 @@ def matching(shapes, request):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proposals, "_SCENES_PER_STEP", 16)
         patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
-        matching.fit(
-            *(images, images, images, locations, heights, tasks, sentences),
-            seed=0,
-            steps=60,
-            in_bfloat16=request.param,
-        )
+        # As in the first step of a policy's training.
+        with torch.autocast("cpu", torch.bfloat16), torch.autocast("cpu", enabled=False):
+            matching.fit(
+                *(images, images, images, locations, heights, tasks, sentences),
+                seed=0,
+                steps=60,
+                in_bfloat16=request.param,
+            )
     assert matching.fitted
     return matching
 

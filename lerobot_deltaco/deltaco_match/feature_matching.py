@@ -237,7 +237,9 @@ class FeatureMatching(nn.Module):
             PretrainedWeightsError: The encoder's weights are missing.
         """
         generator, device = torch.Generator().manual_seed(seed), images.device
-        autocast = torch.autocast(device.type, torch.bfloat16, enabled=in_bfloat16)
+        # Without its cache, which would keep the weights of the first step: it is only emptied at the end of
+        # the outermost context, here the one in which the policy is trained.
+        autocast = torch.autocast(device.type, torch.bfloat16, enabled=in_bfloat16, cache_enabled=False)
         grasps = (~locations.isnan().any(dim=1)).nonzero().flatten().cpu()
         drawn = grasps[torch.randperm(len(grasps), generator=generator)[:MAX_EPISODES]].sort().values
         _Pairs([tasks[row] for row in drawn.tolist()])  # fails before the slow part
@@ -504,7 +506,7 @@ def _nearest(proposed: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _dropout(values: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Sets half of the values to 0 and doubles the others, by draws on the CPU; nothing without a generator."""
+    """Sets half of the values to 0 and doubles the others; without a generator, returns them unchanged."""
     if generator is None:
         return values
     # One bit of a random byte for each value: eight bytes are drawn at once.

@@ -63,7 +63,7 @@ class ProposalNetwork(nn.Module):
         )
         for _ in tqdm(range(steps), desc="Fitting the proposals", unit="step", leave=False):
             rows = torch.randint(len(images), (_SCENES_PER_STEP,), generator=generator).to(images.device)
-            with autocast:  # anew in each step, since it keeps the weights that it has converted
+            with autocast:
                 maps = self.layers(channels_last(images[rows].float() / 255)).float()
             loss = location_loss(maps, locations[rows, None]).mean()
             optimizer.zero_grad()
