@@ -281,7 +281,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     def _prepare_training(self) -> None:
         """Reads the training episodes unless they have been read."""
         if self.training_bank is None:
-            # Models fitted to them do not use the training loop's mixed precision.
+            # Models fitted to them choose their own precision.
             with torch.autocast(self.step.device.type, enabled=False):
                 self._read_training_data()
 

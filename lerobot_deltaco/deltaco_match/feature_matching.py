@@ -196,6 +196,7 @@ class FeatureMatching(nn.Module):
 
     def _features(self, native: Tensor, locations: Tensor) -> Tensor:
         """Returns features of the crops at locations (batch, n, 2), (batch, n, FEATURE_DIM)."""
+        # Not as a product of matrices, which autocast would round.
         sizes = self.crop_size * (locations * self.perspective).sum(dim=-1).exp()
         return crop_features(native, locations, sizes)
 
