@@ -109,7 +109,7 @@ class TaskConditionedConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.dtype == "bfloat16" and self.device == "cpu" and not _has_bfloat16():
+        if self.dtype == "bfloat16" and self.device == "cpu" and not has_bfloat16():
             logger.warning("This CPU has no bfloat16 instructions. The policy is trained in float32.")
             self.dtype = "float32"
         try:
@@ -371,6 +371,6 @@ def check_image_shapes(shapes: dict[str, Sequence[int]]) -> None:
         )
 
 
-def _has_bfloat16() -> bool:
+def has_bfloat16() -> bool:
     """Returns whether this CPU has bfloat16 instructions; without them, bfloat16 is emulated, slowly."""
     return torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()

@@ -5,6 +5,7 @@ import pytest
 import torch
 from small_policies import TABLE_SIZE, draw_table, random_moves, state_at
 
+from lerobot_deltaco.base_config import has_bfloat16
 from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.calibration import StateToImage
 from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops, fit_perspective
@@ -14,7 +15,7 @@ from lerobot_deltaco.deltaco_match.gripper_direction import is_inverted, warn_if
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
 from lerobot_deltaco.deltaco_match.keyframes import Keyframes, find_grasps, find_keyframes, follows_gripper
 from lerobot_deltaco.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
-from lerobot_deltaco.deltaco_match.proposals import N_PROPOSALS, peaks
+from lerobot_deltaco.deltaco_match.proposals import N_PROPOSALS, ProposalNetwork, peaks
 from lerobot_deltaco.deltaco_match.robot_states import RobotStates
 from lerobot_deltaco.deltaco_match.words import encode_words, understand, vocabulary_of
 from lerobot_deltaco.demonstrations import RobotData
@@ -354,7 +355,13 @@ def shapes():
     return images, locations, [move[0] for move in moves]
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["float32", "bfloat16"])
+EMULATED = pytest.mark.skipif(not has_bfloat16(), reason="emulated bfloat16 takes minutes")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(False, id="float32"), pytest.param(True, id="bfloat16", marks=EMULATED)],
+)
 def matching(shapes, request):
     """A feature matching that is fitted to 24 of the episodes."""
     images, locations, tasks = (part[:24] for part in shapes)
@@ -495,6 +502,32 @@ def test_peaks_are_apart_and_ordered():
     x, y = peaks(maps, 3)[0].T
     assert x.tolist() == pytest.approx([-0.6, 20.5 / 15 - 1, 27.5 / 15 - 1], abs=0.04)
     assert y.tolist() == pytest.approx([-0.55, 0.55, -0.15], abs=0.03)
+
+
+def test_things_that_no_training_task_asks_for_are_proposed():
+    generator = np.random.default_rng(0)
+    moves = random_moves(80, SHAPE_TASKS)
+    grasps = torch.tensor(np.stack([move[1] for move in moves]), dtype=torch.float32)
+    images, never_grasped = [], []
+    for task, moved, other in (move[:3] for move in moves):
+        image = draw_shapes(task, moved, other)
+        while True:
+            row, column = generator.integers(5, SIZE - 5, 2)
+            location = (np.array([column, row]) + 0.5) * 2 / SIZE - 1
+            if min(np.abs(location - each).max() for each in (moved, other)) > 0.45:
+                break
+        image[row - 3 : row + 4, column - 3 : column + 4] = (200, 80, 40)
+        images.append(image)
+        never_grasped.append(location)
+    scenes, thing = stacked_images(images), torch.tensor(np.stack(never_grasped), dtype=torch.float32)
+    torch.manual_seed(0)
+    network, autocast = ProposalNetwork().requires_grad_(True), torch.autocast("cpu", enabled=False)
+    network.fit(scenes[:60], grasps[:60], torch.Generator().manual_seed(0), 100, autocast)
+    with torch.no_grad():
+        proposed = network(scenes[60:].float() / 255)
+    for locations in (grasps[60:], thing[60:]):
+        distance = (proposed - locations[:, None]).norm(dim=2).amin(dim=1)
+        assert (distance < 0.19).float().mean() >= 0.9
 
 
 def test_words_are_understood():

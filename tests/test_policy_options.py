@@ -63,7 +63,7 @@ def test_invalid_options_say_what_is_valid():
 
 def test_bfloat16_needs_instructions_of_the_processor(monkeypatch, caplog):
     for supported, dtype in ((True, "bfloat16"), (False, "float32")):
-        monkeypatch.setattr(base_config, "_has_bfloat16", lambda: supported)  # noqa: B023
+        monkeypatch.setattr(base_config, "has_bfloat16", lambda: supported)  # noqa: B023
         assert DeltacoMatchConfig(device="cpu").dtype == dtype
         assert ("no bfloat16 instructions" in caplog.text) == (not supported)
 
