@@ -20,7 +20,7 @@ import lerobot_policy_deltaco  # noqa: F401  (registers the types of this projec
 from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
 from lerobot_deltaco import language
 from lerobot_deltaco.collect import CollectionPlan, collect
-from lerobot_deltaco.deltaco_match import feature_matching
+from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
@@ -85,7 +85,7 @@ def use_short_fit(monkeypatch, steps=2):
         return torch.nn.functional.pad(crops, (0, FEATURE_DIM - crops.shape[2]))
 
     monkeypatch.setattr(feature_matching, "crop_features", colors)
-    monkeypatch.setattr(feature_matching, "_MAX_DISTANCE", 9.0)  # any proposal will do
+    monkeypatch.setattr(proposals, "GRASP_RADIUS", 9.0)  # any proposal will do
     monkeypatch.setattr(feature_matching.FeatureMatching.fit, "__defaults__", (steps,))
 
 

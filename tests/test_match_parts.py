@@ -355,12 +355,12 @@ def shapes():
     return images, locations, [move[0] for move in moves]
 
 
-EMULATED = pytest.mark.skipif(not has_bfloat16(), reason="emulated bfloat16 takes minutes")
+NEEDS_BFLOAT16 = pytest.mark.skipif(not has_bfloat16(), reason="emulated bfloat16 takes minutes")
 
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(False, id="float32"), pytest.param(True, id="bfloat16", marks=EMULATED)],
+    params=[pytest.param(False, id="float32"), pytest.param(True, id="bfloat16", marks=NEEDS_BFLOAT16)],
 )
 def matching(shapes, request):
     """A feature matching that is fitted to 24 of the episodes."""

@@ -56,7 +56,6 @@ _OTHER_PROPOSALS = 0.2  # by which the gradients of a scene's other proposals ar
 _WORD_PENALTY = 0.03  # of each word's weight
 _COUNTS = 0.5  # weight from which on a word is shown as one that describes the object
 _MAP_STD = 0.8  # of a candidate, in cells
-_MAX_DISTANCE = 0.19  # from a grasp, of the proposal that stands for it: 4.5 px of 48
 _ENCODED_AT_A_TIME, _NORMALIZED_AT_A_TIME = 16, 256
 
 
@@ -531,7 +530,7 @@ def _word_scores(words: Tensor, said: Tensor, weights: Tensor) -> Tensor:
 def _nearest(proposed: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
     """Returns which proposal is nearest to locations (batch, 2), and whether it is near, (batch,) each."""
     distance, nearest = (proposed - locations[:, None]).norm(dim=2).min(dim=1)
-    return nearest, distance < _MAX_DISTANCE
+    return nearest, distance < proposals.GRASP_RADIUS
 
 
 def _dropout(values: Tensor, generator: torch.Generator | None) -> Tensor:

@@ -18,9 +18,9 @@ FIT_STEPS = 800
 _SCENES_PER_STEP = 48
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
 _P_NEW_COLORS = 0.5
-# What stands out beside the grasped object is left out of the loss: cells near as many of the highest peaks,
-# but away from the grasp.
-_LEFT_OUT_PEAKS, _LEFT_OUT_RADIUS, _GRASP_RADIUS = 16, 0.25, 0.19
+GRASP_RADIUS = 0.19  # around a grasp: a proposal within it stands for the grasped object; 4.5 px of 48
+# The loss leaves out the cells within this radius of the map's highest peaks, unless a grasp is near.
+_LEFT_OUT_PEAKS, _LEFT_OUT_RADIUS = 16, 0.25
 _LEFT_OUT_LOGIT = -30.0
 
 
@@ -114,11 +114,11 @@ def _stands_out(maps: Tensor, grasps: Tensor) -> Tensor:
     """Returns which cells of maps (batch, h, w) are near high peaks, but not near grasps, (batch, h, w)."""
     height, width = maps.shape[1:]
     found = peaks(maps, _LEFT_OUT_PEAKS)
-    is_other = (found - grasps[:, None]).norm(dim=2) > _GRASP_RADIUS
+    is_other = (found - grasps[:, None]).norm(dim=2) > GRASP_RADIUS
     centers = _centers(height, width, maps.device)
     to_peaks = (centers - found[:, :, None]).norm(dim=-1)  # (batch, peaks, cells)
     near = ((to_peaks < _LEFT_OUT_RADIUS) & is_other[..., None]).any(dim=1)
-    return (near & ((centers - grasps[:, None]).norm(dim=-1) > _GRASP_RADIUS)).unflatten(1, (height, width))
+    return (near & ((centers - grasps[:, None]).norm(dim=-1) > GRASP_RADIUS)).unflatten(1, (height, width))
 
 
 def _centers(height: int, width: int, device: torch.device) -> Tensor:
