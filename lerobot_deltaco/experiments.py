@@ -2,7 +2,7 @@
 
     recipe -> collect -> train -> evaluate -> report
 
-Each step is a `deltaco` command in a process of its own. Finished steps are skipped, so the same command
+Each step is a `deltaco` command. Finished steps are skipped, so the same command
 continues after an interruption.
 """
 
@@ -203,16 +203,21 @@ def _text(value: Any) -> str:
 
 
 def call(arguments: Sequence[str]) -> None:
-    """Runs a `deltaco` command in a process of its own.
+    """Runs a `deltaco` command in a process of its own; an evaluation in this one, which imports LeRobot once.
 
     Args:
         arguments: Subcommand and its arguments.
 
     Raises:
-        ExperimentError: The command failed.
+        ExperimentError: The command failed in another process.
     """
     sys.stdout.write(f"\n{command_line(arguments)}\n")
     sys.stdout.flush()
+    if arguments[0] == "evaluate":
+        from lerobot_deltaco import cli  # which imports this module
+
+        cli.run(*arguments)
+        return
     status = subprocess.run([sys.executable, "-m", "lerobot_deltaco.cli", *arguments], check=False).returncode
     if status != 0:
         raise ExperimentError(

@@ -1,13 +1,14 @@
 import itertools
 import json
 import re
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 from example_records import make_record
 
-from lerobot_deltaco import experiments
+from lerobot_deltaco import evaluate, experiments
 from lerobot_deltaco.checkpoints import find_checkpoints
 from lerobot_deltaco.experiments import Run, last_step, run_experiments
 from lerobot_deltaco.recipes import (
@@ -262,6 +263,18 @@ def test_a_command_that_fails_is_named(capfd):
     with pytest.raises(ExperimentError, match=r"`deltaco no_such_command` failed \(exit status 1\)"):
         experiments.call(["no_such_command"])
     assert capfd.readouterr().out.strip() == "deltaco no_such_command"
+
+
+def test_evaluations_run_in_the_same_process(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    given = []
+    monkeypatch.setattr(
+        evaluate, "evaluate_checkpoints", lambda arguments: given.append((arguments, sys.argv))
+    )
+    experiments.call(["evaluate", str(tmp_path), "--trials", "1"])
+    ((arguments, command),) = given
+    assert (arguments.checkpoint, arguments.plan.trials) == (tmp_path, 1)
+    assert command == ["deltaco", "evaluate", str(tmp_path), "--trials", "1"]
 
 
 def test_policies_accept_their_options():
