@@ -203,7 +203,7 @@ def _text(value: Any) -> str:
 
 
 def call(arguments: Sequence[str]) -> None:
-    """Runs a `deltaco` command in a process of its own; an evaluation in this one, which imports LeRobot once.
+    """Runs a `deltaco` command in its own process; an evaluation in this one, to import LeRobot once.
 
     Args:
         arguments: Subcommand and its arguments.
