@@ -35,7 +35,7 @@ Minutes = Literal[8, 25]
 EXPERIMENT = "random_objects/deltaco_match"
 # Episodes of each of the 630 training tasks, and training steps, by the minutes that they take at most on two
 # fast, idle cores. 25 minutes are enough for the full recipe.
-BUDGETS: MappingProxyType[Minutes, tuple[int, int]] = MappingProxyType({8: (3, 1500), 25: (16, 8000)})
+BUDGETS: MappingProxyType[Minutes, tuple[int, int]] = MappingProxyType({8: (3, 800), 25: (16, 8000)})
 
 # Success rates to compare with, on the novel tasks of scenario A, in %.
 CHANCE = 16.7  # one of three objects, one of two containers

@@ -1,4 +1,4 @@
-"""`--policy.type=deltaco_match`; the defaults are the recipe of the shipped policy."""
+"""`--policy.type=deltaco_match`; the defaults are the options of the shipped policy."""
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 

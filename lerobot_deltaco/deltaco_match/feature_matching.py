@@ -46,7 +46,8 @@ _P_OTHER_OBJECT, _SHARPNESS = 0.5, 1.5
 _COLOR_WEIGHT = 2.0  # of colors among the features
 _INITIAL_GATE = (8.0, -5.0)  # slope and offset of the logit that a proposal is the very object, by its cosine
 # Of the fit.
-FIT_STEPS = 1500
+_MIN_STEPS, _MAX_STEPS = 400, 1500
+_DRAWS = 16  # of each scene, within these bounds
 MAX_EPISODES = 10_000
 _SCENES_PER_STEP = 64
 _LEARNING_RATE, _WORD_LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 1e-3, 3e-3, 0.2, 0.1
@@ -211,7 +212,7 @@ class FeatureMatching(nn.Module):
         tasks: Sequence[str],
         sentences: Mapping[str, Sequence[str]],
         seed: int,
-        steps: int = FIT_STEPS,
+        steps: int | None = None,
         *,
         in_bfloat16: bool = False,
     ) -> None:
@@ -231,7 +232,7 @@ class FeatureMatching(nn.Module):
             tasks: Task of each episode.
             sentences: Instructions of each task, one of which is drawn for an episode in each step.
             seed: Seed of the initial weights and of the draws.
-            steps: Number of steps of the comparison.
+            steps: Number of steps of the comparison; None for as many as the number of episodes needs.
             in_bfloat16: Whether convolutions and linear layers compute in bfloat16, which takes half the time
                 on a CPU that has it.
 
@@ -246,6 +247,8 @@ class FeatureMatching(nn.Module):
         grasps = (~locations.isnan().any(dim=1)).nonzero().flatten().cpu()
         drawn = grasps[torch.randperm(len(grasps), generator=generator)[:MAX_EPISODES]].sort().values
         _Pairs([tasks[row] for row in drawn.tolist()])  # fails before the slow part
+        if steps is None:
+            steps = min(max(_MIN_STEPS, _DRAWS * len(drawn) // _SCENES_PER_STEP), _MAX_STEPS)
         with torch.random.fork_rng(devices=[]), torch.enable_grad():
             torch.manual_seed(seed)
             for layer in self.modules():
