@@ -53,7 +53,7 @@ def main() -> None:
         return
     logging.basicConfig(format="%(levelname)s %(message)s", level=logging.WARNING)
     try:
-        run(name, *arguments)
+        _run(name, arguments)
     except KeyboardInterrupt:
         sys.exit("\nInterrupted. Run the same command again to continue.")
     except Exception as error:
@@ -71,11 +71,9 @@ def main() -> None:
         raise
 
 
-def run(name: str, *arguments: str) -> None:
-    """Runs a subcommand, and prints its result."""
-    # LeRobot parses it, and records hold it.
-    sys.argv = ["lerobot-train", *arguments] if name == "train" else ["deltaco", name, *arguments]
+def _run(name: str, arguments: Sequence[str]) -> None:
     if name == "train":
+        sys.argv = ["lerobot-train", *arguments]
         import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
         from lerobot_deltaco.train import train
 

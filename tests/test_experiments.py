@@ -265,16 +265,20 @@ def test_a_command_that_fails_is_named(capfd):
     assert capfd.readouterr().out.strip() == "deltaco no_such_command"
 
 
-def test_evaluations_run_in_the_same_process(tmp_path, monkeypatch):
+def test_evaluations_run_in_the_same_process(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", sys.argv)
     given = []
-    monkeypatch.setattr(
-        evaluate, "evaluate_checkpoints", lambda arguments: given.append((arguments, sys.argv))
-    )
+
+    def evaluate_checkpoints(arguments):
+        given.append((arguments, sys.argv))
+        return "50.0 % succeeded."
+
+    monkeypatch.setattr(evaluate, "evaluate_checkpoints", evaluate_checkpoints)
     experiments.call(["evaluate", str(tmp_path), "--trials", "1"])
     ((arguments, command),) = given
     assert (arguments.checkpoint, arguments.plan.trials) == (tmp_path, 1)
     assert command == ["deltaco", "evaluate", str(tmp_path), "--trials", "1"]
+    assert capsys.readouterr().out.endswith("50.0 % succeeded.\n")
 
 
 def test_policies_accept_their_options():
