@@ -2,8 +2,8 @@
 
     recipe -> collect -> train -> evaluate -> report
 
-Each step is a `deltaco` command. Finished steps are skipped, so the same command
-continues after an interruption.
+Each step is a `deltaco` command. Finished steps are skipped, so the same command continues after an
+interruption.
 """
 
 from __future__ import annotations

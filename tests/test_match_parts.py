@@ -432,6 +432,23 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes, sho
     assert not torch.equal(fitted[0]["compare.hidden.weight"], fitted[2]["compare.hidden.weight"])
 
 
+@pytest.mark.parametrize(("n_scenes", "steps"), [(8, 2), (24, 6), (80, 9)])
+def test_steps_of_the_fit_follow_the_number_of_scenes(n_scenes, steps, monkeypatch):
+    monkeypatch.setattr(feature_matching, "_SCENES_PER_STEP", 64)
+    monkeypatch.setattr(feature_matching, "_MIN_STEPS", 2)
+    monkeypatch.setattr(feature_matching, "_MAX_STEPS", 9)
+    fitted = []
+    monkeypatch.setattr(proposals.ProposalNetwork, "fit", lambda *_: None)
+    found = (torch.zeros(0), torch.zeros(0), torch.arange(n_scenes))
+    monkeypatch.setattr(FeatureMatching, "_crops_of_proposals", lambda *_: found)
+    monkeypatch.setattr(FeatureMatching, "_fit_comparison", lambda *arguments: fitted.append(arguments[-2]))
+    images = torch.zeros(n_scenes, 3, 16, 16, dtype=torch.uint8)
+    locations = torch.zeros(n_scenes, 2)
+    tasks = ["task"] * n_scenes
+    FeatureMatching([], 0.25).fit(images, images, images, locations, torch.zeros(n_scenes), tasks, {}, 0)
+    assert fitted == [steps]
+
+
 def test_words_that_describe_the_container_do_not_count(monkeypatch):
     """The color of an object and that of its container vary independently."""
     tasks = [f"put the {color} cube in the {bin} bin" for color in ("red", "blue") for bin in ("red", "blue")]

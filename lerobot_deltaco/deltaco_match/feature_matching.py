@@ -46,8 +46,8 @@ _P_OTHER_OBJECT, _SHARPNESS = 0.5, 1.5
 _COLOR_WEIGHT = 2.0  # of colors among the features
 _INITIAL_GATE = (8.0, -5.0)  # slope and offset of the logit that a proposal is the very object, by its cosine
 # Of the fit.
-_MIN_STEPS, _MAX_STEPS = 400, 1500
-_DRAWS = 16  # of each scene, within these bounds
+_MIN_STEPS, _MAX_STEPS = 400, 1500  # of the comparison
+_DRAWS = 16  # of each scene, as far as these bounds allow
 MAX_EPISODES = 10_000
 _SCENES_PER_STEP = 64
 _LEARNING_RATE, _WORD_LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 1e-3, 3e-3, 0.2, 0.1
