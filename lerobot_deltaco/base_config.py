@@ -110,7 +110,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.dtype == "bfloat16" and self.device == "cpu" and not has_bfloat16():
-            logger.warning("This CPU has no bfloat16 instructions. The policy is trained in float32.")
+            logger.warning("This CPU has no bfloat16 instructions: training computes in float32.")
             self.dtype = "float32"
         try:
             self.check()
