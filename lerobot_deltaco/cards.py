@@ -48,6 +48,7 @@ _HIDDEN = {
     "output_features",
     "normalization_mapping",
     "known_words",
+    "gripper_range",
     "one_hot_tasks",
     "type",
 }

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 WEIGHTS = "model.safetensors"
 CONFIG, TRAIN_CONFIG = "config.json", "train_config.json"
+OWN_TYPES = ("deltaco", "deltaco_match")  # of this project's policies
 _RENAMING_STEP = "rename_observations_processor"
 
 

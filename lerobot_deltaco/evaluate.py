@@ -39,7 +39,7 @@ from gym_deltaco.tasks import get_task
 from lerobot_deltaco.arguments import EvaluateArguments
 from lerobot_deltaco.base_config import SOURCES
 from lerobot_deltaco.base_policy import TaskConditionedPolicy
-from lerobot_deltaco.checkpoints import Checkpoint, LoadedPolicy, find_checkpoints, load_policy
+from lerobot_deltaco.checkpoints import OWN_TYPES, Checkpoint, LoadedPolicy, find_checkpoints, load_policy
 from lerobot_deltaco.demonstrations import Demonstration, DemonstrationBank
 from lerobot_deltaco.episodes import Episode, draw_episodes
 from lerobot_deltaco.expert_demonstrations import ExpertBank
@@ -59,6 +59,7 @@ _NOT_RECORDED = (
     "output_features",
     "one_hot_tasks",
     "known_words",
+    "gripper_range",
     "demo_episodes",
     *SOURCES,
 )
@@ -348,6 +349,11 @@ def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
         demonstrations = (arguments.demo_repo_id, digest)
     lines = []
     for checkpoint in _chosen(found, arguments.steps):
+        if demonstrations is not None and checkpoint.policy_type not in OWN_TYPES:
+            raise ValueError(
+                f"--demo-repo-id is for {' and '.join(OWN_TYPES)}. A policy of another type, such as "
+                f"{checkpoint.policy_type}, gets the expert's demonstrations without it."
+            )
         fitted = replace(plan, scene=_fitted(plan.scene, checkpoint))
         file = folder / "evaluations" / _record_name(checkpoint, fitted, demonstrations)
         if file.exists():

@@ -18,7 +18,6 @@ from lerobot_deltaco.arguments import LookArguments
 from lerobot_deltaco.base_config import TaskConditionedConfig
 from lerobot_deltaco.checkpoints import LoadedPolicy
 from lerobot_deltaco.dataset_reading import open_folder_or_hub
-from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, Found
 from lerobot_deltaco.demonstrations import as_uint8, read_demonstrations, read_robot_data
 from lerobot_deltaco.pages import data_uri, picture_uri, render
@@ -119,7 +118,7 @@ def _dataset_views(
     _check_features(config, dataset)
     tasks = [names[0] for names in meta.episodes["tasks"]]
     data = read_robot_data(dataset, range(len(tasks)))
-    keyframes = find_keyframes(data.states, config.gripper_opening(data.actions), data.spans)
+    keyframes = policy.keyframes_of(data)
     chosen = _spread(len(tasks), n_episodes)
     partners = {episode: _partner(tasks, episode) for episode in chosen}
     bank = None

@@ -65,7 +65,7 @@ def test_the_help_of_training_lists_the_options_of_both_policies(helps):
     from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 
     text, _ = helps["train"]
-    hidden = {"push_to_hub", "normalization_mapping", "one_hot_tasks", "known_words"}
+    hidden = {"push_to_hub", "normalization_mapping", "one_hot_tasks", "known_words", "gripper_range"}
     inherited = {field.name for field in fields(DeltacoConfig.__mro__[2])}
     for config in (DeltacoConfig, DeltacoMatchConfig):
         for option in {field.name for field in fields(config)} - inherited - hidden:

@@ -352,7 +352,7 @@ def test_checkpoints_are_those_that_are_complete(run, tmp_path):
         find_checkpoints(copy)
 
 
-def test_act_is_evaluated_with_other_names_of_cameras(act_checkpoint, tmp_path):
+def test_act_is_evaluated_with_other_names_of_cameras(act_checkpoint, benchmark, tmp_path):
     arguments = ["--tasks", "4,7", "--trials", 1, *BRIEFLY, "--out"]
     run_command(act_checkpoint, *arguments, tmp_path / "same")
     # The same policy, trained on a dataset that names the camera otherwise.
@@ -368,6 +368,8 @@ def test_act_is_evaluated_with_other_names_of_cameras(act_checkpoint, tmp_path):
     (same,), (other,) = (read_records(tmp_path / name) for name in ("same", "other"))
     assert (same.policy_type, same.experiment) == ("act", "small/act")
     assert set(same.episodes["demonstration_task"]) == {-1}
+    with pytest.raises(SystemExit, match="such as act, gets the expert's demonstrations without it"):
+        run_command(copy, *arguments, tmp_path / "other", "--demo-repo-id", "a/b", "--demo-root", benchmark)
     pd.testing.assert_frame_equal(same.episodes, other.episodes)
 
 

@@ -13,7 +13,13 @@ from lerobot_deltaco.deltaco_match.feature_matching import Candidates, Crops, Fe
 from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.deltaco_match.gripper_direction import is_inverted, warn_if_inverted
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
-from lerobot_deltaco.deltaco_match.keyframes import Keyframes, find_grasps, find_keyframes, follows_gripper
+from lerobot_deltaco.deltaco_match.keyframes import (
+    Keyframes,
+    find_grasps,
+    find_keyframes,
+    follows_gripper,
+    warn_of_missing,
+)
 from lerobot_deltaco.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
 from lerobot_deltaco.deltaco_match.proposals import N_PROPOSALS, ProposalNetwork, peaks
 from lerobot_deltaco.deltaco_match.robot_states import RobotStates
@@ -117,7 +123,8 @@ def test_a_gripper_at_rest_grasps_nothing(values, reason, caplog):
     course = torch.from_numpy(ramps(*values))
     spans = [(0, len(course) - 1)]
     assert find_grasps(course, spans) == [reason]
-    find_keyframes(torch.zeros(len(course), 1), course, spans, [7])
+    keyframes = find_keyframes(torch.zeros(len(course), 1), course, spans)
+    warn_of_missing(keyframes, [7], "are not trained on")
     refusal = f"1 of 1 episodes have no grasp, and are not trained on: in 1, such as episode 7, {reason}."
     assert refusal in caplog.text
 
@@ -127,6 +134,8 @@ def test_trembles_and_noise_are_no_grasps():
     starts = np.cumsum([0, *map(len, courses)]).tolist()
     spans = [(start, end - 1) for start, end in zip(starts, starts[1:], strict=False)]
     assert find_grasps(torch.from_numpy(np.concatenate(courses)), spans)[2] == "the gripper only trembles"
+    alone, span = torch.from_numpy(courses[2]), [(0, len(courses[2]) - 1)]
+    assert find_grasps(alone, span, usual=1.0) == ["the gripper only trembles"]
     noise = torch.from_numpy(np.random.default_rng(0).normal(0, 0.01, 200))
     assert find_grasps(noise, [(0, 199)]) == ["the gripper only trembles"]
 
@@ -222,7 +231,7 @@ def grasps(heights):
     width = torch.rand(200, 2, generator=generator) * 40
     states = torch.stack([2 + x, 5 * y + 0.2 * height, 3 * height + x * y, width], dim=2)
     approach = states[:, 0] - torch.tensor([0, 0.2, 3, 0])
-    return Keyframes(states, approach, torch.arange(200) % 10 > 0), locations
+    return Keyframes(states, approach, torch.arange(200) % 10 > 0, (None,) * 200), locations
 
 
 def fitted_states(keyframes):

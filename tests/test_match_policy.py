@@ -176,15 +176,15 @@ def test_greater_values_of_the_gripper_may_mean_closed(table, caplog):
     assert "Set --policy.gripper_closed=high." in caplog.text
 
 
-def test_validation_loss_of_held_back_episodes_finds_their_locations(make, table):
+def test_validation_loss_of_held_out_episodes_is_that_at_their_recorded_locations(make, table, monkeypatch):
     policy = make().eval()
-    batch = batch_of(table, first_frames([0, 1]))
-    known, _ = policy(batch, reduction="none")
-    policy.training_locations.found[:] = False  # as of episodes that are held back
-    found, logged = policy(batch, reduction="none")
-    assert found.isfinite().all()
-    assert not torch.equal(known, found)
-    assert policy(batch)[0] == found.mean()
+    batch = batch_of(table, [frame + 2 for frame in first_frames([0, 1, 1])])
+    known, logged = policy(batch, reduction="none")
+    held_out = torch.full((len(known),), -1)
+    monkeypatch.setattr(policy.training_bank, "episode_rows", lambda _: held_out)
+    losses, _ = policy(batch, reduction="none")
+    torch.testing.assert_close(losses, known)
+    assert policy(batch)[0] == losses.mean()
     assert int(policy.step) == 0
     assert {"action_nll", "gripper_accuracy"} <= set(logged)
 
@@ -288,16 +288,24 @@ def test_demonstrations_of_another_robot_and_a_missing_gripper_are_errors(table,
         small_policy(table, "deltaco_match", gripper="none")
 
 
-def test_a_demonstration_may_be_given_by_hand_while_the_arm_rests(table, tmp_path):
+@pytest.mark.parametrize("tremble", [0, 0.1])
+def test_a_demonstration_may_be_given_by_hand_while_the_arm_rests(tremble, table, tmp_path, caplog):
     task, start, other, end = MOVES[0]
-    rest = {"observation.state": state_at(np.zeros(2)), "action": np.array([0, 0, 1], np.float32)}
-    frames = [{"observation.image": draw_table(task, at, other), **rest} for at in (start, start, end, end)]
+    frames = [
+        {
+            "observation.image": draw_table(task, start if step < 6 else end, other),
+            "observation.state": state_at(np.zeros(2)),
+            "action": np.array([0, 0, 1 - tremble * (4 <= step < 8)], np.float32),
+        }
+        for step in range(12)
+    ]
     named = {"observation.state": list("abc"), "action": ["a", "b", "gripper"]}
     demos = write_episodes(tmp_path / "demos", "test/hand", [(task, frames)], **named)
     policy, before, _ = small_policy(table, "deltaco_match", **demos_of(demos))
     policy._prepare_training()
     policy.eval()
     assert policy.demonstrations.pick_states.isnan().all()
+    assert "1 of 1 episodes have no grasp, and what they moved is found from their first" in caplog.text
     action = policy.select_action(before(observation(table, [task])))
     assert torch.isfinite(action).all()
     assert policy.found.by_demonstration[0]

@@ -3,7 +3,9 @@
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
 from dataclasses import dataclass, field
+from typing import Any
 
+import torch
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_deltaco.base_config import TaskConditionedConfig
@@ -51,8 +53,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.2
     scheduler_warmup_steps: int = 200
-    # Filled in by training: the vocabulary of feature matching.
+    # Filled in by training: the vocabulary of feature matching, and the range of the gripper's commands.
     known_words: list[str] = field(default_factory=list)
+    gripper_range: float | None = None
 
     def check(self) -> None:
         """Checks the options.
@@ -75,6 +78,23 @@ class DeltacoMatchConfig(TaskConditionedConfig):
                 "`demo_episode` names a single demonstration, but `n_demonstrations` is "
                 f"{self.n_demonstrations}. Set `demo_episode` to null, or `n_demonstrations` to 1."
             )
+
+    def set_dataset_feature_metadata(
+        self, features: dict[str, dict[str, Any]], stats: dict[str, dict[str, Any]] | None = None
+    ) -> None:
+        """Finds out which dimension is the gripper, how far it moves, and how actions are scaled.
+
+        Raises:
+            ValueError: The names of the action's dimensions cannot be read.
+        """
+        super().set_dataset_feature_metadata(features, stats)
+        if stats is not None and self.gripper_index is not None:
+            action = stats["action"]
+            least, most = (
+                torch.as_tensor(action.get(quantile, action[end])).reshape(-1)[self.gripper_index]
+                for quantile, end in (("q01", "min"), ("q99", "max"))
+            )
+            self.gripper_range = float(most - least)
 
     def validate_features(self) -> None:
         """Checks the inputs and outputs that LeRobot found in the dataset.

@@ -58,11 +58,13 @@ class Keyframes(NamedTuple):
             dataset. Zeros where there are none.
         approach: States shortly before the gripper closes, (episodes, state).
         found: Whether an episode has them, (episodes,) bool.
+        missing: Why an episode has none; None if it has them.
     """
 
     states: Tensor
     approach: Tensor
     found: Tensor
+    missing: tuple[str | None, ...]
 
     @property
     def pick_states(self) -> Tensor:
@@ -74,7 +76,7 @@ def find_keyframes(
     states: Tensor,
     gripper: Tensor,
     spans: Sequence[tuple[int, int]],
-    episodes: Sequence[int] | None = None,
+    usual: float | None = None,
 ) -> Keyframes:
     """Finds the grasp and the release of episodes. If an object slips, the last grasp counts.
 
@@ -82,9 +84,9 @@ def find_keyframes(
         states: Robot states of all frames, (frames, state).
         gripper: Commands to the gripper in all frames, greater for more open, (frames,).
         spans: First and last frame of each episode.
-        episodes: Index of each episode, for the warning; by default, they are counted.
+        usual: As for `find_grasps`.
     """
-    found, frames = find_grasps(gripper, spans), []
+    found, frames = find_grasps(gripper, spans, usual), []
     for (first, last), grasp in zip(spans, found, strict=True):
         if isinstance(grasp, str):
             frames.append((first, first, first))
@@ -92,25 +94,32 @@ def find_keyframes(
         approach = grasp.closing - max(1, (last - first + 1) // _APPROACH)
         # The command to close takes effect one step later.
         frames.append((min(grasp.grasp + 1, grasp.release), grasp.release, max(approach, first)))
-    _warn_of_missing(found, range(len(spans)) if episodes is None else episodes)
     is_found = torch.tensor([isinstance(grasp, Grasp) for grasp in found], device=states.device)
     at = states[torch.tensor(frames, device=states.device)].float()  # (episodes, 3, state)
     at = torch.where(is_found[:, None, None], at, 0.0)
-    return Keyframes(at[:, :2], at[:, 2], is_found)
+    missing = tuple(grasp if isinstance(grasp, str) else None for grasp in found)
+    return Keyframes(at[:, :2], at[:, 2], is_found, missing)
 
 
-def _warn_of_missing(found: Sequence[Grasp | str], episodes: Sequence[int]) -> None:
-    example = {
-        reason: episode
-        for reason, episode in zip(found[::-1], episodes[::-1], strict=True)
-        if isinstance(reason, str)
-    }
+def warn_of_missing(keyframes: Keyframes, episodes: Sequence[int], consequence: str) -> None:
+    """Warns of episodes without a grasp.
+
+    Args:
+        keyframes: Keyframes of the episodes.
+        episodes: Index of each episode.
+        consequence: What becomes of them, as the end of a sentence about them.
+    """
+    example: dict[str, int] = {}
+    for reason, episode in zip(keyframes.missing, episodes, strict=True):
+        if reason is not None:
+            example.setdefault(reason, episode)
     if example:
-        counts = Counter(reason for reason in found if isinstance(reason, str))
+        counts = Counter(reason for reason in keyframes.missing if reason is not None)
         logger.warning(
-            "%d of %d episodes have no grasp, and are not trained on: %s.",
+            "%d of %d episodes have no grasp, and %s: %s.",
             counts.total(),
-            len(found),
+            len(episodes),
+            consequence,
             "; ".join(
                 f"in {count}, such as episode {example[reason]}, {reason}"
                 for reason, count in counts.most_common(_N_REASONS)
@@ -118,13 +127,17 @@ def _warn_of_missing(found: Sequence[Grasp | str], episodes: Sequence[int]) -> N
         )
 
 
-def find_grasps(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[Grasp | str]:
+def find_grasps(
+    gripper: Tensor, spans: Sequence[tuple[int, int]], usual: float | None = None
+) -> list[Grasp | str]:
     """Finds the last grasp of each episode that is released.
 
     Args:
         gripper: Commands to the gripper in all frames, greater for more open, (frames,). Of commands that
             mean close, stay and open (0, 1, 2 or -1, 0, 1), the last one before "stay" holds.
         spans: First and last frame of each episode.
+        usual: Range of the commands in a usual episode, of which a fifth is needed for a grasp; by default,
+            the median of these episodes.
 
     Returns:
         The grasp of each episode, or the reason why there is none.
@@ -132,7 +145,8 @@ def find_grasps(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[Grasp
     courses = _courses(gripper, spans)
     smooth = [_without_outliers(course) for course in courses]
     ranges = [float(np.ptp(course)) for course in smooth]
-    usual = float(np.nanmedian(ranges)) if np.isfinite(ranges).any() else 0.0
+    if usual is None:
+        usual = float(np.nanmedian(ranges)) if np.isfinite(ranges).any() else 0.0
     found: list[Grasp | str] = []
     for (first, _), raw, course, size in zip(spans, courses, smooth, ranges, strict=True):
         grasp = _last_valley(raw, course, size, usual)

@@ -22,7 +22,7 @@ have to wait for the place network, which learns beside it.
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
 from collections.abc import Callable, Iterable, Sequence
-from itertools import chain
+from itertools import chain, starmap
 from typing import Any, NamedTuple
 
 import torch
@@ -32,13 +32,18 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_deltaco.base_policy import DemonstrationsOfTasks, TaskConditionedPolicy
-from lerobot_deltaco.dataset_reading import warn_of_equal_instructions
+from lerobot_deltaco.dataset_reading import open_dataset, warn_of_equal_instructions
 from lerobot_deltaco.deltaco_match.calibration import MIN_EPISODES
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.deltaco_match.feature_matching import FeatureMatching
 from lerobot_deltaco.deltaco_match.gripper_direction import warn_if_inverted
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
-from lerobot_deltaco.deltaco_match.keyframes import find_keyframes, follows_gripper
+from lerobot_deltaco.deltaco_match.keyframes import (
+    Keyframes,
+    find_keyframes,
+    follows_gripper,
+    warn_of_missing,
+)
 from lerobot_deltaco.deltaco_match.place import (
     TARGET_DIM,
     DemonstrationAttention,
@@ -162,6 +167,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self.place = PlaceNetwork(INSTRUCTION_DIM)
         self.instruction_encoder = InstructionEncoder(len(config.known_words))
         self.training_locations: TrainingLocations | None = None
+        self._held_out: dict[int, TrainingLocations] = {}
 
     # The loss
 
@@ -190,7 +196,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             if self.training:
                 loss, logged = self._training_loss(batch, tasks, generator)
             else:
-                loss, logged = self._validation_loss(batch, tasks)
+                loss, logged = self._validation_loss(batch)
         return self._finish_step(batch, loss, logged, reduction)
 
     def _training_loss(
@@ -292,19 +298,33 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             target = torch.where(says[:, None], target, self.place.target(last, attention))
         return self.place(scenes, instruction, target)
 
-    def _validation_loss(self, batch: dict[str, Any], tasks: list[str]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Returns the imitation loss; locations in held-out episodes are found in the image."""
-        known = self.training_locations
+    def _validation_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the imitation loss at the recorded locations; 0 for an episode without a grasp."""
+        recorded = self._recorded_locations(batch["episode_index"].tolist())
+        images = self._images(batch)
+        loss, logged = self._acting_loss(batch, images, recorded.locations, recorded.heights)
+        return torch.where(recorded.found, loss, 0.0), logged
+
+    def _recorded_locations(self, episodes: Sequence[int]) -> TrainingLocations:
+        """Returns the locations of episodes of the training dataset, (batch, ...); reads held-out ones."""
+        known, bank, meta, device = self.training_locations, self.training_bank, self._meta, self.step.device
         assert known is not None
-        assert self.training_bank is not None
-        rows = self.training_bank.episode_rows(batch["episode_index"])
-        is_known = (rows >= 0) & known.found[rows]
-        locations, heights = known.locations[rows], known.heights[rows]
-        if not is_known.all():
-            found = self._find(batch, tasks, self.banked_demonstrations(tasks))
-            locations = torch.where(is_known[:, None, None], locations, found.locations)
-            heights = torch.where(is_known, heights, found.heights)
-        return self._acting_loss(batch, self._images(batch), locations, heights)
+        assert bank is not None
+        rows = dict(zip(episodes, bank.episode_rows(torch.tensor(episodes, device=device)), strict=True))
+        new = [episode for episode, row in rows.items() if row < 0 and episode not in self._held_out]
+        if new:
+            assert meta is not None
+            dataset = open_dataset("--dataset.root", meta.repo_id, meta.root, new)
+            data = read_robot_data(dataset, new)
+            on_device = data._replace(states=data.states.to(device))
+            found = self.robot_states.locate(self.keyframes_of(on_device))
+            self._held_out.update(zip(new, starmap(TrainingLocations, zip(*found, strict=True)), strict=True))
+        each = [
+            self._held_out[episode] if rows[episode] < 0 else [part[rows[episode]] for part in known]
+            for episode in episodes
+        ]
+        return TrainingLocations(*map(torch.stack, zip(*each, strict=True)))
+
 
     def _acting_loss(
         self,
@@ -344,6 +364,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     def p_pick(self) -> Tensor | None:
         """Probability of the pick location among the proposals, (batch,); None before the first action."""
         return None if self._episode is None else self._episode.found.p_pick
+
+    def keyframes_of(self, data: RobotData) -> Keyframes:
+        """Returns the keyframes of episodes that the policy was not trained on."""
+        gripper, usual = self.config.gripper_opening(data.actions), self.config.gripper_range
+        return find_keyframes(data.states, gripper, data.spans, usual)
 
     @torch.no_grad()
     def _find(
@@ -448,7 +473,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         config, device, frames = self.config, self.step.device, self.training_bank.frames
         states = robot_data.states.to(device)
         gripper = config.gripper_opening(robot_data.actions).to(device)
-        keyframes = find_keyframes(states, gripper, robot_data.spans, bank.episodes.tolist())
+        keyframes = find_keyframes(states, gripper, robot_data.spans)
+        warn_of_missing(keyframes, bank.episodes.tolist(), "are not trained on")
         warn_if_inverted(gripper, robot_data, config.gripper_closed)
         zero_and_one = torch.stack([torch.zeros(states.shape[1]), torch.ones(states.shape[1])])
         shift, end = self._normalized(zero_and_one).to(device)
@@ -511,8 +537,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 f"actions have {sizes[0]} and {sizes[1]} numbers, those of the policy {expected[0]} and "
                 f"{expected[1]}. Name a dataset of the policy's robot."
             )
-        gripper = self.config.gripper_opening(data.actions)
-        bank.pick_states = find_keyframes(data.states, gripper, data.spans).pick_states
+        keyframes = self.keyframes_of(data)
+        warn_of_missing(
+            keyframes, bank.episodes.tolist(), "what they moved is found from their first and last image"
+        )
+        bank.pick_states = keyframes.pick_states
 
 
 def _shifted(images: Tensor, locations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -90,14 +90,10 @@ class RobotStates(nn.Module):
 
         Returns:
             The locations and heights of the episodes.
-
-        Raises:
-            ValueError: There are too few episodes in which the gripper closes and opens.
         """
         found = keyframes.found
         self.to_image.fit(first[found], last[found], keyframes.states[found, 0], scale)
         locations = self.to_image(keyframes.states).clamp(-1, 1)
-        locations = torch.where(found[:, None, None], locations, 0.0)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
         states = keyframes.states * scale + shift  # (episodes, 2, state)
@@ -106,8 +102,16 @@ class RobotStates(nn.Module):
             self.location_to_state[n].copy_(_ridge_regression(features, states[found, n]))
         last_moves = (states[:, 0] - (keyframes.approach * scale + shift))[found]
         self._fit_heights(locations[found, 0], states[found, 0], last_moves, is_arm)
-        heights = torch.where(found, self.heights(keyframes.states[:, 0]), 0.0)
-        return TrainingLocations(locations, heights, found)
+        return self.locate(keyframes)
+
+    def locate(self, keyframes: Keyframes) -> TrainingLocations:
+        """Returns the locations and heights of episodes, from the robot's states in them."""
+        found = keyframes.found
+        locations = self.to_image(keyframes.states).clamp(-1, 1)
+        heights = self.heights(keyframes.states[:, 0])
+        return TrainingLocations(
+            torch.where(found[:, None, None], locations, 0.0), torch.where(found, heights, 0.0), found
+        )
 
     def _fit_heights(self, locations: Tensor, states: Tensor, last_moves: Tensor, is_arm: Tensor) -> None:
         features = _location_features(locations)
