@@ -139,7 +139,7 @@ def _dataset_views(
             policy.select_action(loaded.preprocessor({**observation, "task": tasks[episode]}))
         found: Found = policy.found
         recorded, right, text = None, (None, None), "no grasp is recorded"
-        if bool(keyframes.found[episode]):
+        if bool(keyframes.has_grasp[episode]):
             states = keyframes.states[episode].to(config.device)
             recorded = policy.robot_states.to_image(states).clamp(-1, 1).cpu()
             distances = (found.locations[0].cpu() - recorded).norm(dim=1)

@@ -335,6 +335,12 @@ def cell_centers(n_cells: int, device: torch.device) -> Tensor:
     return (torch.arange(n_cells, device=device) + 0.5) * 2 / n_cells - 1
 
 
+def grid_of_centers(height: int, width: int, device: torch.device) -> Tensor:
+    """Returns the centers of a map's cells, row by row, (h w, 2) in -1..1."""
+    x, y = cell_centers(width, device), cell_centers(height, device)
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)
+
+
 def gaussian_maps(locations: Tensor, height: int, width: int, std: float | Tensor) -> Tensor:
     """Returns maps that are 1 at a location and fall off around it.
 

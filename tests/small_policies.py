@@ -85,8 +85,10 @@ def use_short_fit(monkeypatch, steps=2):
         return torch.nn.functional.pad(crops, (0, FEATURE_DIM - crops.shape[2]))
 
     monkeypatch.setattr(feature_matching, "crop_features", colors)
+    monkeypatch.setattr(proposals, "FIT_STEPS", 2 * steps)
     monkeypatch.setattr(proposals, "GRASP_RADIUS", 9.0)  # any proposal will do
-    monkeypatch.setattr(feature_matching.FeatureMatching.fit, "__defaults__", (steps,))
+    monkeypatch.setattr(feature_matching, "_MIN_STEPS", steps)
+    monkeypatch.setattr(feature_matching, "_MAX_STEPS", steps)
 
 
 # Datasets

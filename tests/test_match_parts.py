@@ -43,7 +43,7 @@ def test_last_grasp_that_is_released_counts():
     gripper = torch.tensor([1, -1, 1, 1, -1, -1, 1, 1, -1, 1.0, 1, 1, -1, -1])
     spans = [(0, 7), (8, 10), (11, 13)]
     keyframes = find_keyframes(states, gripper, spans)
-    assert keyframes.found.tolist() == [True, False, False]
+    assert keyframes.has_grasp.tolist() == [True, False, False]
     # One step after the command to close, and the step of the command to open.
     assert keyframes.states[0, :, 0].tolist() == [5, 6]
     assert keyframes.approach[0, 0] == 2
@@ -247,7 +247,7 @@ def test_heights_are_what_locations_do_not_tell_of_states():
     heights = torch.randn(200, generator=torch.Generator().manual_seed(1))
     keyframes, locations = grasps(heights)
     robot_states, known, (scale, shift) = fitted_states(keyframes)
-    found = keyframes.found
+    found = keyframes.has_grasp
     torch.testing.assert_close(known.locations[found, 0], locations[found, 0], atol=0.1, rtol=0)
     assert not known.locations[~found].any()
     assert torch.corrcoef(torch.stack([known.heights[found], heights[found]]))[0, 1] > 0.98
@@ -378,13 +378,14 @@ def matching(shapes, request):
     sentences, heights = {task: [task] for task in tasks}, torch.zeros(24)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proposals, "_SCENES_PER_STEP", 16)
+        patch.setattr(proposals, "FIT_STEPS", 120)
         patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
+        patch.setattr(feature_matching, "_MIN_STEPS", 60)
         # As in the first step of a policy's training.
         with torch.autocast("cpu", torch.bfloat16), torch.autocast("cpu", enabled=False):
             matching.fit(
                 *(images, images, images, locations, heights, tasks, sentences),
                 seed=0,
-                steps=60,
                 in_bfloat16=request.param,
             )
     assert matching.fitted
@@ -491,9 +492,7 @@ def test_fit_needs_a_task_with_two_grasps(shapes):
     images, locations, tasks = (part[:6] for part in shapes)
     locations = torch.where(torch.arange(6)[:, None] < 2, locations, torch.nan)
     with pytest.raises(ValueError, match="at least two episodes .* 2 such episodes are of 2 different tasks"):
-        FeatureMatching([], 0.25).fit(
-            images, images, images, locations, torch.zeros(6), tasks, {}, 0, steps=2
-        )
+        FeatureMatching([], 0.25).fit(images, images, images, locations, torch.zeros(6), tasks, {}, 0)
 
 
 def test_crops_are_centered_and_see_the_native_resolution():
@@ -532,6 +531,7 @@ def test_peaks_are_apart_and_ordered():
 
 def test_things_that_no_training_task_asks_for_are_proposed(monkeypatch):
     monkeypatch.setattr(proposals, "_SCENES_PER_STEP", 16)
+    monkeypatch.setattr(proposals, "FIT_STEPS", 100)
     generator = np.random.default_rng(0)
     moves = random_moves(80, SHAPE_TASKS)
     grasps = torch.tensor(np.stack([move[1] for move in moves]), dtype=torch.float32)
@@ -549,7 +549,7 @@ def test_things_that_no_training_task_asks_for_are_proposed(monkeypatch):
     scenes, thing = stacked_images(images), torch.tensor(np.stack(never_grasped), dtype=torch.float32)
     torch.manual_seed(0)
     network, autocast = ProposalNetwork().requires_grad_(True), torch.autocast("cpu", enabled=False)
-    network.fit(scenes[:60], grasps[:60], torch.Generator().manual_seed(0), 100, autocast)
+    network.fit(scenes[:60], grasps[:60], torch.Generator().manual_seed(0), autocast)
     with torch.no_grad():
         proposed = network(scenes[60:].float() / 255)
     for locations in (grasps[60:], thing[60:]):

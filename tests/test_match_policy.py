@@ -99,7 +99,7 @@ def test_training_learns_to_find_what_a_demonstration_moved_and_an_instruction_n
 def test_locations_of_training_episodes_are_where_objects_were_moved(make):
     known = make().training_locations
     true = torch.tensor(np.stack([move[1::2] for move in MOVES])).float().clamp(-1, 1)
-    assert known.found.all()
+    assert known.has_grasp.all()
     errors = (known.locations - true).norm(dim=2) * TABLE_SIZE / 2
     assert errors.median() < 1.5  # px
 
@@ -117,7 +117,7 @@ def test_episode_without_a_grasp_teaches_nothing(make, table):
 
     known, gradients = losses()
     assert any(gradient.any() for gradient in gradients)
-    policy.training_locations.found[0] = False
+    policy.training_locations.has_grasp[0] = False
     unknown, gradients = losses()
     assert unknown == [0, known[1]]
     assert not any(gradient.any() for gradient in gradients)

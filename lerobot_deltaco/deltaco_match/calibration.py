@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.networks import cell_centers
+from lerobot_deltaco.networks import grid_of_centers
 
 EPISODES_PER_CLUSTER = 60
 MIN_CLUSTERS, MAX_CLUSTERS = 12, 200
@@ -110,16 +110,9 @@ def _blurred(maps: Tensor) -> Tensor:
     return F.conv2d(across, kernel.view(1, 1, -1, 1), padding=(radius, 0))[:, 0]
 
 
-def _grid(maps: Tensor) -> Tensor:
-    """Returns the locations of the pixels of maps (n, H, W), (H * W, 2)."""
-    height, width = maps.shape[-2:]
-    y, x = cell_centers(height, maps.device), cell_centers(width, maps.device)
-    return torch.stack([x.repeat(height), y.repeat_interleave(width)], dim=1)
-
-
 def _peaks(maps: Tensor) -> Tensor:
     """Returns the locations of the maxima of maps (n, H, W), (n, 2)."""
-    return _grid(maps)[maps.flatten(1).argmax(dim=1)]
+    return grid_of_centers(maps.shape[1], maps.shape[2], maps.device)[maps.flatten(1).argmax(dim=1)]
 
 
 def _peaks_near(maps: Tensor, locations: Tensor) -> Tensor:
@@ -128,7 +121,7 @@ def _peaks_near(maps: Tensor, locations: Tensor) -> Tensor:
     For the few locations farther outside the image, it is the top left corner, which the fit downweights as
     an outlier.
     """
-    grid = _grid(maps)
+    grid = grid_of_centers(maps.shape[1], maps.shape[2], maps.device)
     peaks = []
     for some, around in zip(maps.split(512), locations.split(512), strict=True):
         far = torch.cdist(around, grid) > 2 * _REACH  # (some, H * W)

@@ -212,7 +212,6 @@ class FeatureMatching(nn.Module):
         tasks: Sequence[str],
         sentences: Mapping[str, Sequence[str]],
         seed: int,
-        steps: int | None = None,
         *,
         in_bfloat16: bool = False,
     ) -> None:
@@ -232,12 +231,11 @@ class FeatureMatching(nn.Module):
             tasks: Task of each episode.
             sentences: Instructions of each task, one of which is drawn for an episode in each step.
             seed: Seed of the initial weights and of the draws.
-            steps: Number of steps of the comparison; None for as many as the number of episodes needs.
             in_bfloat16: Whether convolutions and linear layers compute in bfloat16, which takes half the time
                 on a CPU that has it.
 
         Raises:
-            ValueError: No task has two episodes with a grasp.
+            ValueError: No task has two episodes with a grasp, or no proposal is near a grasp.
             PretrainedWeightsError: The encoder's weights are missing.
         """
         generator, device = torch.Generator().manual_seed(seed), images.device
@@ -247,8 +245,7 @@ class FeatureMatching(nn.Module):
         grasps = (~locations.isnan().any(dim=1)).nonzero().flatten().cpu()
         drawn = grasps[torch.randperm(len(grasps), generator=generator)[:MAX_EPISODES]].sort().values
         _Pairs([tasks[row] for row in drawn.tolist()])  # fails before the slow part
-        if steps is None:
-            steps = min(max(_MIN_STEPS, _DRAWS * len(drawn) // _SCENES_PER_STEP), _MAX_STEPS)
+        steps = min(max(_MIN_STEPS, _DRAWS * len(drawn) // _SCENES_PER_STEP), _MAX_STEPS)
         with torch.random.fork_rng(devices=[]), torch.enable_grad():
             torch.manual_seed(seed)
             for layer in self.modules():
@@ -257,9 +254,8 @@ class FeatureMatching(nn.Module):
             self.requires_grad_(True)
             known = grasps.to(device)
             self.perspective.copy_(fit_perspective(images[known], last[known], locations[known]))
-            n_steps = min(proposals.FIT_STEPS, 2 * steps)
             rows = drawn.to(device)
-            self.propose.fit(images[rows], locations[rows], generator, n_steps, autocast)
+            self.propose.fit(images[rows], locations[rows], generator, autocast)
             features, target, kept = self._crops_of_proposals(images, native, locations, drawn, autocast)
             of_kept = [tasks[row] for row in kept.tolist()]
             heights = heights[kept.to(heights.device)]
@@ -314,7 +310,7 @@ class FeatureMatching(nn.Module):
         self.compare.set_statistics(features)
         for some in features.split(_NORMALIZED_AT_A_TIME):  # once and in place: they are large
             some.copy_(self.compare.inputs(some))
-        said, first = self._encoded_sentences(tasks, sentences, device)
+        said, spans = self._encoded_sentences(tasks, sentences, device)
         numbers = {task: number for number, task in enumerate(dict.fromkeys(tasks))}
         task_numbers = torch.tensor([numbers[task] for task in tasks], device=device)
         groups: list[dict[str, Any]] = [
@@ -335,7 +331,7 @@ class FeatureMatching(nn.Module):
             matches, _ = self.compare.match(proposed, described.descriptors[:, -1])
             loss = F.nll_loss(matches, target[scenes])
             draws = torch.rand(len(scenes), generator=generator)
-            drawn = (first[scenes.cpu(), 0] + draws * first[scenes.cpu(), 1]).long()
+            drawn = (spans[scenes.cpu(), 0] + draws * spans[scenes.cpu(), 1]).long()
             dropped = torch.rand(len(scenes), said.shape[1], generator=generator) < _P_DROP_WORD
             sentence = said[drawn.to(device)]
             left = torch.where(dropped.to(device) & (sentence > 0), UNKNOWN_WORD, sentence)

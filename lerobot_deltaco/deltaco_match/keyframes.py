@@ -57,19 +57,19 @@ class Keyframes(NamedTuple):
         states: States in which the gripper has closed and is about to open, (episodes, 2, state), as in the
             dataset. Zeros where there are none.
         approach: States shortly before the gripper closes, (episodes, state).
-        found: Whether an episode has them, (episodes,) bool.
+        has_grasp: Whether an episode has them, (episodes,) bool.
         missing: Why an episode has none; None if it has them.
     """
 
     states: Tensor
     approach: Tensor
-    found: Tensor
+    has_grasp: Tensor
     missing: tuple[str | None, ...]
 
     @property
     def pick_states(self) -> Tensor:
         """The states in which the gripper has closed, (episodes, state); NaN where there are none."""
-        return torch.where(self.found[:, None], self.states[:, 0], torch.nan)
+        return torch.where(self.has_grasp[:, None], self.states[:, 0], torch.nan)
 
 
 def find_keyframes(
@@ -94,11 +94,11 @@ def find_keyframes(
         approach = grasp.closing - max(1, (last - first + 1) // _APPROACH)
         # The command to close takes effect one step later.
         frames.append((min(grasp.grasp + 1, grasp.release), grasp.release, max(approach, first)))
-    is_found = torch.tensor([isinstance(grasp, Grasp) for grasp in found], device=states.device)
+    has_grasp = torch.tensor([isinstance(grasp, Grasp) for grasp in found], device=states.device)
     at = states[torch.tensor(frames, device=states.device)].float()  # (episodes, 3, state)
-    at = torch.where(is_found[:, None, None], at, 0.0)
+    at = torch.where(has_grasp[:, None, None], at, 0.0)
     missing = tuple(grasp if isinstance(grasp, str) else None for grasp in found)
-    return Keyframes(at[:, :2], at[:, 2], is_found, missing)
+    return Keyframes(at[:, :2], at[:, 2], has_grasp, missing)
 
 
 def warn_of_missing(keyframes: Keyframes, episodes: Sequence[int], consequence: str) -> None:

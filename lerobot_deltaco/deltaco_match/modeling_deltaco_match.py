@@ -226,7 +226,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         images = change_colors(images, changes)
         loss, logged = self._acting_loss(batch, images, locations, heights, generator)
         # An episode without a grasp has no locations, and teaches nothing.
-        loss = torch.where((rows >= 0) & known.found[rows], loss, 0.0)
+        loss = torch.where((rows >= 0) & known.has_grasp[rows], loss, 0.0)
         loss = loss.index_add(0, some.to(rows.device), len(rows) / n_some * finding.sum(dim=1))
         names = ("place_loss", "attention_loss")
         return loss, logged | dict(zip(names, finding.mean(dim=0), strict=True))
@@ -256,7 +256,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert known is not None
         rows, device = bank.episode_rows(episodes), episodes.device
         others = bank.draw_other_episodes(episodes, tasks, generator)
-        found = (rows >= 0) & known.found[rows] & known.found[others]
+        both_grasp = (rows >= 0) & known.has_grasp[rows] & known.has_grasp[others]
         scenes, locations = _shifted(
             bank.frames[rows, 0].float() / 255, known.locations[rows, 1:], generator
         )  # (batch, 3, H, W)
@@ -264,18 +264,18 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             bank.frames[others][:, [0, -1]].float() / 255, known.locations[others], generator
         )  # (batch, 2, 3, H, W)
         attention = self.attention(change_colors(ends, changes))
-        says = (torch.rand(len(rows), generator=generator) >= _P_PLACE_BY_DEMONSTRATION).to(device)
-        maps = self._place_maps(scenes, says, instructions, ends[:, 1], attention[:, 1], generator)
+        by_instruction = (torch.rand(len(rows), generator=generator) >= _P_PLACE_BY_DEMONSTRATION).to(device)
+        maps = self._place_maps(scenes, by_instruction, instructions, ends[:, 1], attention[:, 1], generator)
         # Without a loss of its own, the attention would take thousands of steps.
         log_attention = attention.clamp_min(_MIN_ATTENTION).log()
         attention_losses = location_loss(log_attention, demonstrated).sum(dim=1, keepdim=True)
         losses = torch.cat([location_loss(maps[:, None], locations), attention_losses], dim=1)
-        return torch.where(found[:, None], losses, 0.0)
+        return torch.where(both_grasp[:, None], losses, 0.0)
 
     def _place_maps(
         self,
         scenes: Tensor,
-        says: Tensor,
+        by_instruction: Tensor,
         instructions: Sequence[str],
         last: Tensor | None,
         attention: Tensor | None,
@@ -285,17 +285,17 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
         Args:
             scenes: First images of episodes, (batch, 3, H, W) in 0..1.
-            says: Whether the instruction says where, and not the demonstration, (batch,) bool.
+            by_instruction: Whether the instruction says where, and not the demonstration, (batch,) bool.
             instructions: Instruction of each sample.
             last: Last images of the demonstrations, (batch, 3, H, W); None without demonstrations.
             attention: Maps of where the demonstrations put the object, (batch, h, w).
             generator: In training, source of the draws of words that are left out, on the CPU.
         """
         words = encode_words(instructions, self.config.known_words).to(scenes.device)
-        instruction = torch.where(says[:, None], self.instruction_encoder(words, generator), 0.0)
+        instruction = torch.where(by_instruction[:, None], self.instruction_encoder(words, generator), 0.0)
         target = torch.zeros(len(scenes), TARGET_DIM, device=scenes.device)
         if last is not None and attention is not None:
-            target = torch.where(says[:, None], target, self.place.target(last, attention))
+            target = torch.where(by_instruction[:, None], target, self.place.target(last, attention))
         return self.place(scenes, instruction, target)
 
     def _validation_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
@@ -303,28 +303,27 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         recorded = self._recorded_locations(batch["episode_index"].tolist())
         images = self._images(batch)
         loss, logged = self._acting_loss(batch, images, recorded.locations, recorded.heights)
-        return torch.where(recorded.found, loss, 0.0), logged
+        return torch.where(recorded.has_grasp, loss, 0.0), logged
 
     def _recorded_locations(self, episodes: Sequence[int]) -> TrainingLocations:
         """Returns the locations of episodes of the training dataset, (batch, ...); reads held-out ones."""
-        known, bank, meta, device = self.training_locations, self.training_bank, self._meta, self.step.device
-        assert known is not None
+        located, bank = self.training_locations, self.training_bank
+        meta, device = self._meta, self.step.device
+        assert located is not None
         assert bank is not None
         rows = dict(zip(episodes, bank.episode_rows(torch.tensor(episodes, device=device)), strict=True))
         new = [episode for episode, row in rows.items() if row < 0 and episode not in self._held_out]
         if new:
             assert meta is not None
-            dataset = open_dataset("--dataset.root", meta.repo_id, meta.root, new)
-            data = read_robot_data(dataset, new)
-            on_device = data._replace(states=data.states.to(device))
-            found = self.robot_states.locate(self.keyframes_of(on_device))
-            self._held_out.update(zip(new, starmap(TrainingLocations, zip(*found, strict=True)), strict=True))
+            data = read_robot_data(open_dataset("--dataset.root", meta.repo_id, meta.root, new), new)
+            keyframes = self.keyframes_of(data._replace(states=data.states.to(device)))
+            found = zip(*self.robot_states.locate(keyframes), strict=True)
+            self._held_out.update(zip(new, starmap(TrainingLocations, found), strict=True))
         each = [
-            self._held_out[episode] if rows[episode] < 0 else [part[rows[episode]] for part in known]
+            self._held_out[episode] if rows[episode] < 0 else [part[rows[episode]] for part in located]
             for episode in episodes
         ]
         return TrainingLocations(*map(torch.stack, zip(*each, strict=True)))
-
 
     def _acting_loss(
         self,
@@ -387,11 +386,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """
         camera = self.config.cameras[0]
         scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
-        says = torch.tensor([bool(text) for text in instructions], device=scenes.device)
+        by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
         stacked = self._stacked(demonstrations, scenes.device)
         attention = last = described = heights = None
         if stacked is None:
-            if not bool(says.all()):
+            if not bool(by_instruction.all()):
                 raise ValueError("Neither a demonstration nor an instruction is given. Pass one of them.")
         else:
             n_each = stacked.ends.shape[1]
@@ -406,11 +405,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         candidates = self.feature_matching.find(scenes, batch[camera], instructions, described, heights)
         pick, p_pick, height = candidates.best
         place_maps = self._place_maps(
-            scenes, says, instructions, last, None if attention is None else attention[:, 1]
+            scenes, by_instruction, instructions, last, None if attention is None else attention[:, 1]
         )
         locations = torch.stack([pick, peak_locations(place_maps[:, None])[:, 0]], dim=1)
         maps = torch.stack([candidates.map(place_maps.shape[1:]), place_maps], dim=1)
-        by_demonstration = (stacked is not None, stacked is not None and not bool(says.all()))
+        by_demonstration = (stacked is not None, stacked is not None and not bool(by_instruction.all()))
         bias = self.config.grasp_height_bias
         return Found(locations, height + bias, maps, attention, by_demonstration, p_pick)
 
@@ -479,12 +478,12 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         zero_and_one = torch.stack([torch.zeros(states.shape[1]), torch.ones(states.shape[1])])
         shift, end = self._normalized(zero_and_one).to(device)
         is_arm = ~follows_gripper(states, gripper, robot_data.spans)
-        n_found = int(keyframes.found.sum())
-        if n_found < MIN_EPISODES:
+        n_grasps = int(keyframes.has_grasp.sum())
+        if n_grasps < MIN_EPISODES:
             assert self._meta is not None
             raise ValueError(
                 f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} episodes "
-                f"in which the gripper closes and opens. Got {n_found}. Collect more, or train "
+                f"in which the gripper closes and opens. Got {n_grasps}. Collect more, or train "
                 "--policy.type=deltaco with --policy.demo_encoder=attention, which needs none. The gripper "
                 f"is {config.name_gripper(self._meta.features)}, whose {config.gripper_closed} values close "
                 "it; see --policy.gripper and --policy.gripper_closed."
@@ -493,7 +492,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self.training_locations = known
         self.training_bank.pick_states = keyframes.pick_states
         if not bool(self.feature_matching.fitted):
-            picks = torch.where(known.found[:, None], known.locations[:, 0], torch.nan)
+            picks = torch.where(known.has_grasp[:, None], known.locations[:, 0], torch.nan)
             native = self.training_bank.first_images
             tasks = self.training_bank.tasks
             self.feature_matching.fit(

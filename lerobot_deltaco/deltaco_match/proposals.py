@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
 from lerobot_deltaco.losses import location_loss
-from lerobot_deltaco.networks import cell_centers, channels_last, conv_norm_relu
+from lerobot_deltaco.networks import channels_last, conv_norm_relu, grid_of_centers
 
 N_PROPOSALS = 5
 _CHANNELS = 32
@@ -50,7 +50,6 @@ class ProposalNetwork(nn.Module):
         images: Tensor,
         locations: Tensor,
         generator: torch.Generator,
-        steps: int,
         autocast: torch.autocast,
     ) -> None:
         """Fits the network.
@@ -59,7 +58,6 @@ class ProposalNetwork(nn.Module):
             images: First images of episodes, (episodes, 3, H, W) uint8.
             locations: Locations of their grasps, (episodes, 2) in -1..1.
             generator: Source of the draws, on the CPU.
-            steps: Number of training steps.
             autocast: Context of the forward pass.
         """
         self.layers.train()
@@ -67,9 +65,9 @@ class ProposalNetwork(nn.Module):
             self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, fused=True
         )
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, _LEARNING_RATE, steps, pct_start=_WARMUP_FRACTION
+            optimizer, _LEARNING_RATE, FIT_STEPS, pct_start=_WARMUP_FRACTION
         )
-        for _ in tqdm(range(steps), desc="Fitting the proposals", unit="step", leave=False):
+        for _ in tqdm(range(FIT_STEPS), desc="Fitting the proposals", unit="step", leave=False):
             rows = torch.randint(len(images), (_SCENES_PER_STEP,), generator=generator).to(images.device)
             changes = random_color_changes(len(rows), _P_NEW_COLORS, generator)
             scenes = change_colors(images[rows].float() / 255, changes)
@@ -96,7 +94,7 @@ def peaks(maps: Tensor, n_peaks: int) -> Tensor:
         Means of the cells around each peak, the highest first, (batch, n_peaks, 2) in -1..1.
     """
     height, width = maps.shape[1:]
-    centers = _centers(height, width, maps.device)
+    centers = grid_of_centers(height, width, maps.device)
     radius = _PEAK_RADIUS * 2 / torch.tensor([width, height], device=maps.device)
     values = maps.flatten(1)
     left, found = values.clone(), []
@@ -115,13 +113,7 @@ def _stands_out(maps: Tensor, grasps: Tensor) -> Tensor:
     height, width = maps.shape[1:]
     found = peaks(maps, _LEFT_OUT_PEAKS)
     is_other = (found - grasps[:, None]).norm(dim=2) > GRASP_RADIUS
-    centers = _centers(height, width, maps.device)
+    centers = grid_of_centers(height, width, maps.device)
     to_peaks = (centers - found[:, :, None]).norm(dim=-1)  # (batch, peaks, cells)
     near = ((to_peaks < _LEFT_OUT_RADIUS) & is_other[..., None]).any(dim=1)
     return (near & ((centers - grasps[:, None]).norm(dim=-1) > GRASP_RADIUS)).unflatten(1, (height, width))
-
-
-def _centers(height: int, width: int, device: torch.device) -> Tensor:
-    """Returns the centers of a map's cells, row by row, (h w, 2) in -1..1."""
-    x, y = cell_centers(width, device), cell_centers(height, device)
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)

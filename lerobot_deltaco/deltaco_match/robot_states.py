@@ -34,12 +34,12 @@ class TrainingLocations(NamedTuple):
     Attributes:
         locations: Pick and place in the first camera's image, (episodes, 2, 2) in -1..1.
         heights: Grasp height offsets, (episodes,).
-        found: Whether the gripper closed and opened in an episode, (episodes,) bool; else the rest is 0.
+        has_grasp: Whether the gripper closed and opened in an episode, (episodes,) bool; else the rest is 0.
     """
 
     locations: Tensor
     heights: Tensor
-    found: Tensor
+    has_grasp: Tensor
 
 
 class RobotStates(nn.Module):
@@ -91,26 +91,28 @@ class RobotStates(nn.Module):
         Returns:
             The locations and heights of the episodes.
         """
-        found = keyframes.found
-        self.to_image.fit(first[found], last[found], keyframes.states[found, 0], scale)
+        has_grasp = keyframes.has_grasp
+        self.to_image.fit(first[has_grasp], last[has_grasp], keyframes.states[has_grasp, 0], scale)
         locations = self.to_image(keyframes.states).clamp(-1, 1)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
         states = keyframes.states * scale + shift  # (episodes, 2, state)
         for n in range(N_LOCATIONS):
-            features = _location_features(locations[found, n])
-            self.location_to_state[n].copy_(_ridge_regression(features, states[found, n]))
-        last_moves = (states[:, 0] - (keyframes.approach * scale + shift))[found]
-        self._fit_heights(locations[found, 0], states[found, 0], last_moves, is_arm)
+            features = _location_features(locations[has_grasp, n])
+            self.location_to_state[n].copy_(_ridge_regression(features, states[has_grasp, n]))
+        last_moves = (states[:, 0] - (keyframes.approach * scale + shift))[has_grasp]
+        self._fit_heights(locations[has_grasp, 0], states[has_grasp, 0], last_moves, is_arm)
         return self.locate(keyframes)
 
     def locate(self, keyframes: Keyframes) -> TrainingLocations:
         """Returns the locations and heights of episodes, from the robot's states in them."""
-        found = keyframes.found
+        has_grasp = keyframes.has_grasp
         locations = self.to_image(keyframes.states).clamp(-1, 1)
         heights = self.heights(keyframes.states[:, 0])
         return TrainingLocations(
-            torch.where(found[:, None, None], locations, 0.0), torch.where(found, heights, 0.0), found
+            torch.where(has_grasp[:, None, None], locations, 0.0),
+            torch.where(has_grasp, heights, 0.0),
+            has_grasp,
         )
 
     def _fit_heights(self, locations: Tensor, states: Tensor, last_moves: Tensor, is_arm: Tensor) -> None:

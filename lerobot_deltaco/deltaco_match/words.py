@@ -42,7 +42,8 @@ def understand(sentence: str, vocabulary: Sequence[str]) -> list[str | None]:
 
     A word outside the vocabulary is taken for the most similar known one, if that is similar enough.
     """
-    return [_understand_word(word, tuple(vocabulary)) for word in words_of(sentence)]
+    known = tuple(vocabulary)
+    return [_understand_word(word, known) for word in words_of(sentence)]
 
 
 @cache
