@@ -22,7 +22,8 @@ from torch import Tensor, nn
 from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
 from lerobot_deltaco.demonstrations import read_demonstrations, read_robot_data
 
-N_WORDS, DIM, N_SCENES = 4096, 32, 32  # of a batch's samples, those on which finding is trained
+N_WORDS, DIM = 4096, 32
+N_SCENES = 32  # of a batch's samples, on which finding is trained
 HAND = slice(6, 9)  # the end effector's x, y, z in the state
 
 
@@ -78,7 +79,7 @@ class ExamplePolicy(PreTrainedPolicy):
         )
 
     def find(self, scenes: Tensor, sentences: list[str], ends: Tensor) -> Tensor:
-        """Returns where the hand should grasp and release, and where it grasped, each (batch, 3) in m.
+        """Returns where the hand should grasp and release, and where it grasped, (batch, 3, 3) in m.
 
         Args:
             scenes: First image of each episode, (batch, 3, H, W) in 0..1.
@@ -127,6 +128,8 @@ class ExamplePolicy(PreTrainedPolicy):
 
     def set_tasks(self, instructions, demonstrations) -> None:
         """Called by `deltaco evaluate` after each reset, with a list of demonstrations of each sample."""
+        if not all(demonstrations):
+            raise ValueError("This example needs a demonstration: evaluate it with an instruction and one.")
         ends = torch.stack([own[0].frames[[0, -1]] for own in demonstrations])
         self.tasks = instructions, ends.to(self.config.device)
 

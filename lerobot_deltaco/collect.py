@@ -50,7 +50,6 @@ PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_
 # Held-out tasks, whose episodes are for validation.
 HELD_OUT = (
     "scenario_a_test",
-    "scenario_a_clean_test",
     "scenario_a_validation",
     "scenario_b_test",
     "foreign",

@@ -135,7 +135,7 @@ def test_scene_settings_reach_the_scenes_and_the_features(tmp_path):
 
 
 def test_held_out_tasks_are_for_validation():
-    held_out = ("scenario_a_test", "scenario_b_test", "scenario_a_clean_test", "scenario_a_validation")
+    held_out = ("scenario_a_test", "scenario_b_test", "scenario_a_validation")
     assert {CollectionPlan(tasks, 1).split for tasks in held_out} == {"validation"}
     others = ("scenario_a_train", "all", "4", "0,scenario_a_validation")
     assert {CollectionPlan(tasks, 1).split for tasks in others} == {"train"}

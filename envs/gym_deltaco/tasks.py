@@ -384,7 +384,6 @@ TASK_SETS = MappingProxyType(
         "scenario_a_selection_train": VALIDATION.train_tasks,
         "scenario_a_validation": VALIDATION.test_tasks,
         "scenario_a_clean_train": CLEAN.train_tasks,
-        "scenario_a_clean_test": CLEAN.test_tasks,
         # For the objects "random:N": scenario A's training tasks, and tasks by color and shape
         "random_train": (*SCENARIOS["a"].train_tasks, *_COLOR_SHAPE_TASKS),
         # For the objects "fold_K:N", and for "scenario_a_train"
