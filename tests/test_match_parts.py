@@ -9,7 +9,7 @@ from lerobot_deltaco.base_config import has_bfloat16
 from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.calibration import StateToImage
 from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops, fit_perspective
-from lerobot_deltaco.deltaco_match.feature_matching import Candidates, Crops, FeatureMatching, _contrasted
+from lerobot_deltaco.deltaco_match.feature_matching import Candidates, Crops, FeatureMatching
 from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.deltaco_match.gripper_direction import is_inverted, warn_if_inverted
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
@@ -21,7 +21,7 @@ from lerobot_deltaco.deltaco_match.keyframes import (
     warn_of_missing,
 )
 from lerobot_deltaco.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
-from lerobot_deltaco.deltaco_match.proposals import N_PROPOSALS, ProposalNetwork, peaks
+from lerobot_deltaco.deltaco_match.proposals import N_PROPOSALS, peaks
 from lerobot_deltaco.deltaco_match.robot_states import RobotStates
 from lerobot_deltaco.deltaco_match.words import encode_words, understand, vocabulary_of
 from lerobot_deltaco.demonstrations import RobotData
@@ -527,53 +527,6 @@ def test_peaks_are_apart_and_ordered():
     x, y = peaks(maps, 3)[0].T
     assert x.tolist() == pytest.approx([-0.6, 20.5 / 15 - 1, 27.5 / 15 - 1], abs=0.04)
     assert y.tolist() == pytest.approx([-0.55, 0.55, -0.15], abs=0.03)
-
-
-def test_things_that_no_training_task_asks_for_are_proposed(monkeypatch):
-    monkeypatch.setattr(proposals, "_SCENES_PER_STEP", 16)
-    monkeypatch.setattr(proposals, "FIT_STEPS", 100)
-    generator = np.random.default_rng(0)
-    moves = random_moves(80, SHAPE_TASKS)
-    grasps = torch.tensor(np.stack([move[1] for move in moves]), dtype=torch.float32)
-    images, never_grasped = [], []
-    for task, moved, other in (move[:3] for move in moves):
-        image = draw_shapes(task, moved, other)
-        while True:
-            row, column = generator.integers(5, SIZE - 5, 2)
-            location = (np.array([column, row]) + 0.5) * 2 / SIZE - 1
-            if min(np.abs(location - each).max() for each in (moved, other)) > 0.45:
-                break
-        image[row - 3 : row + 4, column - 3 : column + 4] = (200, 80, 40)
-        images.append(image)
-        never_grasped.append(location)
-    scenes, thing = stacked_images(images), torch.tensor(np.stack(never_grasped), dtype=torch.float32)
-    torch.manual_seed(0)
-    network, autocast = ProposalNetwork().requires_grad_(True), torch.autocast("cpu", enabled=False)
-    network.fit(scenes[:60], grasps[:60], torch.Generator().manual_seed(0), autocast)
-    with torch.no_grad():
-        proposed = network(scenes[60:].float() / 255)
-    for locations in (grasps[60:], thing[60:]):
-        distance = (proposed - locations[:, None]).norm(dim=2).amin(dim=1)
-        assert (distance < 0.19).float().mean() >= 0.9
-
-
-def test_a_target_is_told_from_targets_of_other_tasks_and_less_from_what_stands_beside_it():
-    descriptors = torch.rand(12, 5, 4, requires_grad=True)
-    target, tasks = torch.arange(12) % 5, torch.arange(12) % 3
-    crops = Crops(descriptors, torch.zeros(12, 5, 2), torch.zeros(12, 5, 2))
-    own, others = _contrasted(crops, target, tasks).descriptors.split([5, 8], dim=1)
-    torch.testing.assert_close(own, descriptors)
-    grasped = descriptors[torch.arange(12), target]
-    for scene in range(12):
-        for number in range(8):
-            other = (scene - 1 - number) % 12
-            expected = 0 * grasped[other] if tasks[other] == tasks[scene] else grasped[other]
-            torch.testing.assert_close(others[scene, number], expected)
-    own.sum().backward()
-    gradients = descriptors.grad[..., 0]
-    is_target = torch.nn.functional.one_hot(target, 5).bool()
-    torch.testing.assert_close(gradients[is_target], torch.ones(12))
-    torch.testing.assert_close(gradients[~is_target], torch.full((48,), 0.2))
 
 
 def test_words_are_understood():

@@ -52,8 +52,6 @@ MAX_EPISODES = 10_000
 _SCENES_PER_STEP = 64
 _LEARNING_RATE, _WORD_LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 1e-3, 3e-3, 0.2, 0.1
 _P_DROP_WORD = 0.3
-_OTHER_SCENES = 8  # whose grasped objects are told from what is meant in a scene
-_OTHER_PROPOSALS = 0.2  # by which the gradients of a scene's other proposals are multiplied
 _WORD_PENALTY = 0.03  # of each word's weight
 _COUNTS = 0.5  # weight from which on a word is shown as one that describes the object
 _MAP_STD = 0.8  # of a candidate, in cells
@@ -218,9 +216,8 @@ class FeatureMatching(nn.Module):
         """Fits the proposals, and then the comparison.
 
         The comparison learns to tell the object grasped in one episode of a task from the other proposals in
-        the scene of another episode, by the demonstration and by words; by the demonstration also from what
-        was grasped in scenes of other tasks. Some words are left out at random in each step, so that none is
-        indispensable.
+        the scene of another episode, by the demonstration and by words. Some words are left out at random in
+        each step, so that none is indispensable.
 
         Args:
             images: First images of episodes, (episodes, 3, H, W) uint8, as small as the policy's.
@@ -311,8 +308,6 @@ class FeatureMatching(nn.Module):
         for some in features.split(_NORMALIZED_AT_A_TIME):  # once and in place: they are large
             some.copy_(self.compare.inputs(some))
         said, spans = self._encoded_sentences(tasks, sentences, device)
-        numbers = {task: number for number, task in enumerate(dict.fromkeys(tasks))}
-        task_numbers = torch.tensor([numbers[task] for task in tasks], device=device)
         groups: list[dict[str, Any]] = [
             {"params": self.compare.parameters(), "lr": _LEARNING_RATE, "weight_decay": _WEIGHT_DECAY},
             {"params": self.grasp_height.parameters(), "lr": _LEARNING_RATE, "weight_decay": _WEIGHT_DECAY},
@@ -327,8 +322,7 @@ class FeatureMatching(nn.Module):
             crops = torch.cat([features[scenes], features[others, target[others]][:, None]], dim=1).float()
             with autocast:
                 described = self.compare.describe(crops, generator)
-            proposed = _contrasted(described.among(slice(-1)), target[scenes], task_numbers[scenes])
-            matches, _ = self.compare.match(proposed, described.descriptors[:, -1])
+            matches, _ = self.compare.match(described.among(slice(-1)), described.descriptors[:, -1])
             loss = F.nll_loss(matches, target[scenes])
             draws = torch.rand(len(scenes), generator=generator)
             drawn = (spans[scenes.cpu(), 0] + draws * spans[scenes.cpu(), 1]).long()
@@ -484,28 +478,6 @@ class Comparison(nn.Module):
         p_same = torch.sigmoid(self.gate[0] * cosines[0].amax(dim=1, keepdim=True) + self.gate[1])
         probabilities = p_same * is_same + (1 - p_same) * is_alike
         return probabilities.clamp_min(_MIN_PROBABILITY).log(), cosines[0]
-
-
-def _contrasted(crops: Crops, target: Tensor, tasks: Tensor) -> Crops:
-    """Adds what was grasped in scenes of other tasks to the proposals among which the target is to be found.
-
-    No training task may ask for some of the things that stand beside the targets, and the comparison should
-    not learn that such things are never meant. So the gradients of other proposals in a scene are reduced.
-
-    Args:
-        crops: The proposals.
-        target: The right one, (batch,).
-        tasks: Number of each scene's task, (batch,).
-    """
-    each = crops.descriptors
-    is_target = F.one_hot(target, each.shape[1])[..., None].bool()
-    own = torch.where(is_target, each, torch.lerp(each.detach(), each, _OTHER_PROPOSALS))
-    grasped = each[torch.arange(len(each)), target]
-    shifts = range(1, _OTHER_SCENES + 1)
-    others = torch.stack([grasped.roll(n, dims=0) for n in shifts], dim=1)
-    is_same = torch.stack([tasks.roll(n) == tasks for n in shifts], dim=1)
-    # A descriptor of zeros is like nothing.
-    return crops._replace(descriptors=torch.cat([own, others.masked_fill(is_same[..., None], 0)], dim=1))
 
 
 def _unit(descriptors: Tensor) -> Tensor:

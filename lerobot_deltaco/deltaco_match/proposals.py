@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
 from lerobot_deltaco.losses import location_loss
 from lerobot_deltaco.networks import channels_last, conv_norm_relu, grid_of_centers
 
@@ -17,19 +16,13 @@ _PEAK_RADIUS = 1.6  # of the cells around a peak whose mean is a proposal
 FIT_STEPS = 800
 _SCENES_PER_STEP = 48
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
-_P_NEW_COLORS = 0.5
 GRASP_RADIUS = 0.19  # around a grasp: a proposal within it stands for the grasped object; 4.5 px of 48
-# The loss leaves out the cells within this radius of the map's highest peaks, unless a grasp is near.
-_LEFT_OUT_PEAKS, _LEFT_OUT_RADIUS = 16, 0.25
-_LEFT_OUT_LOGIT = -30.0
 
 
 class ProposalNetwork(nn.Module):
     """Proposes pick locations. It is fitted to where the gripper closed in training scenes.
 
-    The network is not told what to look for, so its map has a peak at each thing that can be grasped. Things
-    that no training task asks for should have one, too, though they stand in training scenes. So the loss
-    leaves out what else stands out in a scene, and colors change at random.
+    The network is not told what to look for, so its map has a peak at each thing that can be grasped.
     """
 
     def __init__(self) -> None:
@@ -69,12 +62,8 @@ class ProposalNetwork(nn.Module):
         )
         for _ in tqdm(range(FIT_STEPS), desc="Fitting the proposals", unit="step", leave=False):
             rows = torch.randint(len(images), (_SCENES_PER_STEP,), generator=generator).to(images.device)
-            changes = random_color_changes(len(rows), _P_NEW_COLORS, generator)
-            scenes = change_colors(images[rows].float() / 255, changes)
             with autocast:
-                maps = self.layers(channels_last(scenes)).float()
-            left_out = _stands_out(maps[:, 0].detach(), locations[rows])
-            maps = maps.masked_fill(left_out[:, None], _LEFT_OUT_LOGIT)
+                maps = self.layers(channels_last(images[rows].float() / 255)).float()
             loss = location_loss(maps, locations[rows, None]).mean()
             optimizer.zero_grad()
             loss.backward()
@@ -106,14 +95,3 @@ def peaks(maps: Tensor, n_peaks: int) -> Tensor:
         found.append((weights[..., None] * centers).sum(dim=1) / weights.sum(dim=1, keepdim=True))
         left = left.masked_fill(away.norm(dim=2) < _MIN_DISTANCE, -1e9)
     return torch.stack(found, dim=1)
-
-
-def _stands_out(maps: Tensor, grasps: Tensor) -> Tensor:
-    """Returns which cells of maps (batch, h, w) are near high peaks, but not near grasps, (batch, h, w)."""
-    height, width = maps.shape[1:]
-    found = peaks(maps, _LEFT_OUT_PEAKS)
-    is_other = (found - grasps[:, None]).norm(dim=2) > GRASP_RADIUS
-    centers = grid_of_centers(height, width, maps.device)
-    to_peaks = (centers - found[:, :, None]).norm(dim=-1)  # (batch, peaks, cells)
-    near = ((to_peaks < _LEFT_OUT_RADIUS) & is_other[..., None]).any(dim=1)
-    return (near & ((centers - grasps[:, None]).norm(dim=-1) > GRASP_RADIUS)).unflatten(1, (height, width))
