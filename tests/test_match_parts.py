@@ -9,7 +9,7 @@ from lerobot_deltaco.base_config import has_bfloat16
 from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.calibration import StateToImage
 from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops, fit_perspective
-from lerobot_deltaco.deltaco_match.feature_matching import Candidates, Crops, FeatureMatching
+from lerobot_deltaco.deltaco_match.feature_matching import Candidates, FeatureMatching
 from lerobot_deltaco.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.deltaco_match.gripper_direction import is_inverted, warn_if_inverted
 from lerobot_deltaco.deltaco_match.hue_augmentation import change_colors, random_color_changes
