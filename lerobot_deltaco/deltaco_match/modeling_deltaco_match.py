@@ -311,14 +311,15 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         meta, device = self._meta, self.step.device
         assert located is not None
         assert bank is not None
-        rows = dict(zip(episodes, bank.episode_rows(torch.tensor(episodes, device=device)), strict=True))
+        found = bank.episode_rows(torch.tensor(episodes, device=device))
+        rows = dict(zip(episodes, found.tolist(), strict=True))
         new = [episode for episode, row in rows.items() if row < 0 and episode not in self._held_out]
         if new:
             assert meta is not None
             data = read_robot_data(open_dataset("--dataset.root", meta.repo_id, meta.root, new), new)
             keyframes = self.keyframes_of(data._replace(states=data.states.to(device)))
-            found = zip(*self.robot_states.locate(keyframes), strict=True)
-            self._held_out.update(zip(new, starmap(TrainingLocations, found), strict=True))
+            read = zip(*self.robot_states.locate(keyframes), strict=True)
+            self._held_out.update(zip(new, starmap(TrainingLocations, read), strict=True))
         each = [
             self._held_out[episode] if rows[episode] < 0 else [part[rows[episode]] for part in located]
             for episode in episodes
