@@ -292,8 +292,12 @@ import multiprocessing
 from gym_deltaco.env import PickPlaceEnv
 env = PickPlaceEnv(); env.reset(seed=0)
 env.itself = env
-process = multiprocessing.get_context("fork").Process(target=env.close); process.start(); process.join()
+fork = multiprocessing.get_context("fork").Process
+process = fork(target=env.close); process.start(); process.join()
 env.reset(seed=1, options={"task_id": 1})  # the child has closed its copy, and no files of the parent
+process = fork(target=lambda: PickPlaceEnv().reset(seed=0)); process.start(); process.join()
+other = PickPlaceEnv()
+process = fork(target=lambda: other.reset(seed=0)); process.start(); process.join()
 """
     environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONWARNINGS": "always::ResourceWarning"}
     result = run_python(script, env=environment)

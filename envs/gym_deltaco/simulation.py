@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 import shutil
 import tempfile
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -156,7 +155,8 @@ class Simulation:
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise RuntimeError("PyBullet has no free client left. Close environments that you no longer use.")
-        self._release = weakref.finalize(self, _release, self._client, self._files, os.getpid())
+        # Unlike `weakref.finalize`, this also runs at the end of processes that `multiprocessing` forks.
+        self._release = Finalize(self, _release, (self._client, self._files), exitpriority=0)
         self._hull_files: dict[object, str] = {}
         self._texture = -1
         # Visible parts, as body and link. Static parts have their mesh and position, as keys of backgrounds.
@@ -496,11 +496,9 @@ class Simulation:
         return image[..., :3], np.asarray(depths, dtype=np.float32).reshape(size, size)
 
 
-def _release(client: int, files: Path, process: int) -> None:
+def _release(client: int, files: Path) -> None:
     """Disconnects the client of a simulation, and removes its files."""
-    # A forked process has its own copy of the client, but shares the files.
-    if os.getpid() == process:
-        shutil.rmtree(files, ignore_errors=True)
+    shutil.rmtree(files, ignore_errors=True)
     pybullet.disconnect(physicsClientId=client)
 
 
