@@ -52,6 +52,8 @@ def main() -> None:
         _print(_training_help())
         return
     logging.basicConfig(format="%(levelname)s %(message)s", level=logging.WARNING)
+    # Without FFmpeg, LeRobot decodes videos with PyAV, and warns of it with four tracebacks.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
         _run(name, arguments)
     except KeyboardInterrupt:
