@@ -1,6 +1,7 @@
 """Pictures, videos and the page of `deltaco look`."""
 
 import io
+import re
 
 import av
 import numpy as np
@@ -16,6 +17,7 @@ from lerobot_deltaco import look as room
 from lerobot_deltaco.arguments import LookArguments
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import Found
 from lerobot_deltaco.look import look
+from lerobot_deltaco.pages import render
 from lerobot_deltaco.pictures import PICK_COLOR, PLACE_COLOR, draw_found, encode_video
 from lerobot_deltaco.recording import benchmark_env, find_demonstration, load_conditioned, record_episode
 
@@ -112,10 +114,19 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     assert [text.count(f"by {who}") for who in ("episode 1", "episode 0", "itself")] == [1, 1, 1]
     assert [args[0].shape for args in drawn] == [(96, 96, 3)] * 3
     assert [args[1].shape for args in drawn] == [(2, 96, 96, 3)] * 3
-    for n, what in enumerate(("pick", "place")):
-        right = [bool((args[2].locations[0, n] - args[4][n]).norm() < room.TOLERANCE) for args in drawn]
-        assert f"Episodes with the right {what} location: <b>{sum(right)} of 3</b>" in text
-        assert f"Episodes with the right {what} location: {sum(right)} of 3\n" in report
+    right = torch.stack([(args[2].locations[0] - args[4]).norm(dim=1) < room.TOLERANCE for args in drawn])
+    for what, number in zip(("pick", "place"), right.sum(dim=0).tolist(), strict=True):
+        assert f"Episodes with the right {what} location: <b>{number} of 3</b>" in text
+        assert f"Episodes with the right {what} location: {number} of 3\n" in report
+
+
+def test_an_episode_is_marked_as_right_if_both_of_its_locations_are():
+    view = {"title": "", "picture": "", "text": "", "video": None}
+    cases = {(True, True): "✓", (True, False): "✗", (False, True): "✗", (None, None): "–", (False,): "✗"}
+    views = [{**view, "right": right} for right in cases]
+    page = {"checkpoint": "", "source": "", "rates": [], "tolerance": 0.2, "pick_color": "", "place_color": ""}
+    text = render("look.html", views=views, **page)
+    assert re.findall("[✓✗–]", text) == list(cases.values())
 
 
 def test_without_a_dataset_episodes_of_the_benchmark_are_run(tmp_path):
