@@ -124,8 +124,8 @@ def test_an_episode_is_marked_as_right_if_both_of_its_locations_are():
     view = {"title": "", "picture": "", "text": "", "video": None}
     cases = {(True, True): "✓", (True, False): "✗", (False, True): "✗", (None, None): "–", (False,): "✗"}
     views = [{**view, "right": right} for right in cases]
-    page = {"checkpoint": "", "source": "", "rates": [], "tolerance": 0.2, "pick_color": "", "place_color": ""}
-    text = render("look.html", views=views, **page)
+    page = dict.fromkeys(("checkpoint", "source", "pick_color", "place_color"), "")
+    text = render("look.html", views=views, rates=[], tolerance=0.2, **page)
     assert re.findall("[✓✗–]", text) == list(cases.values())
 
 
