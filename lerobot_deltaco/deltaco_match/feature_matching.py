@@ -150,12 +150,12 @@ class FeatureMatching(nn.Module):
                 demonstrated = torch.full_like(scores[:, 0], torch.nan)
             else:
                 # How well known words describe the object. A new noun leaves the demonstration in charge.
-                unknown = (weights * (said == UNKNOWN_WORD)).amax(dim=1)
-                known = (1 - unknown) * (weights * (said > UNKNOWN_WORD)).amax(dim=1)
+                p_unknown = (weights * (said == UNKNOWN_WORD)).amax(dim=1)
+                p_described = (1 - p_unknown) * (weights * (said > UNKNOWN_WORD)).amax(dim=1)
                 matches, similarity = self.compare.match(
-                    crops, described, _SHARPNESS, _P_OTHER_OBJECT * known
+                    crops, described, _SHARPNESS, _P_OTHER_OBJECT * p_described
                 )
-                scores = (1 - unknown)[:, None] * scores + matches
+                scores = (1 - p_unknown)[:, None] * scores + matches
             heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
             return Candidates(locations, scores.log_softmax(dim=1), heights)
 
@@ -163,11 +163,11 @@ class FeatureMatching(nn.Module):
     def understood(self, instruction: str) -> list[tuple[str, str]]:
         """Returns the words of an instruction that describe the object, and what each is understood as."""
         said = encode_words([instruction], self.vocabulary).to(self.fitted.device)
-        known = zip(words_of(instruction), understand(instruction, self.vocabulary), strict=True)
+        meanings = zip(words_of(instruction), understand(instruction, self.vocabulary), strict=True)
         weights = self.word_weights(said)[0].tolist()
         return [
             (word, meant)
-            for (word, meant), weight in zip(known, weights, strict=False)
+            for (word, meant), weight in zip(meanings, weights, strict=False)
             if meant is not None and weight > _COUNTS
         ]
 
@@ -249,8 +249,8 @@ class FeatureMatching(nn.Module):
                 if isinstance(layer, (nn.Conv2d, nn.Linear, nn.BatchNorm2d)):
                     layer.reset_parameters()
             self.requires_grad_(True)
-            known = grasps.to(device)
-            self.perspective.copy_(fit_perspective(images[known], last[known], locations[known]))
+            rows = grasps.to(device)
+            self.perspective.copy_(fit_perspective(images[rows], last[rows], locations[rows]))
             rows = drawn.to(device)
             self.propose.fit(images[rows], locations[rows], generator, autocast)
             features, target, kept = self._crops_of_proposals(images, native, locations, drawn, autocast)
@@ -360,9 +360,9 @@ class FeatureMatching(nn.Module):
         weights = self.word_weights(said)
         loss = F.cross_entropy(_word_scores(words, said, weights), target)
         named = words[torch.arange(len(words)), target]  # (batch, vocabulary)
-        known = weights.detach() * (said > UNKNOWN_WORD)
+        known_weights = weights.detach() * (said > UNKNOWN_WORD)
         log_probabilities = named.gather(1, (said - UNKNOWN_WORD - 1).clamp_min(0))
-        naming = -(known * log_probabilities).sum(dim=1) / known.sum(dim=1).clamp_min(1e-6)
+        naming = -(known_weights * log_probabilities).sum(dim=1) / known_weights.sum(dim=1).clamp_min(1e-6)
         # Words that tell nothing would only add noise.
         penalty = _WORD_PENALTY * (weights * (said > UNKNOWN_WORD)).sum(dim=1).mean()
         # What an unknown word is about follows from its neighbors.
@@ -494,8 +494,8 @@ def _word_scores(words: Tensor, said: Tensor, weights: Tensor) -> Tensor:
         weights: Their weights, (batch, length).
     """
     index = (said - UNKNOWN_WORD - 1).clamp_min(0)[:, None].expand(-1, words.shape[1], -1)
-    known = weights * (said > UNKNOWN_WORD)
-    return (words.gather(2, index) * known[:, None]).sum(dim=2)
+    known_weights = weights * (said > UNKNOWN_WORD)
+    return (words.gather(2, index) * known_weights[:, None]).sum(dim=2)
 
 
 def _nearest(proposed: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
@@ -525,7 +525,7 @@ class _Pairs:
         rows: dict[str, list[int]] = {}
         for row, task in enumerate(tasks):
             rows.setdefault(task, []).append(row)
-        self._rows = [torch.tensor(found) for found in rows.values() if len(found) > 1]
+        self._rows = [torch.tensor(own) for own in rows.values() if len(own) > 1]
         if not self._rows:
             raise ValueError(
                 "Feature matching needs tasks with at least two episodes in which the gripper closes on "

@@ -31,7 +31,7 @@ def is_inverted(gripper: Tensor, data: RobotData) -> bool | None:
         data: The episodes, and their images.
     """
     readings = [find_grasps(commands, data.spans) for commands in (gripper, -gripper)]
-    n_grasps, n_inverted = (sum(isinstance(found, Grasp) for found in reading) for reading in readings)
+    n_grasps, n_inverted = (sum(isinstance(grasp, Grasp) for grasp in reading) for reading in readings)
     if 2 * n_inverted < len(data.spans):
         return False if n_grasps > n_inverted else None
     if data.images is None:
@@ -50,12 +50,12 @@ def _change_while_closed(
     Returns:
         Median over some of the episodes, as a fraction; 0 if there are no grasps.
     """
-    found = [(span, grasp) for span, grasp in zip(spans, grasps, strict=True) if isinstance(grasp, Grasp)]
-    if not found:
+    episodes = [(span, grasp) for span, grasp in zip(spans, grasps, strict=True) if isinstance(grasp, Grasp)]
+    if not episodes:
         return 0.0
     shown = []
-    for n in np.unique(np.linspace(0, len(found) - 1, min(_N_EPISODES, len(found))).astype(int)):
-        (first, last), grasp = found[n]
+    for n in np.unique(np.linspace(0, len(episodes) - 1, min(_N_EPISODES, len(episodes))).astype(int)):
+        (first, last), grasp = episodes[n]
         # The arm has begun to leave the object.
         after = min(grasp.opened + max(1, (last - first + 1) // 30), last)
         shown.append(images([first, grasp.closing, after, last]))
@@ -91,7 +91,7 @@ def warn_if_inverted(gripper: Tensor, data: RobotData, closed: str) -> None:
             other,
             other,
         )
-    elif inverted is None and not any(isinstance(found, Grasp) for found in find_grasps(gripper, data.spans)):
+    elif inverted is None and not any(isinstance(grasp, Grasp) for grasp in find_grasps(gripper, data.spans)):
         logger.warning(
             "No episode has a grasp if %s values of the gripper mean closed (--policy.gripper_closed), and "
             "the images do not show whether they do. Look at a recording: if %s values mean closed, set "

@@ -86,18 +86,18 @@ def find_keyframes(
         spans: First and last frame of each episode.
         usual: As for `find_grasps`.
     """
-    found, frames = find_grasps(gripper, spans, usual), []
-    for (first, last), grasp in zip(spans, found, strict=True):
+    grasps, frames = find_grasps(gripper, spans, usual), []
+    for (first, last), grasp in zip(spans, grasps, strict=True):
         if isinstance(grasp, str):
             frames.append((first, first, first))
             continue
         approach = grasp.closing - max(1, (last - first + 1) // _APPROACH)
         # The command to close takes effect one step later.
         frames.append((min(grasp.grasp + 1, grasp.release), grasp.release, max(approach, first)))
-    has_grasp = torch.tensor([isinstance(grasp, Grasp) for grasp in found], device=states.device)
+    has_grasp = torch.tensor([isinstance(grasp, Grasp) for grasp in grasps], device=states.device)
     at = states[torch.tensor(frames, device=states.device)].float()  # (episodes, 3, state)
     at = torch.where(has_grasp[:, None, None], at, 0.0)
-    missing = tuple(grasp if isinstance(grasp, str) else None for grasp in found)
+    missing = tuple(grasp if isinstance(grasp, str) else None for grasp in grasps)
     return Keyframes(at[:, :2], at[:, 2], has_grasp, missing)
 
 
@@ -147,11 +147,11 @@ def find_grasps(
     ranges = [float(np.ptp(course)) for course in smooth]
     if usual is None:
         usual = float(np.nanmedian(ranges)) if np.isfinite(ranges).any() else 0.0
-    found: list[Grasp | str] = []
+    grasps: list[Grasp | str] = []
     for (first, _), raw, course, size in zip(spans, courses, smooth, ranges, strict=True):
         grasp = _last_valley(raw, course, size, usual)
-        found.append(grasp if isinstance(grasp, str) else Grasp(*(first + frame for frame in grasp)))
-    return found
+        grasps.append(grasp if isinstance(grasp, str) else Grasp(*(first + frame for frame in grasp)))
+    return grasps
 
 
 def _courses(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[NDArray[np.float64]]:

@@ -203,8 +203,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self, batch: dict[str, Any], tasks: list[str], generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the loss of each sample, (batch,), and its parts to log."""
-        config, known = self.config, self.training_locations
-        assert known is not None
+        config, located = self.config, self.training_locations
+        assert located is not None
         assert self.training_bank is not None
         images, rows = self._images(batch), self.training_bank.episode_rows(batch["episode_index"])
         instructions = self._draw_instructions(tasks, generator)
@@ -219,14 +219,14 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             changes[some],
             generator,
         )  # (some, 2)
-        noise = torch.randn(known.locations[rows].shape, generator=generator).to(rows.device)
-        locations = known.locations[rows] + config.location_noise * noise
+        noise = torch.randn(located.locations[rows].shape, generator=generator).to(rows.device)
+        locations = located.locations[rows] + config.location_noise * noise
         noise = torch.randn(len(rows), generator=generator).to(rows.device)
-        heights = known.heights[rows] + _HEIGHT_NOISE * noise
+        heights = located.heights[rows] + _HEIGHT_NOISE * noise
         images = change_colors(images, changes)
         loss, logged = self._acting_loss(batch, images, locations, heights, generator)
         # An episode without a grasp has no locations, and teaches nothing.
-        loss = torch.where((rows >= 0) & known.has_grasp[rows], loss, 0.0)
+        loss = torch.where((rows >= 0) & located.has_grasp[rows], loss, 0.0)
         loss = loss.index_add(0, some.to(rows.device), len(rows) / n_some * finding.sum(dim=1))
         names = ("place_loss", "attention_loss")
         return loss, logged | dict(zip(names, finding.mean(dim=0), strict=True))
@@ -251,17 +251,17 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         Returns:
             Losses of the place and of the attention, (batch, 2); 0 for an episode without a grasp.
         """
-        bank, known = self.training_bank, self.training_locations
+        bank, located = self.training_bank, self.training_locations
         assert bank is not None
-        assert known is not None
+        assert located is not None
         rows, device = bank.episode_rows(episodes), episodes.device
         others = bank.draw_other_episodes(episodes, tasks, generator)
-        both_grasp = (rows >= 0) & known.has_grasp[rows] & known.has_grasp[others]
+        both_grasp = (rows >= 0) & located.has_grasp[rows] & located.has_grasp[others]
         scenes, locations = _shifted(
-            bank.frames[rows, 0].float() / 255, known.locations[rows, 1:], generator
+            bank.frames[rows, 0].float() / 255, located.locations[rows, 1:], generator
         )  # (batch, 3, H, W)
         ends, demonstrated = _shifted(
-            bank.frames[others][:, [0, -1]].float() / 255, known.locations[others], generator
+            bank.frames[others][:, [0, -1]].float() / 255, located.locations[others], generator
         )  # (batch, 2, 3, H, W)
         attention = self.attention(change_colors(ends, changes))
         by_instruction = (torch.rand(len(rows), generator=generator) >= _P_PLACE_BY_DEMONSTRATION).to(device)
@@ -311,8 +311,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         meta, device = self._meta, self.step.device
         assert located is not None
         assert bank is not None
-        found = bank.episode_rows(torch.tensor(episodes, device=device))
-        rows = dict(zip(episodes, found.tolist(), strict=True))
+        bank_rows = bank.episode_rows(torch.tensor(episodes, device=device))
+        rows = dict(zip(episodes, bank_rows.tolist(), strict=True))
         new = [episode for episode, row in rows.items() if row < 0 and episode not in self._held_out]
         if new:
             assert meta is not None
@@ -489,11 +489,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 f"is {config.name_gripper(self._meta.features)}, whose {config.gripper_closed} values close "
                 "it; see --policy.gripper and --policy.gripper_closed."
             )
-        known = self.robot_states.fit(keyframes, frames[:, 0], frames[:, -1], end - shift, shift, is_arm)
-        self.training_locations = known
+        located = self.robot_states.fit(keyframes, frames[:, 0], frames[:, -1], end - shift, shift, is_arm)
+        self.training_locations = located
         self.training_bank.pick_states = keyframes.pick_states
         if not bool(self.feature_matching.fitted):
-            picks = torch.where(known.has_grasp[:, None], known.locations[:, 0], torch.nan)
+            picks = torch.where(located.has_grasp[:, None], located.locations[:, 0], torch.nan)
             native = self.training_bank.first_images
             tasks = self.training_bank.tasks
             self.feature_matching.fit(
@@ -501,7 +501,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 frames[:, -1],
                 frames[:, 0] if native is None else native,
                 picks,
-                known.heights,
+                located.heights,
                 tasks,
                 self._sentences(tasks),
                 config.seed,
@@ -510,13 +510,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     def _sentences(self, tasks: Iterable[str]) -> dict[str, list[str]]:
         """Returns the instructions of tasks in training; a task string is repeated by its probability."""
-        found = {}
+        sentences = {}
         for task in dict.fromkeys(tasks):
             own = [] if self.paraphrases is None else list(self.paraphrases.of(task))
             p = self.config.p_paraphrase if own else 0.0
             n_templates = 1 if p == 0 else round(len(own) * (1 - p) / p)
-            found[task] = [task] * n_templates + (own if p else [])
-        return found
+            sentences[task] = [task] * n_templates + (own if p else [])
+        return sentences
 
     def _normalized(self, states: Tensor) -> Tensor:
         """Normalizes robot states (n, state) as the network gets them, without clipping, on the CPU."""

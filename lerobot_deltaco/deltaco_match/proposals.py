@@ -86,12 +86,12 @@ def peaks(maps: Tensor, n_peaks: int) -> Tensor:
     centers = grid_of_centers(height, width, maps.device)
     radius = _PEAK_RADIUS * 2 / torch.tensor([width, height], device=maps.device)
     values = maps.flatten(1)
-    left, found = values.clone(), []
+    left, locations = values.clone(), []
     for _ in range(n_peaks):
         best, cell = left.max(dim=1)
         away = centers - centers[cell][:, None]  # (batch, cells, 2)
         # Beyond the last peak, all cells may be taken; then the highest is proposed again.
         weights = (values - best[:, None]).clamp(max=0).exp() * (away.abs() <= radius).all(dim=2)
-        found.append((weights[..., None] * centers).sum(dim=1) / weights.sum(dim=1, keepdim=True))
+        locations.append((weights[..., None] * centers).sum(dim=1) / weights.sum(dim=1, keepdim=True))
         left = left.masked_fill(away.norm(dim=2) < _MIN_DISTANCE, -1e9)
-    return torch.stack(found, dim=1)
+    return torch.stack(locations, dim=1)

@@ -42,8 +42,8 @@ def understand(sentence: str, vocabulary: Sequence[str]) -> list[str | None]:
 
     A word outside the vocabulary is taken for the most similar known one, if that is similar enough.
     """
-    known = tuple(vocabulary)
-    return [_understand_word(word, known) for word in words_of(sentence)]
+    words = tuple(vocabulary)
+    return [_understand_word(word, words) for word in words_of(sentence)]
 
 
 @cache
