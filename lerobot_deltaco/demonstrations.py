@@ -277,6 +277,12 @@ class RobotData(NamedTuple):
     spans: list[tuple[int, int]]
     images: Callable[[list[int]], Tensor] | None = None
 
+    def images_at(self, frames: Sequence[int], size: int) -> Tensor:
+        """Returns the images of some frames, resized, (n, 3, size, size) uint8."""
+        assert self.images is not None
+        parts = (list(frames[n : n + _RESIZED_AT_A_TIME]) for n in range(0, len(frames), _RESIZED_AT_A_TIME))
+        return torch.cat([resize_images(self.images(part), size) for part in parts])
+
 
 def read_demonstrations(
     dataset: LeRobotDataset,

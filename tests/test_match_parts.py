@@ -39,14 +39,15 @@ def grasp_frames(gripper, spans):
 
 
 def test_last_grasp_that_is_released_counts():
-    states = torch.arange(14).float()[:, None]
+    states = torch.tensor([0, 1, 2, 3, 4, 5, 4.5, 4, 0, 0, 0, 0, 0, 0])[:, None]
     gripper = torch.tensor([1, -1, 1, 1, -1, -1, 1, 1, -1, 1.0, 1, 1, -1, -1])
     spans = [(0, 7), (8, 10), (11, 13)]
     keyframes = find_keyframes(states, gripper, spans)
     assert keyframes.has_grasp.tolist() == [True, False, False]
     # One step after the command to close, and the step of the command to open.
-    assert keyframes.states[0, :, 0].tolist() == [5, 6]
+    assert keyframes.states[0, :, 0].tolist() == [5, 4.5]
     assert keyframes.approach[0, 0] == 2
+    assert keyframes.carried.tolist() == [5, 8, 11]
     assert not keyframes.states[1:].any()
     assert keyframes.pick_states[:, 0].isnan().tolist() == [False, True, True]
     assert grasp_frames(gripper, spans) == [(4, 6), None, None]
@@ -101,6 +102,18 @@ def test_approach_and_opening_scale_with_the_course():
     assert 180 < found.release < 190 < 200 < found.opened <= 210
     # A 30th of the episode before the gripper begins to close.
     assert find_keyframes(states, slow, [(0, len(slow) - 1)]).approach[0, 0] == found.closing - 10
+
+
+@pytest.mark.parametrize(("stops", "expected"), [(5, 6), (8, 8), (11, 11), (30, 11)])
+def test_a_gripper_that_closes_on_its_way_has_grasped_where_the_approach_ends(stops, expected):
+    """It is told to close in frame 5, and carries the object away from frame 15 on."""
+    frames = torch.arange(40)
+    gripper = 1 - 2.0 * ((frames >= 5) & (frames < 30))
+    down = frames.clamp(max=stops) + 0.01 * frames
+    away = (frames - 15).clamp(min=0)
+    keyframes = find_keyframes(torch.stack([down, 3000.0 * away, frames * 0.0], dim=1), gripper, [(0, 39)])
+    assert keyframes.states[0, 0, 0] == down[expected]
+    assert keyframes.carried.tolist() == [(expected + 30) // 2]
 
 
 def test_a_state_holds_while_the_command_is_to_stay():
@@ -206,10 +219,42 @@ def test_changes_alone_tell_where_states_are_in_the_image():
     scale = torch.cat([1 / states.std(dim=0), torch.ones(5)])
     states = torch.cat([states, velocities], dim=1)
     to_image = StateToImage(states.shape[1])
-    to_image.fit(first, last, states, scale)
+    to_image.fit(first, last, last, states, scale)
     errors = (to_image(states) - torch.from_numpy(starts).float()).norm(dim=1) * TABLE_SIZE / 2  # px
     assert errors.median() < 1
     assert errors.max() < 2.5
+
+
+@pytest.mark.parametrize("carried_elsewhere", [True, False])
+def test_a_robot_that_ends_where_the_object_tells_is_not_taken_for_the_object(carried_elsewhere):
+    """Without the images on the way, nothing tells the object's place from that of the robot at the end."""
+    moves, rng = random_moves(120), np.random.default_rng(0)
+    starts = np.stack([start for _, start, _, _ in moves])
+
+    def with_robot(task, other, location):
+        image = draw_table(task, location, other)
+        column, row = ((location + 1) * TABLE_SIZE / 2).astype(int)
+        image[max(0, row - 5) : row + 5, max(0, column - 5) : column + 5] = 255
+        return image
+
+    first = stacked_images([draw_table(task, start, other) for task, start, other, _ in moves])
+    last = stacked_images([with_robot(task, other, -start) for task, start, other, _ in moves])
+    on_the_way = [with_robot(task, other, rng.uniform(-0.9, 0.9, 2)) for task, _, other, _ in moves]
+    states = torch.from_numpy(np.stack([state_at(start) for start in starts])).float()
+    to_image = StateToImage(states.shape[1])
+    carried = stacked_images(on_the_way) if carried_elsewhere else last
+    to_image.fit(first, carried, last, states, 1 / states.std(dim=0).clamp_min(1e-3))
+    errors = (to_image(states) - torch.from_numpy(starts).float()).norm(dim=1) * TABLE_SIZE / 2  # px
+    assert (errors.median() < 1) == carried_elsewhere
+
+
+def test_states_that_tell_nothing_of_the_image_are_warned_of(caplog):
+    moves = random_moves(120)
+    first = stacked_images([draw_table(task, start, other) for task, start, other, _ in moves])
+    last = stacked_images([draw_table(task, end, other) for task, _, other, end in moves])
+    states = torch.randn(len(moves), 3, generator=torch.Generator().manual_seed(0))
+    StateToImage(3).fit(first, last, last, states, torch.ones(3))
+    assert "the locations are probably wrong" in caplog.text
 
 
 class ExactLocations(torch.nn.Module):
@@ -231,7 +276,10 @@ def grasps(heights):
     width = torch.rand(200, 2, generator=generator) * 40
     states = torch.stack([2 + x, 5 * y + 0.2 * height, 3 * height + x * y, width], dim=2)
     approach = states[:, 0] - torch.tensor([0, 0.2, 3, 0])
-    return Keyframes(states, approach, torch.arange(200) % 10 > 0, (None,) * 200), locations
+    has_grasp = torch.arange(200) % 10 > 0
+    return Keyframes(
+        states, approach, torch.zeros(200, dtype=torch.long), has_grasp, (None,) * 200
+    ), locations
 
 
 def fitted_states(keyframes):
@@ -240,7 +288,11 @@ def fitted_states(keyframes):
     images = torch.zeros(200, 3, 2, 2, dtype=torch.uint8)
     scale, shift = torch.tensor([0.5, 2, 0.1, 1]), torch.tensor([1.0, 0, -1, 0])
     is_arm = torch.tensor([True, True, True, False])
-    return robot_states, robot_states.fit(keyframes, images, images, scale, shift, is_arm), (scale, shift)
+    return (
+        robot_states,
+        robot_states.fit(keyframes, images, images, images, scale, shift, is_arm),
+        (scale, shift),
+    )
 
 
 def test_heights_are_what_locations_do_not_tell_of_states():

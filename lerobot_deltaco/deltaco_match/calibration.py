@@ -1,12 +1,13 @@
-"""Calibration of the camera: from robot states to locations, learned from an episode's first and last image.
+"""Calibration of the camera: from robot states to locations, learned from images of episodes.
 
-Where the gripper closed around an object, the image has changed at the end of the episode: the object is
-gone. The map from states to locations sends the states at the grasps to the locations of these changes. So no
-calibrated camera is needed, only a fixed one.
+Where the gripper closed around an object, the image stays changed: the object is gone while it is carried, and
+at the end. The map from states to locations sends the states at the grasps to the locations of these changes.
+So no calibrated camera is needed, only a fixed one.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 
 import torch
@@ -15,6 +16,8 @@ from torch import Tensor, nn
 
 from lerobot_deltaco.networks import grid_of_centers
 
+logger = logging.getLogger(__name__)
+
 EPISODES_PER_CLUSTER = 60
 MIN_CLUSTERS, MAX_CLUSTERS = 12, 200
 MIN_EPISODES = 2 * MIN_CLUSTERS
@@ -22,6 +25,7 @@ _ROUNDS = 10  # of k-means, of the robust regression and of the refinement
 _BLUR = 1 / 32  # standard deviation, as a fraction of the image's side
 _REACH = 1 / 8  # of the refinement around a predicted location, as a fraction of the image's side
 _RIDGE = 1e-2
+_DOUBTFUL = 1 / 16  # median distance of changes from where they are expected, as a fraction of the side
 
 
 class StateToImage(nn.Module):
@@ -41,11 +45,12 @@ class StateToImage(nn.Module):
         self.register_buffer("scale", torch.zeros(state_dim))
         self.register_buffer("weights", torch.zeros(_quadratic(self.mean).shape[-1], 2))
 
-    def fit(self, first: Tensor, last: Tensor, states: Tensor, scale: Tensor) -> None:
-        """Learns the map from episodes.
+    def fit(self, first: Tensor, carried: Tensor, last: Tensor, states: Tensor, scale: Tensor) -> None:
+        """Learns the map from episodes; warns if it fits badly.
 
         Args:
             first: First images of episodes, (episodes, 3, H, W) uint8.
+            carried: Images of the same episodes, halfway between grasp and release.
             last: Last images of the same episodes.
             states: States at their grasps, (episodes, state), at least `MIN_EPISODES`.
             scale: Factor by which each dimension counts, (state,), such as 1 / its standard deviation over
@@ -55,7 +60,7 @@ class StateToImage(nn.Module):
         mean, std = states.mean(dim=0), states.std(dim=0)
         self.mean.copy_(mean)
         self.scale.copy_(torch.where(std > 1e-6 * (1 + mean.abs()), scale, 0.0))
-        changes = _changes(first, last)  # (episodes, H, W)
+        changes = _changes(first, carried, last)  # (episodes, H, W)
         x = (states - mean) * self.scale.to(mean)
         centers, members = _clusters(x)
         # A change in the episodes of a cluster, but not in others, belongs to the states of the cluster.
@@ -67,21 +72,35 @@ class StateToImage(nn.Module):
         smooth = _blurred(changes)
         weights = F.pad(linear, (0, 0, 0, len(self.weights) - len(linear)))
         for _ in range(_ROUNDS):
-            weights = robust_fit(_quadratic(x), _peaks_near(smooth, locations))
+            near = _peaks_near(smooth, locations)
+            weights = robust_fit(_quadratic(x), near)
             locations = _quadratic(x) @ weights
         self.weights.copy_(weights)
+        distance = float((near - locations).norm(dim=1).median()) / 2
+        if distance > _DOUBTFUL:
+            logger.warning(
+                "What changes in the images is not where the robot's states at the grasps let expect it, but "
+                "%.0f %% of the side away (median). So the locations are probably wrong: see whether the rings "
+                "of `deltaco check` lie on the objects. Another camera (--policy.demo_camera) or larger images "
+                "(--policy.image_size) may help.",
+                100 * distance,
+            )
 
     def forward(self, states: Tensor) -> Tensor:
         """Maps states (..., state) to locations (..., 2)."""
         return _quadratic((states.float() - self.mean) * self.scale) @ self.weights
 
 
-def _changes(first: Tensor, last: Tensor) -> Tensor:
-    """Returns the change of each pixel in an episode, beyond its usual change, (episodes, H, W)."""
+def _changes(first: Tensor, carried: Tensor, last: Tensor) -> Tensor:
+    """Returns the lasting change of each pixel in an episode, beyond its usual change, (episodes, H, W)."""
+    # The robot moves on, so that it hardly ever changes a pixel in both of the later images.
     changes = torch.stack(
-        [(b.float() - a.float()).abs().mean(dim=0) / 255 for a, b in zip(first, last, strict=True)]
+        [
+            torch.minimum(*((image.float() - before.float()).abs().mean(dim=0) / 255 for image in later))
+            for before, *later in zip(first, carried, last, strict=True)
+        ]
     )
-    # The robot itself changes in every episode.
+    # But it has left its first place in every episode.
     return (changes - changes.mean(dim=0)) / (changes.std(dim=0) + 0.02)
 
 

@@ -28,6 +28,9 @@ _MIN_RELATIVE_DEPTH = 0.3  # the same, as a fraction of the deepest valley's dep
 _NOISE = 4.0  # ranges of less than so many standard deviations are noise
 _CLOSED = 0.2  # fraction of the way up from the valley to an opening below which the gripper counts as closed
 _APPROACH = 30  # the state before a grasp is a 30th of the episode before the gripper begins to close
+# A gripper that begins to close on its way still approaches while it moves on at a tenth of its speed, but no
+# longer than an eighth of the episode.
+_STILL_APPROACHES, _MAX_CLOSING = 0.1, 8
 _N_REASONS = 3  # that a warning names
 _GRIPPER_CORRELATION = 0.8  # of a state with the gripper's command, above which it is the gripper's
 # Commands that mean close, stay, open, as LeRobot's gamepads and keyboards give them; and inverted.
@@ -57,12 +60,14 @@ class Keyframes(NamedTuple):
         states: States in which the gripper has closed and is about to open, (episodes, 2, state), as in the
             dataset. Zeros where there are none.
         approach: States shortly before the gripper closes, (episodes, state).
+        carried: Frames halfway between grasp and release, (episodes,); the first of an episode without them.
         has_grasp: Whether an episode has them, (episodes,) bool.
         missing: Why an episode has none; None if it has them.
     """
 
     states: Tensor
     approach: Tensor
+    carried: Tensor
     has_grasp: Tensor
     missing: tuple[str | None, ...]
 
@@ -89,16 +94,38 @@ def find_keyframes(
     grasps, frames = find_grasps(gripper, spans, usual), []
     for (first, last), grasp in zip(spans, grasps, strict=True):
         if isinstance(grasp, str):
-            frames.append((first, first, first))
+            frames.append((first,) * 4)
             continue
-        approach = grasp.closing - max(1, (last - first + 1) // _APPROACH)
+        length = last - first + 1
+        approach = max(grasp.closing - max(1, length // _APPROACH), first)
         # The command to close takes effect one step later.
-        frames.append((min(grasp.grasp + 1, grasp.release), grasp.release, max(approach, first)))
+        closed = min(grasp.grasp + 1, grasp.release)
+        end = min(closed + length // _MAX_CLOSING, grasp.release)
+        closed += _end_of_approach(states[first : last + 1], *(at - first for at in (approach, closed, end)))
+        frames.append((closed, grasp.release, approach, (closed + grasp.release) // 2))
     has_grasp = torch.tensor([isinstance(grasp, Grasp) for grasp in grasps], device=states.device)
-    at = states[torch.tensor(frames, device=states.device)].float()  # (episodes, 3, state)
+    rows = torch.tensor(frames, device=states.device)
+    at = states[rows[:, :3]].float()  # (episodes, 3, state)
     at = torch.where(has_grasp[:, None, None], at, 0.0)
     missing = tuple(grasp if isinstance(grasp, str) else None for grasp in grasps)
-    return Keyframes(at[:, :2], at[:, 2], has_grasp, missing)
+    return Keyframes(at[:, :2], at[:, 2], rows[:, 3], has_grasp, missing)
+
+
+def _end_of_approach(states: Tensor, approach: int, closed: int, end: int) -> int:
+    """Returns how many frames after it has closed, and before `end`, a gripper still moves on.
+
+    Args:
+        states: Robot states of an episode, (frames, state).
+        approach: Frame of the approach.
+        closed: Frame in which the gripper has closed.
+        end: Last frame to look at.
+    """
+    x = states.float()
+    x = x / (x.amax(dim=0) - x.amin(dim=0)).clamp_min(1e-6)
+    move = x[closed] - x[approach]
+    speed = move.norm() / max(1, closed - approach)
+    progress = (x[closed + 1 : end + 1] - x[closed:end]) @ (move / move.norm().clamp_min(1e-6))
+    return int((progress > _STILL_APPROACHES * speed).long().cumprod(dim=0).sum())
 
 
 def warn_of_missing(keyframes: Keyframes, episodes: Sequence[int], consequence: str) -> None:

@@ -489,7 +489,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 f"is {config.name_gripper(self._meta.features)}, whose {config.gripper_closed} values close "
                 "it; see --policy.gripper and --policy.gripper_closed."
             )
-        located = self.robot_states.fit(keyframes, frames[:, 0], frames[:, -1], end - shift, shift, is_arm)
+        carried = robot_data.images_at(keyframes.carried.tolist(), config.image_size).to(device)
+        images = (frames[:, 0], carried, frames[:, -1])
+        located = self.robot_states.fit(keyframes, *images, end - shift, shift, is_arm)
         self.training_locations = located
         self.training_bank.pick_states = keyframes.pick_states
         if not bool(self.feature_matching.fitted):

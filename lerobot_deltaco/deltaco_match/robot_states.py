@@ -72,6 +72,7 @@ class RobotStates(nn.Module):
         self,
         keyframes: Keyframes,
         first: Tensor,
+        carried: Tensor,
         last: Tensor,
         scale: Tensor,
         shift: Tensor,
@@ -82,6 +83,7 @@ class RobotStates(nn.Module):
         Args:
             keyframes: Keyframes of the training episodes.
             first: First images of the episodes, (episodes, 3, H, W) uint8.
+            carried: Images halfway between grasp and release, (episodes, 3, H, W) uint8.
             last: Last images of the episodes, (episodes, 3, H, W) uint8.
             scale: The policy's input is `scale * state + shift`, (state,).
             shift: Shift of each dimension, (state,).
@@ -92,7 +94,8 @@ class RobotStates(nn.Module):
             The locations and heights of the episodes.
         """
         has_grasp = keyframes.has_grasp
-        self.to_image.fit(first[has_grasp], last[has_grasp], keyframes.states[has_grasp, 0], scale)
+        images = (some[has_grasp] for some in (first, carried, last))
+        self.to_image.fit(*images, keyframes.states[has_grasp, 0], scale)
         locations = self.to_image(keyframes.states).clamp(-1, 1)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
