@@ -1,8 +1,8 @@
 """Calibration of the camera: from robot states to locations, learned from images of episodes.
 
-Where the gripper closed around an object, the image stays changed: the object is gone while it is carried, and
-at the end. The map from states to locations sends the states at the grasps to the locations of these changes.
-So no calibrated camera is needed, only a fixed one.
+Where the gripper closed around an object, the image stays changed: the object is gone while it is carried,
+and at the end. The map from states to locations sends the states at the grasps to the locations of these
+changes. So no calibrated camera is needed, only a fixed one.
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ class StateToImage(nn.Module):
         distance = float((near - locations).norm(dim=1).median()) / 2
         if distance > _DOUBTFUL:
             logger.warning(
-                "What changes in the images is not where the robot's states at the grasps let expect it, but "
-                "%.0f %% of the side away (median). So the locations are probably wrong: see whether the rings "
-                "of `deltaco check` lie on the objects. Another camera (--policy.demo_camera) or larger images "
+                "Objects do not disappear where the robot's states at the grasps suggest, but %.0f %% of the "
+                "image's side away (median), so the locations are probably wrong. See whether the rings of "
+                "`deltaco check` lie on the objects. Another camera (--policy.demo_camera) or larger images "
                 "(--policy.image_size) may help.",
                 100 * distance,
             )

@@ -94,8 +94,8 @@ class RobotStates(nn.Module):
             The locations and heights of the episodes.
         """
         has_grasp = keyframes.has_grasp
-        images = (some[has_grasp] for some in (first, carried, last))
-        self.to_image.fit(*images, keyframes.states[has_grasp, 0], scale)
+        first, carried, last = (images[has_grasp] for images in (first, carried, last))
+        self.to_image.fit(first, carried, last, keyframes.states[has_grasp, 0], scale)
         locations = self.to_image(keyframes.states).clamp(-1, 1)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
