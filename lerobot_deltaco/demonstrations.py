@@ -280,8 +280,13 @@ class RobotData(NamedTuple):
     def images_at(self, frames: Sequence[int], size: int) -> Tensor:
         """Returns the images of some frames, resized, (n, 3, size, size) uint8."""
         assert self.images is not None
-        parts = (list(frames[n : n + _RESIZED_AT_A_TIME]) for n in range(0, len(frames), _RESIZED_AT_A_TIME))
-        return torch.cat([resize_images(self.images(part), size) for part in parts])
+        found = []
+        with tqdm(total=len(frames), desc="Reading images", unit="image", leave=False) as progress:
+            for n in range(0, len(frames), _RESIZED_AT_A_TIME):
+                some = list(frames[n : n + _RESIZED_AT_A_TIME])
+                found.append(resize_images(self.images(some), size))
+                progress.update(len(some))
+        return torch.cat(found)
 
 
 def read_demonstrations(
