@@ -104,16 +104,12 @@ def test_approach_and_opening_scale_with_the_course():
     assert find_keyframes(states, slow, [(0, len(slow) - 1)]).approach[0, 0] == found.closing - 10
 
 
-@pytest.mark.parametrize(("stops", "expected"), [(5, 6), (8, 8), (11, 11), (30, 11)])
-def test_a_gripper_that_closes_on_its_way_has_grasped_where_the_approach_ends(stops, expected):
-    """It is told to close in frame 5, and carries the object away from frame 15 on."""
+def test_keyframes_are_the_states_after_the_commands():
     frames = torch.arange(40)
     gripper = 1 - 2.0 * ((frames >= 5) & (frames < 30))
-    down = frames.clamp(max=stops) + 0.01 * frames
-    away = (frames - 15).clamp(min=0)
-    keyframes = find_keyframes(torch.stack([down, 3000.0 * away, frames * 0.0], dim=1), gripper, [(0, 39)])
-    assert keyframes.states[0, 0, 0] == down[expected]
-    assert keyframes.carried.tolist() == [(expected + 30) // 2]
+    keyframes = find_keyframes(frames[:, None], gripper, [(0, 39)])
+    assert keyframes.states.flatten().tolist() == [6, 30]
+    assert keyframes.carried.tolist() == [18]
 
 
 def test_a_state_holds_while_the_command_is_to_stay():
@@ -200,8 +196,9 @@ def test_states_of_the_gripper_are_those_that_follow_its_commands():
     gripper = torch.randn(60, generator=generator).sign()
     arm = torch.randn(60, generator=generator)
     opening = torch.cat([gripper.new_ones(1), 0.02 + 0.5 * gripper[:-1]])
-    states = torch.stack([arm, opening, torch.full((60,), 7.0), -opening], dim=1)
-    assert follows_gripper(states, gripper, [(0, 29), (30, 59)]).tolist() == [False, True, False, True]
+    late = torch.cat([gripper.new_ones(3), gripper[:-3]])
+    states = torch.stack([arm, opening, torch.full((60,), 7.0), -opening, late], dim=1)
+    assert follows_gripper(states, gripper, [(0, 29), (30, 59)]).tolist() == [False, True, False, True, True]
 
 
 def stacked_images(images):
@@ -293,6 +290,17 @@ def fitted_states(keyframes):
         robot_states.fit(keyframes, images, images, images, scale, shift, is_arm),
         (scale, shift),
     )
+
+
+def test_how_far_the_gripper_is_open_says_nothing_about_locations():
+    generator = torch.Generator().manual_seed(0)
+    keyframes, _ = grasps(torch.zeros(200))
+    images = torch.randint(256, (3, 200, 3, 8, 8), generator=generator).to(torch.uint8)
+    robot_states = RobotStates(4)
+    robot_states.fit(keyframes, *images, torch.ones(4), torch.zeros(4), torch.arange(4) < 3)
+    states = keyframes.states[:, 0]
+    other = states + torch.tensor([0.0, 0, 0, 5])
+    assert torch.equal(robot_states.to_image(other), robot_states.to_image(states))
 
 
 def test_heights_are_what_locations_do_not_tell_of_states():

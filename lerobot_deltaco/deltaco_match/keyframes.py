@@ -28,11 +28,9 @@ _MIN_RELATIVE_DEPTH = 0.3  # the same, as a fraction of the deepest valley's dep
 _NOISE = 4.0  # ranges of less than so many standard deviations are noise
 _CLOSED = 0.2  # fraction of the way up from the valley to an opening below which the gripper counts as closed
 _APPROACH = 30  # the state before a grasp is a 30th of the episode before the gripper begins to close
-# A gripper that begins to close on its way still approaches while it moves on at a tenth of its speed, but no
-# longer than an eighth of the episode.
-_STILL_APPROACHES, _MAX_CLOSING = 0.1, 8
 _N_REASONS = 3  # that a warning names
 _GRIPPER_CORRELATION = 0.8  # of a state with the gripper's command, above which it is the gripper's
+_MAX_LAG = 8  # of such a state behind the command: an eighth of an episode
 # Commands that mean close, stay, open, as LeRobot's gamepads and keyboards give them; and inverted.
 _THREE_STATES = ({0.0, 1.0, 2.0}, {-1.0, 0.0, 1.0}, {-2.0, -1.0, 0.0})
 
@@ -96,12 +94,9 @@ def find_keyframes(
         if isinstance(grasp, str):
             frames.append((first,) * 4)
             continue
-        length = last - first + 1
-        approach = max(grasp.closing - max(1, length // _APPROACH), first)
+        approach = max(grasp.closing - max(1, (last - first + 1) // _APPROACH), first)
         # The command to close takes effect one step later.
         closed = min(grasp.grasp + 1, grasp.release)
-        end = min(closed + length // _MAX_CLOSING, grasp.release)
-        closed += _end_of_approach(states[first : last + 1], *(at - first for at in (approach, closed, end)))
         frames.append((closed, grasp.release, approach, (closed + grasp.release) // 2))
     has_grasp = torch.tensor([isinstance(grasp, Grasp) for grasp in grasps], device=states.device)
     rows = torch.tensor(frames, device=states.device)
@@ -109,23 +104,6 @@ def find_keyframes(
     at = torch.where(has_grasp[:, None, None], at, 0.0)
     missing = tuple(grasp if isinstance(grasp, str) else None for grasp in grasps)
     return Keyframes(at[:, :2], at[:, 2], rows[:, 3], has_grasp, missing)
-
-
-def _end_of_approach(states: Tensor, approach: int, closed: int, end: int) -> int:
-    """Returns how many frames after it has closed, and before `end`, a gripper still moves on.
-
-    Args:
-        states: Robot states of an episode, (frames, state).
-        approach: Frame of the approach.
-        closed: Frame in which the gripper has closed.
-        end: Last frame to look at.
-    """
-    x = states.float()
-    x = x / (x.amax(dim=0) - x.amin(dim=0)).clamp_min(1e-6)
-    move = x[closed] - x[approach]
-    speed = move.norm() / max(1, closed - approach)
-    progress = (x[closed + 1 : end + 1] - x[closed:end]) @ (move / move.norm().clamp_min(1e-6))
-    return int((progress > _STILL_APPROACHES * speed).long().cumprod(dim=0).sum())
 
 
 def warn_of_missing(keyframes: Keyframes, episodes: Sequence[int], consequence: str) -> None:
@@ -273,17 +251,21 @@ def _opening(course: NDArray[np.float64], least: float) -> float:
 def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Tensor:
     """Returns which dimensions of the robot's state tell how far the gripper is open, (state,) bool.
 
-    These are the dimensions that follow the gripper's commands one step later.
+    These are the dimensions that follow the gripper's commands, within an eighth of an episode.
 
     Args:
         states: Robot states of all frames, (frames, state).
         gripper: Commands to the gripper in all frames, as for `find_grasps`, (frames,).
         spans: First and last frame of each episode.
     """
-    frames = torch.cat([torch.arange(first, last) for first, last in spans]).to(states.device)
-    held = np.concatenate([course[:-1] for course in _courses(gripper, spans)])
-    after, command = states[frames + 1].double(), torch.from_numpy(held).to(states.device)[:, None]
-    after, command = after - after.mean(dim=0), command - command.mean()
-    covariance = (after * command).mean(dim=0)
-    scale = after.square().mean(dim=0).sqrt() * command.square().mean().sqrt()
-    return covariance.abs() > _GRIPPER_CORRELATION * scale.clamp_min(1e-12)
+    courses, follows = _courses(gripper, spans), torch.zeros(states.shape[1], dtype=torch.bool)
+    usual_length = int(np.median([len(course) for course in courses]))
+    for lag in range(1, max(1, usual_length // _MAX_LAG) + 1):
+        frames = torch.cat([torch.arange(first, last + 1)[lag:] for first, last in spans]).to(states.device)
+        held = torch.from_numpy(np.concatenate([course[:-lag] for course in courses])).to(states.device)
+        after, command = states[frames].double(), held[:, None]
+        after, command = after - after.mean(dim=0), command - command.mean()
+        covariance = (after * command).mean(dim=0)
+        scale = after.square().mean(dim=0).sqrt() * command.square().mean().sqrt()
+        follows |= (covariance.abs() > _GRIPPER_CORRELATION * scale.clamp_min(1e-12)).cpu()
+    return follows.to(states.device)

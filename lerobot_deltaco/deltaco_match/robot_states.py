@@ -88,14 +88,14 @@ class RobotStates(nn.Module):
             scale: The policy's input is `scale * state + shift`, (state,).
             shift: Shift of each dimension, (state,).
             is_arm: Dimensions of the state other than the gripper's opening, (state,) bool. At a grasp, the
-                opening depends on the object's width, and says nothing about the height.
+                opening depends on the object's width, and says nothing about its location.
 
         Returns:
             The locations and heights of the episodes.
         """
         has_grasp = keyframes.has_grasp
         first, carried, last = (images[has_grasp] for images in (first, carried, last))
-        self.to_image.fit(first, carried, last, keyframes.states[has_grasp, 0], scale)
+        self.to_image.fit(first, carried, last, keyframes.states[has_grasp, 0], scale * is_arm)
         locations = self.to_image(keyframes.states).clamp(-1, 1)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
