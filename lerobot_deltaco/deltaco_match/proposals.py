@@ -14,7 +14,7 @@ _CHANNELS = 32
 _MIN_DISTANCE = 1 / 6  # between two proposals, where an image's edges are at -1 and 1
 _PEAK_RADIUS = 1.6  # of the cells around a peak whose mean is a proposal
 FIT_STEPS = 800
-_SCENES_PER_STEP = 48
+_SCENES_PER_STEP = 24
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
 GRASP_RADIUS = 0.19  # around a grasp: a proposal within it stands for the grasped object; 4.5 px of 48
 
