@@ -31,7 +31,7 @@ from lerobot_deltaco.base_config import dimension_names
 from lerobot_deltaco.dataset_reading import open_folder_or_hub
 from lerobot_deltaco.deltaco_match import feature_matching, proposals
 from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.deltaco_match.keyframes import Grasp, find_grasps
+from lerobot_deltaco.deltaco_match.keyframes import Grasp, find_grasps, follows_gripper
 from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.demonstrations import (
     DemonstrationBank,
@@ -67,6 +67,7 @@ class TrainingStart:
         policy: The policy; None if the configuration does not fit the dataset.
         bank: The episodes as demonstrations; None if they were not read.
         grasps: The grasp of each episode, or why there is none; empty if unknown.
+        gripper_states: Dimensions of the state that tell how far the gripper is open.
     """
 
     def __init__(self, dataset: LeRobotDataset, config: DeltacoMatchConfig) -> None:
@@ -76,6 +77,7 @@ class TrainingStart:
         self.policy: DeltacoMatchPolicy | None = None
         self.bank: DemonstrationBank | None = None
         self.grasps: list[Grasp | str] = []
+        self.gripper_states: list[int] = []
         with _warnings() as self.warnings:
             try:
                 self._begin()
@@ -89,7 +91,9 @@ class TrainingStart:
         self.policy = make_policy(config, ds_meta=dataset.meta).train()
         self.policy.feature_matching.fitted.fill_(True)  # the fit takes minutes, and is left out
         data = read_robot_data(dataset, range(dataset.meta.total_episodes), config.cameras[0])
-        self.grasps = find_grasps(config.gripper_opening(data.actions), data.spans)
+        opening = config.gripper_opening(data.actions)
+        self.grasps = find_grasps(opening, data.spans)
+        self.gripper_states = follows_gripper(data.states, opening, data.spans).nonzero().flatten().tolist()
         self.bank = read_demonstrations(dataset, config.cameras[0], config.image_size, config.n_demo_frames)
         self.policy.set_training_data(self.bank, data)
         with_grasp = zip(self.bank.tasks, self.grasps, strict=True)
@@ -281,6 +285,9 @@ def _facts(
         n_found = sum(isinstance(grasp, Grasp) for grasp in start.grasps)
         closing = f"{config.name_gripper(meta.features)}; {config.gripper_closed} values close it"
         facts.append(("gripper", closing))
+        states = [dimensions[OBS_STATE][n][0] for n in start.gripper_states]
+        follow = f"{', '.join(states)} of {OBS_STATE}" if states else f"nothing in {OBS_STATE}"
+        facts.append(("its state", f"{follow} follows these commands; the rest is taken for the arm's"))
         facts.append(("grasps", f"in {n_found} of {len(start.grasps)} episodes; others are left out"))
     for feature, rows in dimensions.items():
         arm = [ends for name, *ends in rows if "gripper" not in name.lower()] or [[0.0, 0.0]]

@@ -39,6 +39,7 @@ def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path):
     assert "Training would refuse" not in report
     assert "demo camera:    observation.image stands still" in report
     assert "dimension 2 of the action (gripper); low values close it" in report
+    assert "its state:      nothing in observation.state follows these commands" in report
     assert "in 48 of 48 episodes" in report
     assert all(f"24 episodes, 24 with a grasp: {task}" in report for task in TABLE_TASKS)
     assert "for 100 steps of 4" in report
