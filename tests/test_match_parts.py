@@ -25,6 +25,7 @@ from lerobot_deltaco.deltaco_match.proposals import N_PROPOSALS, peaks
 from lerobot_deltaco.deltaco_match.robot_states import RobotStates
 from lerobot_deltaco.deltaco_match.words import encode_words, understand, vocabulary_of
 from lerobot_deltaco.demonstrations import RobotData
+from lerobot_deltaco.losses import location_loss
 from lerobot_deltaco.networks import gaussian_maps
 
 # Keyframes
@@ -437,7 +438,8 @@ def matching(shapes, request):
     matching = FeatureMatching(vocabulary_of(SHAPE_TASKS), 0.25)
     sentences, heights = {task: [task] for task in tasks}, torch.zeros(24)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proposals, "_SCENES_PER_STEP", 16)
+        patch.setattr(proposals, "_MIN_SCENES", 16)
+        patch.setattr(proposals, "_MAX_SCENES", 16)
         patch.setattr(proposals, "FIT_STEPS", 120)
         patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
         patch.setattr(feature_matching, "_MIN_STEPS", 60)
@@ -500,6 +502,22 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes, sho
         fitted.append(dict(matching.state_dict()))
     assert all(torch.equal(fitted[0][name], fitted[1][name]) for name in fitted[0])
     assert not torch.equal(fitted[0]["compare.hidden.weight"], fitted[2]["compare.hidden.weight"])
+
+
+@pytest.mark.parametrize(("n_images", "n_scenes"), [(3, 24), (20, 40), (100, 48)])
+def test_a_step_of_the_proposals_fit_has_more_scenes_if_there_are_more(n_images, n_scenes, monkeypatch):
+    monkeypatch.setattr(proposals, "FIT_STEPS", 5)
+    seen = []
+
+    def loss(maps, locations):
+        seen.append(len(maps))
+        return location_loss(maps, locations)
+
+    monkeypatch.setattr(proposals, "location_loss", loss)
+    images = torch.zeros(n_images, 3, 16, 16, dtype=torch.uint8)
+    autocast = torch.autocast("cpu", enabled=False)
+    proposals.ProposalNetwork().fit(images, torch.zeros(n_images, 2), torch.Generator(), autocast)
+    assert seen == [n_scenes] * 5
 
 
 @pytest.mark.parametrize(("n_scenes", "steps"), [(8, 2), (24, 6), (80, 9)])

@@ -65,7 +65,8 @@ def trained(table):
     """A policy that has learned, on 36 of the 48 episodes, to find the locations."""
     with pytest.MonkeyPatch.context() as patch:
         use_short_fit(patch, 40)
-        patch.setattr(proposals, "_SCENES_PER_STEP", 16)
+        patch.setattr(proposals, "_MIN_SCENES", 16)
+        patch.setattr(proposals, "_MAX_SCENES", 16)
         patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
         patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._LOCATED_FRACTION", 1.0)
         patch.setattr("lerobot_deltaco.deltaco_match.modeling_deltaco_match._SHIFT_PADDING", 1)

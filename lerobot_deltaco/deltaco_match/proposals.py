@@ -14,7 +14,8 @@ _CHANNELS = 32
 _MIN_DISTANCE = 1 / 6  # between two proposals, where an image's edges are at -1 and 1
 _PEAK_RADIUS = 1.6  # of the cells around a peak whose mean is a proposal
 FIT_STEPS = 800
-_SCENES_PER_STEP = 24
+_DRAWS = 10  # of each scene, as far as these bounds of the scenes in a step allow
+_MIN_SCENES, _MAX_SCENES = 24, 48
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
 GRASP_RADIUS = 0.19  # around a grasp: a proposal within it stands for the grasped object; 4.5 px of 48
 
@@ -60,8 +61,9 @@ class ProposalNetwork(nn.Module):
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer, _LEARNING_RATE, FIT_STEPS, pct_start=_WARMUP_FRACTION
         )
+        n_scenes = min(max(_DRAWS * len(images) // FIT_STEPS, _MIN_SCENES), _MAX_SCENES)
         for _ in tqdm(range(FIT_STEPS), desc="Fitting the proposals", unit="step", leave=False):
-            rows = torch.randint(len(images), (_SCENES_PER_STEP,), generator=generator).to(images.device)
+            rows = torch.randint(len(images), (n_scenes,), generator=generator).to(images.device)
             with autocast:
                 maps = self.layers(channels_last(images[rows].float() / 255)).float()
             loss = location_loss(maps, locations[rows, None]).mean()
