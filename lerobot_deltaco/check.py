@@ -285,8 +285,9 @@ def _facts(
         n_found = sum(isinstance(grasp, Grasp) for grasp in start.grasps)
         closing = f"{config.name_gripper(meta.features)}; {config.gripper_closed} values close it"
         facts.append(("gripper", closing))
-        states = [dimensions[OBS_STATE][n][0] for n in start.gripper_states]
-        follow = f"{', '.join(states)} of {OBS_STATE}" if states else f"nothing in {OBS_STATE}"
+        names = ((n, dimensions[OBS_STATE][n][0]) for n in start.gripper_states)
+        states = ", ".join(f"{n}" if name == str(n) else f"{n} ({name})" for n, name in names)
+        follow = f"dimension {states} of the state" if states else "nothing in the state"
         facts.append(("its state", f"{follow} follows these commands; the rest is taken for the arm's"))
         facts.append(("grasps", f"in {n_found} of {len(start.grasps)} episodes; others are left out"))
     for feature, rows in dimensions.items():

@@ -31,6 +31,7 @@ _APPROACH = 30  # the state before a grasp is a 30th of the episode before the g
 _N_REASONS = 3  # that a warning names
 _GRIPPER_CORRELATION = 0.8  # of a state with the gripper's command, above which it is the gripper's
 _MAX_LAG = 8  # of such a state behind the command: an eighth of an episode
+_N_LAGS = 8  # that are tried, at most
 # Commands that mean close, stay, open, as LeRobot's gamepads and keyboards give them; and inverted.
 _THREE_STATES = ({0.0, 1.0, 2.0}, {-1.0, 0.0, 1.0}, {-2.0, -1.0, 0.0})
 
@@ -259,8 +260,8 @@ def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, 
         spans: First and last frame of each episode.
     """
     courses, follows = _courses(gripper, spans), torch.zeros(states.shape[1], dtype=torch.bool)
-    usual_length = int(np.median([len(course) for course in courses]))
-    for lag in range(1, max(1, usual_length // _MAX_LAG) + 1):
+    longest = max(1, int(np.median([len(course) for course in courses])) // _MAX_LAG)
+    for lag in np.unique(np.linspace(1, longest, min(longest, _N_LAGS)).astype(int)).tolist():
         frames = torch.cat([torch.arange(first, last + 1)[lag:] for first, last in spans]).to(states.device)
         held = torch.from_numpy(np.concatenate([course[:-lag] for course in courses])).to(states.device)
         after, command = states[frames].double(), held[:, None]

@@ -88,7 +88,7 @@ class RobotStates(nn.Module):
             scale: The policy's input is `scale * state + shift`, (state,).
             shift: Shift of each dimension, (state,).
             is_arm: Dimensions of the state other than the gripper's opening, (state,) bool. At a grasp, the
-                opening depends on the object's width, and says nothing about its location.
+                opening depends on the object's width, and says nothing about where the object is.
 
         Returns:
             The locations and heights of the episodes.
