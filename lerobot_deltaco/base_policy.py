@@ -108,6 +108,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.
         self._tasks: tuple[tuple[str, ...], DemonstrationsOfTasks] | None = None
         self._episode: Any = None
+        self._turn = 0  # number of the next action in the running episode
         # The actions of the running chunks that are still to be carried out, and the average of all chunks.
         self._actions = ActionQueues(config.n_action_steps, config.gripper_index)
         self._ensemble: ACTTemporalEnsembler | None = None
@@ -145,7 +146,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """Returns the next action of a chunk, the mean of the likeliest component of its distribution.
+        """Returns the next action of a chunk, the mean of a likely component of its distribution.
 
         Args:
             batch: As in `forward`, without `action` and `episode_index`. `task` is not needed if `set_tasks`
@@ -159,16 +160,21 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             FloatingPointError: The action is not finite, or absurdly large.
         """
         # In bfloat16, in which LeRobot's training evaluates, an action would depend on the rest of the batch.
-        coefficient = self.config.temporal_ensemble_coeff
         with torch.autocast(self.step.device.type, enabled=False):
-            if coefficient is not None:
-                chunk = self.predict_action_chunk(batch)
-                if self._ensemble is None:
-                    self._ensemble = ACTTemporalEnsembler(coefficient, chunk.shape[1])
-                return self._ensemble.update(chunk)
-            if self._begins_episode(batch) or self._actions.need_chunks:
-                self._actions.refill(self.predict_action_chunk(batch))
-            return self._actions.pop()
+            action = self._next_action(batch)
+        self._turn += 1
+        return action
+
+    def _next_action(self, batch: dict[str, Any]) -> Tensor:
+        coefficient = self.config.temporal_ensemble_coeff
+        if coefficient is not None:
+            chunk = self.predict_action_chunk(batch)
+            if self._ensemble is None:
+                self._ensemble = ACTTemporalEnsembler(coefficient, chunk.shape[1])
+            return self._ensemble.update(chunk)
+        if self._begins_episode(batch) or self._actions.need_chunks:
+            self._actions.refill(self.predict_action_chunk(batch))
+        return self._actions.pop()
 
     @property
     def p_pick(self) -> Tensor | None:
@@ -181,7 +187,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     def _start(self, episode: Any) -> None:
         """Sets the running episode; None for none."""
-        self._episode, self._ensemble = episode, None
+        self._episode, self._ensemble, self._turn = episode, None, 0
         self._actions.clear()
 
     def _tasks_of(self, batch: dict[str, Any]) -> tuple[tuple[str, ...], DemonstrationsOfTasks | None]:
@@ -250,12 +256,12 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
         return self.model if self.training else fuse_batch_norms(self.model)
 
-    def _likeliest(
+    def _chosen(
         self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None
     ) -> Tensor:
-        """Returns the likeliest actions of a chunk, (batch, steps, action); an absurd one is an error."""
+        """Returns the actions of a chunk, (batch, steps, action); an absurd one is an error."""
         opening = None if gripper is None else torch.sigmoid(gripper.float())
-        action = join_action(predicted.mode.float(), opening, self.config.gripper_index)
+        action = join_action(predicted.likely_mean(self._turn).float(), opening, self.config.gripper_index)
         if bool((action.abs() < _ABSURD_ACTION).all()):  # False for NaN
             return action
         damaged = _not_finite(batch)

@@ -37,6 +37,8 @@ from torch.nn.utils import fuse_conv_bn_eval
 FILM_INITIAL_STD = 1e-3
 MIN_LOG_STD, MAX_LOG_STD = -6.0, 0.0
 LOCATION_STD = 1 / 12  # of the map of a location, where the image's edges are at -1 and 1
+_NEARLY = 0.5  # as likely as the likeliest
+_GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 INITIAL_LOG_STD = -1.0  # ours: of the order of the first errors, so that the first gradients are moderate
 # Initial weights of the authors' code, where they differ from PyTorch's.
 AUTHORS_BOUND, AUTHORS_INITIAL_STD = 1e-3, 0.05
@@ -65,11 +67,25 @@ class ActionDistribution(NamedTuple):
 
     @property
     def mode(self) -> Tensor:
-        """The mean of the most likely component, (batch, steps, dims)."""
-        if self.means.shape[1] == 1:
-            return self.means[:, 0]
-        likeliest = self.logits.argmax(dim=1)
-        return self.means[torch.arange(len(likeliest), device=likeliest.device), likeliest]
+        """The mean of the likeliest component, (batch, steps, dims)."""
+        return self.likely_mean(0)
+
+    def likely_mean(self, turn: int) -> Tensor:
+        """Returns the mean of a likely component, (batch, steps, dims).
+
+        Components that are nearly as likely as the likeliest take turns, each as often as it is likely. Where
+        waiting is a little likelier than going on, a robot that always does the likeliest waits forever.
+
+        Args:
+            turn: Number of the action in the episode; at 0, it is the likeliest component's.
+        """
+        probabilities, components = self.logits.float().softmax(dim=1).sort(dim=1, descending=True)
+        probabilities = torch.where(probabilities < _NEARLY * probabilities[:, :1], 0.0, probabilities)
+        shares = probabilities.cumsum(dim=1) / probabilities.sum(dim=1, keepdim=True)
+        # Multiples of the golden ratio are spread evenly over 0..1: none waits long for its turn.
+        chosen = (shares[:, :-1] <= turn * _GOLDEN_RATIO % 1.0).sum(dim=1)
+        rows = torch.arange(len(chosen), device=chosen.device)
+        return self.means[rows, components[rows, chosen]]
 
 
 class PolicyNetwork(nn.Module):

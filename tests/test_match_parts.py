@@ -487,6 +487,14 @@ def test_fit_finds_shapes_of_one_color_by_demonstrations_and_by_words(matching, 
         assert fraction_found(matching, shapes, True, grasp=grasp) >= 0.9
 
 
+def test_words_that_describe_another_object_do_not_outweigh_a_clear_demonstration(matching, shapes):
+    def other_shape(task):
+        return SHAPE_TASKS[task == SHAPE_TASKS[0]]
+
+    assert fraction_found(matching, shapes, words=other_shape) <= 0.2
+    assert fraction_found(matching, shapes, True, other_shape) >= 0.8
+
+
 def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes, short_fit):
     images, locations, tasks = (part[:8] for part in shapes)
     state = torch.get_rng_state()

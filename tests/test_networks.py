@@ -59,6 +59,19 @@ def test_mode_is_the_mean_of_the_likeliest_component():
     assert ActionDistribution(means, logits).mode.tolist() == [[[2.0]], [[3.0]]]
 
 
+def test_nearly_equal_components_take_turns_as_often_as_they_are_likely():
+    means = torch.arange(4.0)[None, :, None, None].repeat(2, 1, 1, 1)
+    logits = torch.tensor([[0.3, 0.0, 0.5, 0.2], [0.1, 0.7, 0.0, 0.2]]).log()
+    predicted = ActionDistribution(means, logits)
+    turns = torch.stack([predicted.likely_mean(turn)[:, 0, 0] for turn in range(400)])
+    assert turns[0].tolist() == [2.0, 1.0]
+    assert set(turns[:, 1].tolist()) == {1.0}
+    assert set(turns[:, 0].tolist()) == {0.0, 2.0}
+    assert abs((turns[:, 0] == 0).float().mean() - 0.3 / 0.8) < 0.02
+    # None waits long.
+    assert all(len(set(some.tolist())) == 2 for some in turns[:, 0].split(5))
+
+
 def test_join_action_reverts_split_action():
     action = torch.rand(5, 4) * 2 - 1
     for gripper_index in (None, 0, 1, 3):

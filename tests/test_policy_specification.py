@@ -147,7 +147,8 @@ def test_acting_in_batches_of_any_size_leaves_the_batch_unchanged(make):
         assert torch.isfinite(made.after(chunk)).all()
         first, second = (made.policy.select_action(batch) for _ in range(2))
         assert torch.equal(first, chunk[:, 0])
-        assert torch.equal(second, chunk[:, 1 % (made.config.n_action_steps or made.config.chunk_size)])
+        if (made.config.n_action_steps or made.config.chunk_size) > 1:
+            assert torch.equal(second, chunk[:, 1])
         assert_same(kept, batch)
     # The first sample acts as it does alone, also where LeRobot's training evaluates in bfloat16.
     alone = made.before(observation(made.data, made.tasks[:1]))

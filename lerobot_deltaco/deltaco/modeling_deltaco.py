@@ -176,7 +176,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
             self._start(self._begin_episode(*self._tasks_of(batch), images.device))
         episode: Episode = self._episode
         concat = self._concatenated(batch, episode.concat)
-        return self._likeliest(batch, *episode.network(images, episode.film, concat))
+        return self._chosen(batch, *episode.network(images, episode.film, concat))
 
     def _begin_episode(
         self,

@@ -43,6 +43,8 @@ _MIN_STD, _MAX_FEATURE, _MIN_PROBABILITY = 1e-3, 6.0, 1e-9
 # are known and no proposal is the very object; and how much more similarities count than in the fit, where
 # dropout disturbs them. Chosen on folds of the training objects, as are the settings of the fit.
 _P_OTHER_OBJECT, _SHARPNESS = 0.5, 1.5
+# Probability that words describe another object than is meant: people see other colors and shapes in it.
+_P_MISDESCRIBED = 0.1
 _COLOR_WEIGHT = 2.0  # of colors among the features
 _INITIAL_GATE = (8.0, -5.0)  # slope and offset of the logit that a proposal is the very object, by its cosine
 # Of the fit.
@@ -145,8 +147,8 @@ class FeatureMatching(nn.Module):
             said = encode_words(instructions, self.vocabulary).to(scenes.device)
             weights = self.word_weights(said)
             scores = _word_scores(crops.words, said, weights)
+            matches = similarity = torch.zeros_like(scores)
             if described is None or demonstrated is None:
-                similarity = torch.zeros_like(scores)
                 demonstrated = torch.full_like(scores[:, 0], torch.nan)
             else:
                 # How well known words describe the object. A new noun leaves the demonstration in charge.
@@ -155,7 +157,9 @@ class FeatureMatching(nn.Module):
                 matches, similarity = self.compare.match(
                     crops, described, _SHARPNESS, _P_OTHER_OBJECT * p_described
                 )
-                scores = (1 - p_unknown)[:, None] * scores + matches
+                scores = (1 - p_unknown)[:, None] * scores
+            by_words = (1 - _P_MISDESCRIBED) * scores.softmax(dim=1) + _P_MISDESCRIBED / scores.shape[1]
+            scores = matches + by_words.log()
             heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
             return Candidates(locations, scores.log_softmax(dim=1), heights)
 

@@ -353,7 +353,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         episode: Episode = self._episode
         locations, heights = episode.found.locations, episode.found.heights
         concat = self._concatenated(batch, locations, heights)
-        return self._likeliest(batch, *episode.network(self._images(batch), None, concat, locations))
+        return self._chosen(batch, *episode.network(self._images(batch), None, concat, locations))
 
     @property
     def found(self) -> Found | None:
