@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RowsOf = Callable[[Result, Sequence[Result]], Iterator[dict[str, Any]]]
+_MAX_CALIBRATED = 4  # experiments in the figure
 PAGE, FIGURE, CALIBRATION = "report.md", "success.png", "calibration.png"
 _SURE = (0, 0.5, 0.7, 0.9, 0.97, 1)  # bounds of a policy's probability of what it picks
 KINDS = ("name", "color", "shape", "color_shape", "foreign")
@@ -304,13 +305,18 @@ def draw_success(results: Sequence[Result]) -> Figure:
 
 
 def draw_calibration(table: pd.DataFrame) -> Figure:
-    """Draws how often grasps are right over the policy's probability, points as large as their number."""
+    """Draws how often grasps are right over the policy's probability, points as large as their number.
+
+    Of many experiments, those with the most grasps are drawn.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 4.2), dpi=140, layout="constrained")
     ax = figure.subplots()
     ax.plot([0, 1], [0, 1], color="0.8", linestyle=":")
-    for (experiment, _), rows in table.groupby(["experiment", "variant"], sort=False):
+    groups = table.groupby(["experiment", "variant"], sort=False)
+    for experiment, variant in groups["grasps"].sum().nlargest(_MAX_CALIBRATED).index:
+        rows = groups.get_group((experiment, variant))
         (line,) = ax.plot(rows["mean_probability"], rows["right_object"], linewidth=1, label=experiment)
         ax.scatter(rows["mean_probability"], rows["right_object"], rows["grasps"], color=line.get_color())
     ax.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="probability of the choice", ylabel="right object grasped")
