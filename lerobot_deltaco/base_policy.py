@@ -256,9 +256,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
         return self.model if self.training else fuse_batch_norms(self.model)
 
-    def _chosen(
-        self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None
-    ) -> Tensor:
+    def _chosen(self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None) -> Tensor:
         """Returns the actions of a chunk, (batch, steps, action); an absurd one is an error."""
         opening = None if gripper is None else torch.sigmoid(gripper.float())
         action = join_action(predicted.likely_mean(self._turn).float(), opening, self.config.gripper_index)
