@@ -74,7 +74,7 @@ class ActionDistribution(NamedTuple):
         """Returns the mean of a likely component, (batch, steps, dims).
 
         Components that are nearly as likely as the likeliest take turns, each as often as it is likely. Where
-        waiting is a little likelier than going on, a robot that always does the likeliest waits forever.
+        waiting is a little likelier than going on, a robot that always does the likeliest may wait forever.
 
         Args:
             turn: Number of the action in the episode; at 0, it is the likeliest component's.
