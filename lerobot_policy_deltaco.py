@@ -5,8 +5,6 @@ import sys
 
 try:
     # These register `--env.type=deltaco`, and both policies with the steps of their processors.
-    import lerobot_deltaco.deltaco.configuration_deltaco
-    import lerobot_deltaco.deltaco_match.configuration_deltaco_match
     import lerobot_deltaco.lerobot_env  # noqa: F401
 except Exception as error:
     problem = (

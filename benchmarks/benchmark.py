@@ -53,9 +53,9 @@ def env(episodes: int = 100, seconds: float = 1.0) -> dict[str, float]:
         episodes: Number of episodes of the expert.
         seconds: Duration of the measurement of each part.
     """
-    from gym_deltaco import kinematics
     from gym_deltaco.env import PickPlaceEnv
     from gym_deltaco.expert import expert_episode
+    from gym_deltaco.robot import kinematics
 
     pick_place = PickPlaceEnv()
     pick_place.reset(seed=0)
@@ -128,7 +128,7 @@ def device() -> str:
 
 def make_dataset(root: Path, episodes_per_task: int) -> Path:
     """Collects episodes of some tasks, and returns their folder."""
-    from lerobot_deltaco.collect import CollectionPlan, collect
+    from lerobot_deltaco.collection.collect import CollectionPlan, collect
 
     collect(root, CollectionPlan(f"0-{N_TASKS - 1}", episodes_per_task))
     return root
@@ -138,7 +138,7 @@ def seconds_of_steps(options: dict[str, Any], in_memory: bool) -> float:
     """Returns the mean duration of a training step, s, after the first third of them."""
     from lerobot.scripts import lerobot_train
 
-    from lerobot_deltaco.train import train as train_in_memory
+    from lerobot_deltaco.training.train import train as train_in_memory
 
     ends: list[float] = []
     update = lerobot_train.update_policy

@@ -19,8 +19,8 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.processor import make_default_pre_post_processors
 from torch import Tensor, nn
 
-from lerobot_deltaco.deltaco_match.keyframes import find_keyframes
-from lerobot_deltaco.demonstrations import read_demonstrations, read_robot_data
+from lerobot_deltaco.data.demonstrations import read_demonstrations, read_robot_data
+from lerobot_deltaco.data.grasps import find_keyframes
 
 N_WORDS, DIM = 4096, 32
 N_SCENES = 32  # of a batch's samples, on which finding is trained

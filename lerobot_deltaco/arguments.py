@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from lerobot_deltaco.records import EvaluationPlan
+from lerobot_deltaco.evaluation.records import EvaluationPlan
 
 
 @dataclass(frozen=True)

@@ -25,14 +25,14 @@ COMMANDS = {
     "demo": "Train and evaluate the project's method in a few minutes.",
 }
 _FUNCTIONS = {
-    "collect": "hub.collect_and_push",
-    "check": "check.check",
-    "evaluate": "evaluate.evaluate_checkpoints",
-    "report": "report.write_report",
-    "experiment": "experiments.run_experiments",
-    "look": "look.look",
-    "play": "play.play",
-    "demo": "demo.run_demo",
+    "collect": "collection.hub.collect_and_push",
+    "check": "pages.check.check",
+    "evaluate": "evaluation.evaluate.evaluate_checkpoints",
+    "report": "reports.report.write_report",
+    "experiment": "experiments.run.run_experiments",
+    "look": "pages.look.look",
+    "play": "pages.play.play",
+    "demo": "pages.demo.run_demo",
 }
 # Commands whose modules import torch, which help should not wait for: their functions have one argument, an
 # object of a class in arguments.py.
@@ -77,7 +77,7 @@ def _run(name: str, arguments: Sequence[str]) -> None:
     if name == "train":
         sys.argv = ["lerobot-train", *arguments]
         import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
-        from lerobot_deltaco.train import train
+        from lerobot_deltaco.training.train import train
 
         train()
         return
@@ -98,7 +98,7 @@ def command_arguments(name: str) -> Callable[..., Any]:
 
 
 def _imported(path: str) -> Any:
-    module, _, attribute = path.partition(".")
+    module, _, attribute = path.rpartition(".")
     return getattr(importlib.import_module(f"lerobot_deltaco.{module}"), attribute)
 
 

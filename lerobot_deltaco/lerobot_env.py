@@ -27,8 +27,8 @@ from gym_deltaco.env import Observation, PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
-from lerobot_deltaco.expert_demonstrations import expert_demonstration
-from lerobot_deltaco.paraphrases import choose_instructions
+from lerobot_deltaco.data.paraphrases import choose_instructions
+from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
 
 logger = logging.getLogger(__name__)
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 # Files of the options, by whose they are.
 OPTIONS = {
-    "deltaco_match": "deltaco_match/configuration_deltaco_match.py",
-    "deltaco": "deltaco/configuration_deltaco.py",
-    "both": "base_config.py",
+    "deltaco_match": "policies/deltaco_match/configuration_deltaco_match.py",
+    "deltaco": "policies/deltaco/configuration_deltaco.py",
+    "both": "policies/base/configuration.py",
 }
 
 

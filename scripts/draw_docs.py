@@ -17,20 +17,20 @@ from matplotlib.patches import Circle
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from gym_deltaco.camera import Camera
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
-from gym_deltaco.fixtures import TABLE_BOXES, TRAY_BOXES, table_mesh, tray_mesh
 from gym_deltaco.layout import twin_word
-from gym_deltaco.objects import ObjectModel, object_model
+from gym_deltaco.objects.objects import ObjectModel, object_model
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.simulation import Simulation, camera_matrices
+from gym_deltaco.sim.camera import Camera
+from gym_deltaco.sim.fixtures import TABLE_BOXES, TRAY_BOXES, table_mesh, tray_mesh
+from gym_deltaco.sim.simulation import Simulation, camera_matrices
+from gym_deltaco.sim.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, SHAPES, TASK_SETS, get_task
-from gym_deltaco.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
-from lerobot_deltaco.pictures import demonstration_ends, draw_found
-from lerobot_deltaco.recording import benchmark_env, load_conditioned, record_episode
-from lerobot_deltaco.records import EvaluationPlan
+from lerobot_deltaco.evaluation.records import EvaluationPlan
+from lerobot_deltaco.evaluation.video import benchmark_env, load_conditioned, record_episode
+from lerobot_deltaco.pages.pictures import demonstration_ends, draw_found
 
 CHECKPOINT = Path("checkpoints/pick_place")
 # Tasks of all kinds with various containers: six names, three colors, three shapes

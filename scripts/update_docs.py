@@ -11,10 +11,10 @@ import pandas as pd
 
 from gym_deltaco.atomic_files import write_text
 from gym_deltaco.tasks import get_task
-from lerobot_deltaco.records import read_records
-from lerobot_deltaco.report import markdown_table
-from lerobot_deltaco.results import PAPER, ReportError, Result, collect_results, paper_row
-from lerobot_deltaco.statistics import paired_difference
+from lerobot_deltaco.evaluation.records import read_records
+from lerobot_deltaco.reports.leaderboard import PAPER, ReportError, Result, collect_results, paper_row
+from lerobot_deltaco.reports.metrics import paired_difference
+from lerobot_deltaco.reports.report import markdown_table
 
 ROOT = Path(__file__).parents[1]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from gym_deltaco import ENV_ID
-from lerobot_deltaco.records import EvaluationPlan, EvaluationRecord
+from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord
 
 TASKS = "24,32,45,124,132,145"  # names, colors and shapes; a color word and position words
 

@@ -18,17 +18,18 @@ from torch.utils.data import default_collate
 
 import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
 from gym_deltaco.tasks import TASKS as BENCHMARK_TASKS
-from lerobot_deltaco import language
-from lerobot_deltaco.collect import CollectionPlan, collect
-from lerobot_deltaco.deltaco_match import feature_matching, proposals
-from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.deltaco_match.crops import FEATURE_DIM, cut_crops
-from lerobot_deltaco.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
-from lerobot_deltaco.deltaco_match.words import vocabulary_of
-from lerobot_deltaco.demonstrations import DemonstrationBank
-from lerobot_deltaco.frames import FramesInMemory
-from lerobot_deltaco.recording import load_conditioned
-from lerobot_deltaco.train import train
+from lerobot_deltaco.collection.collect import CollectionPlan, collect
+from lerobot_deltaco.data.demonstrations import DemonstrationBank
+from lerobot_deltaco.data.frames import FramesInMemory
+from lerobot_deltaco.evaluation.video import load_conditioned
+from lerobot_deltaco.policies.base import language
+from lerobot_deltaco.policies.deltaco_match import matching as feature_matching
+from lerobot_deltaco.policies.deltaco_match import proposals
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.policies.deltaco_match.crops import FEATURE_DIM, cut_crops
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.policies.deltaco_match.words import vocabulary_of
+from lerobot_deltaco.training.train import train
 
 # Most of a small training is spent on making parsers of options and on opening datasets: do both once.
 

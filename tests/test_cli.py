@@ -61,8 +61,8 @@ def test_help_is_quick_and_explains_every_option(helps):
 
 
 def test_the_help_of_training_lists_the_options_of_both_policies(helps):
-    from lerobot_deltaco.deltaco.configuration_deltaco import DeltacoConfig
-    from lerobot_deltaco.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+    from lerobot_deltaco.policies.deltaco.configuration_deltaco import DeltacoConfig
+    from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 
     text, _ = helps["train"]
     hidden = {"push_to_hub", "normalization_mapping", "one_hot_tasks", "known_words", "gripper_range"}
@@ -122,8 +122,8 @@ def test_a_mistyped_option_of_json_is_one_line(monkeypatch):
 
 @pytest.mark.slow
 def test_act_is_trained_and_evaluated_by_the_command_of_a_datasets_card(tmp_path):
-    from lerobot_deltaco.cards import dataset_card
-    from lerobot_deltaco.collect import CollectionPlan, collect
+    from lerobot_deltaco.collection.cards import dataset_card
+    from lerobot_deltaco.collection.collect import CollectionPlan, collect
 
     root = tmp_path / "data"
     collect(root, CollectionPlan("4", 2))

@@ -16,7 +16,7 @@ import tyro
 
 from gym_deltaco.tasks import OBJECTS, TASK_SETS
 from lerobot_deltaco import cli
-from lerobot_deltaco.recipes import experiments_named, read_recipe
+from lerobot_deltaco.experiments.recipes import experiments_named, read_recipe
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -34,13 +34,20 @@ def imported_modules(path):
 
 
 def test_imports_go_one_way():
-    plain = [ROOT / "lerobot_deltaco" / name for name in ("networks.py", "losses.py")]
+    plain = [ROOT / "lerobot_deltaco" / "policies" / "base" / name for name in ("networks.py", "losses.py")]
     for files, forbidden in (
         (GYM_FILES, {"torch", "lerobot", "lerobot_deltaco", "lerobot_policy_deltaco"}),
         ([*GYM_FILES, *LEROBOT_FILES], {"lerobot_deltaco.cli"}),
         (LEROBOT_FILES, {"pybullet"}),
         # Networks and losses take plain numbers.
-        (plain, {"lerobot", "lerobot_deltaco.base_config", "lerobot_deltaco.base_policy"}),
+        (
+            plain,
+            {
+                "lerobot",
+                "lerobot_deltaco.policies.base.configuration",
+                "lerobot_deltaco.policies.base.modeling",
+            },
+        ),
     ):
         assert files
         for path in files:
@@ -72,8 +79,13 @@ NO_SIMULATOR = """
 import sys
 sys.modules["pybullet"] = None
 import gymnasium, gym_deltaco
-from gym_deltaco import chance, env, expert, layout, object_sets, simulation, tasks
-from lerobot_deltaco import collect, paraphrases, records, report
+from gym_deltaco import chance, env, expert, layout, tasks
+from gym_deltaco.objects import object_sets
+from gym_deltaco.sim import simulation
+from lerobot_deltaco.collection import collect
+from lerobot_deltaco.data import paraphrases
+from lerobot_deltaco.evaluation import records
+from lerobot_deltaco.reports import report
 assert not {"torch", "lerobot", "transformers", "huggingface_hub"} & set(sys.modules)
 try:
     gymnasium.make(gym_deltaco.ENV_ID)

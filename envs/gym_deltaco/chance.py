@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gym_deltaco.layout import sample_layout
-from gym_deltaco.object_sets import select_objects
+from gym_deltaco.objects.object_sets import select_objects
 from gym_deltaco.scene_config import DEFAULT_SCENE, SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel, get_task, select_tasks

@@ -11,13 +11,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from gym_deltaco import CONTROL_FPS
-from gym_deltaco import kinematics as kin
-from gym_deltaco.arm import JOINT_HIGH, JOINT_LOW
 from gym_deltaco.control import CONTROLS
 from gym_deltaco.layout import sample_layout
+from gym_deltaco.robot import kinematics as kin
+from gym_deltaco.robot.arm import JOINT_HIGH, JOINT_LOW
 from gym_deltaco.scene import Scene
 from gym_deltaco.scene_config import DEFAULT_SCENE, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, SceneConfig
-from gym_deltaco.simulation import Simulation, check_simulator
+from gym_deltaco.sim.simulation import Simulation, check_simulator
 from gym_deltaco.tasks import Task, get_task
 
 ACTION_SCALE = 0.1  # m, motion of the end effector for an action of 1

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_deltaco import EXPERT_NOISE
-from gym_deltaco.arm import FINGER_OPEN, FINGER_THICKNESS, FINGERTIP_OFFSET, POSITION_HIGH, POSITION_LOW
 from gym_deltaco.env import ACTION_SCALE, Observation, PickPlaceEnv
-from gym_deltaco.kinematics import inverse
+from gym_deltaco.robot.arm import FINGER_OPEN, FINGER_THICKNESS, FINGERTIP_OFFSET, POSITION_HIGH, POSITION_LOW
+from gym_deltaco.robot.kinematics import inverse
 from gym_deltaco.scene_config import DEFAULT_SCENE, SceneConfig
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.workspace import (
+from gym_deltaco.sim.workspace import (
     CONTAINER_FLOOR,
     CONTAINER_HALF_EXTENTS,
     TRAY_CENTER,

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.object_sets import find_label, find_model, select_objects
-from gym_deltaco.objects import ObjectModel
+from gym_deltaco.objects.object_sets import find_label, find_model, select_objects
+from gym_deltaco.objects.objects import ObjectModel
 from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.sim.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
 from gym_deltaco.tasks import CONTAINER_COLORS, ContainerColor, ContainerWord, ObjectLabel, Task
-from gym_deltaco.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
 
 N_OBJECTS = 3
 MIN_OBJECT_DISTANCE = 0.065  # m

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.arm import Arm
-from gym_deltaco.fixtures import (
+from gym_deltaco.layout import Layout
+from gym_deltaco.robot.arm import Arm
+from gym_deltaco.robot.kinematics import forward
+from gym_deltaco.sim.fixtures import (
     CONTAINER_BOXES,
     TABLE_BOXES,
     TRAY_BOXES,
@@ -14,10 +16,8 @@ from gym_deltaco.fixtures import (
     table_mesh,
     tray_mesh,
 )
-from gym_deltaco.kinematics import forward
-from gym_deltaco.layout import Layout
-from gym_deltaco.simulation import Contact, Pose, Simulation
-from gym_deltaco.workspace import (
+from gym_deltaco.sim.simulation import Contact, Pose, Simulation
+from gym_deltaco.sim.workspace import (
     CAMERA,
     CONTAINER_FLOOR,
     CONTAINER_HALF_EXTENTS,

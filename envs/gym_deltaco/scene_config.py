@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from gym_deltaco.control import CONTROLS, Control
-from gym_deltaco.object_sets import default_objects, select_objects
+from gym_deltaco.objects.object_sets import default_objects, select_objects
 from gym_deltaco.tasks import get_task
 
 AMBIGUITIES = ("container", "object")

@@ -6,8 +6,8 @@ appendix A).
 
 Beyond the paper's table, 80 rows (50..129) ask for an object by color and shape, `50 + 10 * color + shape`,
 since random objects have no names. The index of such a task is `1000 + 80 * column + row - 50`. Rows 500 to
-999 ask for a "thing", which only a demonstration shows: a mesh of `gym_deltaco.foreign_objects` with that
-number. The index of such a task is `2000 + 1000 * column + row`.
+999 ask for a "thing", which only a demonstration shows: a mesh of `gym_deltaco.objects.foreign_objects` with
+that number. The index of such a task is `2000 + 1000 * column + row`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CONTAINER_WORDS: tuple[ContainerWord, ...] = ("green", "red", "front", "back", "
 class ObjectLabel:
     """Name, shape and color of an object.
 
-    Its geometry is in `gym_deltaco.objects`, `random_objects` or `foreign_objects`.
+    Its geometry is in `gym_deltaco.objects.objects`, `random_objects` or `foreign_objects`.
 
     Attributes:
         index: 0..31 for the paper's objects, in the order of its table (0..23 are scenario A's training
@@ -113,7 +113,7 @@ _PAIR_TASKS = range(1000, 1000 + N_COLUMNS * _N_PAIRS)
 _FOREIGN_TASKS = range(2000, 2000 + N_COLUMNS * 1000)
 MESHES = range(500, 1000)  # of PyBullet's 1,000 random ones; the benchmark never uses the others
 FIRST_FOREIGN_INDEX = 20_000  # index of the object that mesh 0 would be
-FOREIGN_FILE = Path(__file__).with_name("foreign_objects.json")
+FOREIGN_FILE = Path(__file__).parent / "objects" / "foreign_objects.json"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""The objects: solids made from code, and sets of them."""

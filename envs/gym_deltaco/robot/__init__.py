@@ -1,0 +1,1 @@
+"""The WidowX 250: links, meshes and kinematics."""

@@ -1,0 +1,1 @@
+"""PyBullet: the simulation, the camera and the workspace."""

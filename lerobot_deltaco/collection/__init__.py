@@ -1,0 +1,1 @@
+"""Collects the scripted expert's episodes as LeRobotDatasets, and publishes them."""

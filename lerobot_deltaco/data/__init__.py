@@ -1,0 +1,1 @@
+"""LeRobotDatasets as the policies see them: demonstrations, grasps and frames in memory."""

@@ -1,0 +1,1 @@
+"""Evaluation on the benchmark: episodes, checkpoints, records and videos."""

@@ -1,0 +1,440 @@
+"""Evaluates a policy on the benchmark: some episodes of each task, and a record of every outcome."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+import multiprocessing
+import shlex
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+import pandas as pd
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.utils import preprocess_observation
+from lerobot.utils.constants import HF_LEROBOT_HOME
+from lerobot.utils.random_utils import seeded_context
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from gym_deltaco import ENV_ID
+from gym_deltaco.atomic_files import parse_json
+from gym_deltaco.env import N_JOINTS, PickPlaceEnv
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.tasks import get_task
+from lerobot_deltaco.arguments import EvaluateArguments
+from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
+from lerobot_deltaco.evaluation.checkpoints import (
+    OWN_TYPES,
+    Checkpoint,
+    LoadedPolicy,
+    find_checkpoints,
+    load_policy,
+)
+from lerobot_deltaco.evaluation.episodes import Episode, draw_episodes
+from lerobot_deltaco.evaluation.expert_demonstrations import ExpertBank
+from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord, read_records, write_records
+from lerobot_deltaco.lerobot_env import check_policy_fits
+from lerobot_deltaco.policies.base.configuration import SOURCES
+from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
+from lerobot_deltaco.policies.base.optimization import keep_freed_memory
+
+# Most episodes that run at the same time. A policy's step costs little more for 8 than for 2, and each
+# episode needs a simulator of 50 MB, in each process.
+_MAX_BATCH = 8
+# Processes share batches, so small evaluations need several, too.
+_MIN_BATCHES = 4
+_PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
+# Options of a policy that come from the training data, or say where they were.
+_NOT_RECORDED = (
+    "input_features",
+    "output_features",
+    "one_hot_tasks",
+    "known_words",
+    "gripper_range",
+    "demo_episodes",
+    *SOURCES,
+)
+
+
+# Called after the reset and after each step with the environments of a batch and their observations.
+StepCallback = Callable[[Sequence[PickPlaceEnv], Sequence[Mapping[str, NDArray]]], None]
+
+
+class Evaluation:
+    """An evaluation, whose batches may be run in any order and in any process, with the same outcomes.
+
+    Args:
+        loaded: The policy and its processors.
+        plan: Episodes to run.
+
+    Attributes:
+        batches: The episodes, in batches that run at the same time.
+
+    Raises:
+        ValueError: The policy is not one for the benchmark, or the plan is not one for this policy.
+    """
+
+    def __init__(self, loaded: LoadedPolicy, plan: EvaluationPlan) -> None:
+        self.loaded, self.plan = loaded, plan
+        policy = loaded.policy
+        check_policy_fits(policy.config, plan.scene, loaded.rename_map)
+        self._bank = _bank_for(policy, plan)
+        episodes = draw_episodes(plan, self._bank)
+        if getattr(policy.config, "method", None) == "mcil":
+            # The trials of a task use the instruction and the demonstration in turn.
+            episodes = [
+                each._replace(demonstration_task=-1) if each.trial % 2 == 0 else each._replace(instruction="")
+                for each in episodes
+            ]
+        size = min(_MAX_BATCH, math.ceil(len(episodes) / _MIN_BATCHES))
+        self.batches = [list(batch) for batch in itertools.batched(episodes, size)]
+        # Their simulators start at the first reset, in the process that runs a batch.
+        self._envs = [PickPlaceEnv(plan.task_ids[0], plan.scene) for _ in range(size)]
+
+    def run(self, number: int) -> list[dict[str, Any]]:
+        """Runs the episodes of a batch, and returns the row of each in the record."""
+        batch = self.batches[number]
+        demonstrations = [self._demonstrations(episode) for episode in batch]
+        with self._computing(batch):
+            infos = run_episodes(
+                self.loaded, self._envs, batch, demonstrations, joint_noise=self.plan.joint_noise
+            )
+        p_pick = self.loaded.policy.p_pick if isinstance(self.loaded.policy, TaskConditionedPolicy) else None
+        p_picks = [math.nan] * len(batch) if p_pick is None else p_pick.tolist()
+        rows = []
+        for episode, info, given, p_pick in zip(batch, infos, demonstrations, p_picks, strict=True):
+            template = get_task(episode.task_id).instruction
+            rows.append(
+                {
+                    "task_id": episode.task_id,
+                    "trial": episode.trial,
+                    "success": bool(info["is_success"]),
+                    "instruction": None if episode.instruction == template else episode.instruction,
+                    "demonstration_task": episode.demonstration_task,
+                    "demonstration_episodes": [each.episode for each in given if each.episode is not None],
+                    "demonstrated_objects": [
+                        each.target_object for each in given if each.target_object is not None
+                    ],
+                    "grasped_object": int(info["grasped_object"]),
+                    "object_containers": info["object_containers"].tolist(),
+                    "right_object": bool(info["right_object"]),
+                    "right_container": bool(info["right_container"]),
+                    "p_pick": p_pick,
+                }
+            )
+        return rows
+
+    def close(self) -> None:
+        """Closes the environments."""
+        for env in self._envs:
+            env.close()
+
+    def _demonstrations(self, episode: Episode) -> list[Demonstration]:
+        """Returns the demonstrations of an episode; the trials of a task use its demonstrations in turn."""
+        if self._bank is None or episode.demonstration_task < 0:
+            return []
+        config = self.loaded.policy.config
+        if isinstance(self._bank, DemonstrationBank) and config.demo_episode is not None:
+            return [self._bank.of_episode(config.demo_episode)]
+        task = get_task(episode.demonstration_task)
+        known = self._bank.of_task(task.instruction, task.target_object)
+        n_each = self.plan.n_demonstrations
+        if len(known) < n_each:
+            raise ValueError(
+                f"`n_demonstrations` is {n_each}, but the task {task.instruction!r} has {len(known)}. "
+                "Collect more and name them with --demo-repo-id and --demo-root."
+            )
+        return [known[(episode.trial * n_each + n) % len(known)] for n in range(n_each)]
+
+    @contextmanager
+    def _computing(self, batch: Sequence[Episode]) -> Iterator[None]:
+        config = self.loaded.policy.config
+        n_threads = torch.get_num_threads()
+        with ExitStack() as stack:
+            if config.device == "cpu":
+                # Batches are small, and the number of threads changes no sum.
+                torch.set_num_threads(1)
+                stack.callback(torch.set_num_threads, n_threads)
+            if not isinstance(self.loaded.policy, TaskConditionedPolicy):
+                # Policies that sample, such as diffusion policies, do so for a whole batch, seeded by its
+                # first episode.
+                stack.enter_context(seeded_context(batch[0].seed % 2**32))
+                if config.use_amp:
+                    stack.enter_context(torch.autocast(torch.device(config.device).type))
+            stack.enter_context(torch.inference_mode())
+            yield
+
+
+def run_episodes(
+    loaded: LoadedPolicy,
+    envs: Sequence[PickPlaceEnv],
+    episodes: Sequence[Episode],
+    demonstrations: Sequence[Sequence[Demonstration]],
+    callback: StepCallback | None = None,
+    joint_noise: float = 0.0,
+) -> list[dict[str, Any]]:
+    """Runs episodes at the same time.
+
+    Args:
+        loaded: The policy and its processors.
+        envs: At least as many environments, whatever their tasks.
+        episodes: The episodes.
+        demonstrations: Demonstrations of each.
+        callback: Called after the reset and after each step.
+        joint_noise: Standard deviation of the noise on each joint angle that the policy observes, degrees.
+
+    Returns:
+        Info of each environment after its last step.
+    """
+    policy, instructions = loaded.policy, [episode.instruction for episode in episodes]
+    envs = envs[: len(episodes)]
+    resets = [
+        env.reset(seed=episode.seed, options={"task_id": episode.task_id})
+        for env, episode in zip(envs, episodes, strict=True)
+    ]
+    observations, infos = [list(parts) for parts in zip(*resets, strict=True)]
+    policy.reset()
+    if hasattr(policy, "set_tasks"):
+        policy.set_tasks(instructions, demonstrations)
+    noise = [np.random.default_rng(episode.seed) for episode in episodes]
+    for _ in range(envs[0].scene_config.n_steps):
+        if callback is not None:
+            callback(envs, observations)
+        stacked = _stacked(observations)
+        if joint_noise:
+            drawn = np.stack([rng.normal(0, np.radians(joint_noise), N_JOINTS) for rng in noise])
+            stacked["agent_pos"][:, :N_JOINTS] += drawn.astype(np.float32)
+        batch = {**preprocess_observation(stacked), "task": instructions}
+        actions = loaded.postprocessor(policy.select_action(loaded.preprocessor(batch)))
+        steps = [env.step(action) for env, action in zip(envs, actions.cpu().numpy(), strict=True)]
+        observations, infos = [step[0] for step in steps], [step[-1] for step in steps]
+    if callback is not None:
+        callback(envs, observations)
+    return infos
+
+
+def _stacked(observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns a batch of observations, of which each may contain dictionaries."""
+    columns = {name: [each[name] for each in observations] for name in observations[0]}
+    return {
+        name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
+        for name, values in columns.items()
+    }
+
+
+def evaluate(loaded: LoadedPolicy, plan: EvaluationPlan, processes: int = 1) -> pd.DataFrame:
+    """Evaluates a policy.
+
+    Args:
+        loaded: The policy and its processors.
+        plan: Episodes to run.
+        processes: Number of processes that share the episodes; with 1, everything runs in this one.
+
+    Returns:
+        A row for each episode, with the columns of a record, by task in the plan's order, and trial. They do
+        not depend on the number of processes.
+
+    Raises:
+        ValueError: A task has no demonstration, or the policy is not one for the benchmark.
+        RuntimeError: A process ended unexpectedly.
+    """
+    keep_freed_memory()
+    evaluation = Evaluation(loaded, plan)
+    rows: list[dict[str, Any]] = []
+    with tqdm(total=sum(map(len, evaluation.batches)), desc="Evaluating", unit="episode") as progress:
+        for found in _run_batches(evaluation, min(processes, len(evaluation.batches))):
+            rows += found
+            progress.update(len(found))
+    evaluation.close()
+    order = {task_id: n for n, task_id in enumerate(plan.task_ids)}
+    return pd.DataFrame(sorted(rows, key=lambda row: (order[row["task_id"]], row["trial"])))
+
+
+def _run_batches(evaluation: Evaluation, processes: int) -> Iterator[list[dict[str, Any]]]:
+    """Yields the rows of the batches, in the order in which these are completed."""
+    numbers = range(len(evaluation.batches))
+    if processes == 1:
+        yield from map(evaluation.run, numbers)
+        return
+    # Processes are forked, which shares the policy and takes no time: importing LeRobot takes 10 s.
+    executor = ProcessPoolExecutor(
+        processes, multiprocessing.get_context("fork"), initializer=_start_process, initargs=(evaluation,)
+    )
+    try:
+        with warnings.catch_warnings():
+            # About threads that hold locks: all others are idle, and each process computes with one thread.
+            warnings.filterwarnings("ignore", category=DeprecationWarning, message=".*fork")
+            running = [executor.submit(_run_batch, number) for number in numbers]
+        for future in as_completed(running):
+            yield future.result()
+    except BrokenProcessPool:
+        raise RuntimeError(
+            "A process of the evaluation ended unexpectedly; the memory may be full. Run the command again "
+            "with fewer --processes."
+        ) from None
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+_evaluation: Evaluation | None = None  # of this process, if it was forked for one
+
+
+def _start_process(evaluation: Evaluation) -> None:
+    global _evaluation
+    # Interrupts are left to the main process, which lets the running batches finish.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _evaluation = evaluation
+
+
+def _run_batch(number: int) -> list[dict[str, Any]]:
+    assert _evaluation is not None
+    return _evaluation.run(number)
+
+
+def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | ExpertBank | None:
+    """Returns the demonstrations that a policy receives: its own, or the expert's; None if it takes none.
+
+    Raises:
+        ValueError: The plan asks for demonstrations that the policy does not take or have.
+    """
+    if not hasattr(policy, "set_tasks") or not getattr(policy.config, "uses_demonstrations", True):
+        if plan.counterfactual == "demonstration" or plan.without == "demonstration":
+            raise ValueError("This policy takes no demonstrations: none can be replaced or left out.")
+        return None
+    is_ours = isinstance(policy, TaskConditionedPolicy)
+    bank = policy.demonstrations if is_ours else ExpertBank(plan.task_ids, plan.scene)
+    if bank is None:
+        if plan.without == "demonstration":
+            return None
+        raise ValueError(
+            "The policy has no demonstrations. Name a dataset of them with --demo-repo-id and --demo-root."
+        )
+    if plan.n_demonstrations > 1 and not hasattr(policy.config, "n_demonstrations"):
+        raise ValueError(
+            f"`n_demonstrations` is {plan.n_demonstrations}, but this policy does not combine any."
+        )
+    return bank
+
+
+def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
+    """Evaluates a policy, or the checkpoints of a training run, that have no record of the plan yet.
+
+    Returns:
+        A line for each checkpoint, with its success rate.
+
+    Raises:
+        ValueError: There is no such checkpoint, a record is of another policy, or the plan does not fit.
+    """
+    path, plan = arguments.checkpoint, arguments.plan
+    rename_map = None
+    if arguments.rename_map is not None:
+        rename_map = parse_json(arguments.rename_map, "--rename-map")
+    found = find_checkpoints(path)
+    is_run = (path / "checkpoints").is_dir()
+    folder = arguments.out or (path if is_run else Path("outputs/evaluate") / path.resolve().name)
+    given = {name: getattr(arguments, name) for name in ("device", "demo_repo_id", "demo_root")}
+    overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
+    demonstrations = digest = None
+    if arguments.demo_repo_id is not None:
+        digest = metadata_digest(arguments.demo_repo_id, arguments.demo_root)
+        demonstrations = (arguments.demo_repo_id, digest)
+    lines = []
+    for checkpoint in _chosen(found, arguments.steps):
+        if demonstrations is not None and checkpoint.policy_type not in OWN_TYPES:
+            raise ValueError(
+                f"--demo-repo-id is for {' and '.join(OWN_TYPES)}. A policy of another type, such as "
+                f"{checkpoint.policy_type}, gets the expert's demonstrations without it."
+            )
+        fitted = replace(plan, scene=_fitted(plan.scene, checkpoint))
+        file = folder / "evaluations" / _record_name(checkpoint, fitted, demonstrations)
+        if file.exists():
+            (record,) = read_records(file)
+            if record.weights != checkpoint.weights_digest:
+                raise ValueError(
+                    f"{file} is the record of another policy: its weights are not those of "
+                    f"{checkpoint.folder}. Name another folder with --out, or move that record away."
+                )
+        else:
+            loaded = load_policy(checkpoint.folder, overrides, rename_map)
+            config, start = loaded.policy.config, time.monotonic()
+            episodes = evaluate(loaded, fitted, arguments.processes if config.device == "cpu" else 1)
+            options = draccus.encode(config, PreTrainedConfig)
+            record = EvaluationRecord(
+                experiment=arguments.experiment or checkpoint.experiment,
+                policy_type=config.type,
+                train_seed=checkpoint.seed,
+                step=checkpoint.step,
+                plan=fitted,
+                wording=fitted.wording,
+                policy={name: value for name, value in options.items() if name not in _NOT_RECORDED},
+                versions={"benchmark": ENV_ID, **{name: version(name) for name in _PACKAGES}},
+                command=shlex.join(["deltaco", *sys.argv[1:]]),
+                seconds=time.monotonic() - start,
+                weights=checkpoint.weights_digest,
+                demonstrations=arguments.demo_repo_id,
+                demonstrations_digest=digest,
+                episodes=episodes,
+            )
+            write_records(file, [record])
+        lines.append(
+            f"{checkpoint.folder}, step {record.step}: {record.success_rate:.1%} of {len(record.episodes)} "
+            f"episodes of {record.plan.tasks} succeeded. Record: {file}"
+        )
+    return "\n".join(lines)
+
+
+def _chosen(found: Sequence[Checkpoint], steps: str) -> Sequence[Checkpoint]:
+    """Returns the checkpoints that `steps` selects.
+
+    Raises:
+        ValueError: There is no checkpoint of a step.
+    """
+    if steps in ("all", "last"):
+        return found if steps == "all" else found[-1:]
+    available = {str(checkpoint.step): checkpoint for checkpoint in found}
+    for step in steps.split(","):
+        if step not in available:
+            raise ValueError(
+                f"There is no checkpoint of step {step!r}. Valid are all, last and {', '.join(available)}."
+            )
+    return [available[step] for step in steps.split(",")]
+
+
+def _fitted(scene: SceneConfig, checkpoint: Checkpoint) -> SceneConfig:
+    """Returns settings with the control and image size of a policy's training, unless others are set."""
+    if scene.control == SceneConfig.control:
+        scene = replace(scene, control=checkpoint.control or scene.control)
+    if scene.image_size == SceneConfig.image_size:
+        scene = replace(scene, image_size=checkpoint.image_size)
+    return scene
+
+
+def _record_name(checkpoint: Checkpoint, plan: EvaluationPlan, demonstrations: tuple[str, str] | None) -> str:
+    """Returns the file name of a record: the step, and a digest of the evaluation's other settings."""
+    digest = hashlib.sha256(repr((plan, demonstrations)).encode()).hexdigest()[:8]
+    return f"{checkpoint.step:07d}_{digest}.parquet"
+
+
+def metadata_digest(repo_id: str, root: Path | None) -> str:
+    """Returns the SHA-256 of a dataset's metadata, which hold the statistics of all its frames."""
+    folder = root if root is not None else HF_LEROBOT_HOME / repo_id
+    digest = hashlib.sha256()
+    for path in sorted(path for path in (folder / "meta").rglob("*") if path.is_file()):
+        digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

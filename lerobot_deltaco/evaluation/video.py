@@ -1,0 +1,163 @@
+"""Recordings of benchmark episodes by a policy, and demonstrations for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gym_deltaco.control import control_of
+from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.layout import Layout
+from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.tasks import Task
+from lerobot_deltaco.data.demonstrations import Demonstration, kept_frames, resize_images
+from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy, find_checkpoints, load_policy
+from lerobot_deltaco.evaluation.episodes import Episode
+from lerobot_deltaco.evaluation.evaluate import run_episodes
+from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
+from lerobot_deltaco.lerobot_env import check_policy_fits
+from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
+from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import Found
+
+
+class Recording(NamedTuple):
+    """A recorded episode of the benchmark.
+
+    Attributes:
+        frames: Rendered images before the first step and after each, (render_size, render_size, 3).
+        observed: First image that the policy received, (H, W, 3).
+        found: Locations that the policy found in it; None for policies that find none.
+        info: Info of the environment after the last step.
+        layout: Objects and containers of the scene.
+        placed: Pairs of an object and a container in which it has come to rest.
+    """
+
+    frames: list[NDArray[np.uint8]]
+    observed: NDArray[np.uint8]
+    found: Found | None
+    info: dict[str, Any]
+    layout: Layout
+    placed: frozenset[tuple[int, int]]
+
+
+def record_episode(
+    loaded: LoadedPolicy,
+    env: PickPlaceEnv,
+    task_id: int,
+    seed: int,
+    instruction: str,
+    demonstrations: Sequence[Demonstration],
+) -> Recording:
+    """Runs an episode of the benchmark and records it.
+
+    Args:
+        loaded: The policy and its processors.
+        env: The environment, as of `benchmark_env`.
+        task_id: Index of the task that the scene is drawn for.
+        seed: Seed of the environment's reset.
+        instruction: Instruction that the policy receives; empty for none.
+        demonstrations: Demonstrations that the policy receives; empty for none.
+    """
+    frames: list[NDArray[np.uint8]] = []
+    first: dict[str, Any] = {}
+    placed: set[tuple[int, int]] = set()
+
+    def record(envs: Sequence[PickPlaceEnv], observations: Sequence[Any]) -> None:
+        env = envs[0]
+        if not first:
+            observed = first_camera(observations[0], loaded.policy.config)
+            first.update(observed=observed, layout=env.scene.layout)
+        image = env.render()
+        assert image is not None
+        frames.append(image)
+        placed.update((n, env.scene.container_of(n)) for n in range(len(env.scene.bodies)))
+
+    episode = Episode(task_id, 0, seed, instruction, task_id if demonstrations else -1)
+    with torch.inference_mode():
+        (info,) = run_episodes(loaded, [env], [episode], [demonstrations], record)
+    in_containers = frozenset(pair for pair in placed if pair[1] >= 0)
+    found = getattr(loaded.policy, "found", None)
+    return Recording(frames, first["observed"], found, info, first["layout"], in_containers)
+
+
+def find_demonstration(
+    policy: TaskConditionedPolicy, task: Task, scene: SceneConfig, number: int = 0
+) -> Demonstration:
+    """Returns a demonstration of a task: the checkpoint's own, or one that the scripted expert records.
+
+    Args:
+        policy: The policy that the demonstration is for.
+        task: The task.
+        scene: Settings of the scenes.
+        number: Number of the expert's demonstration, which draws its scene; with 0, the checkpoint's comes
+            first.
+
+    Raises:
+        RuntimeError: The expert has failed too often.
+    """
+    config, bank = policy.config, policy.demonstrations
+    if number == 0 and bank is not None and task.instruction in bank.rows:
+        return bank.of_task(task.instruction)[0]
+    whole = expert_demonstration(task.index, number, scene, config.cameras[0].rpartition(".")[-1])
+    kept = kept_frames(0, len(whole.frames) - 1, config.n_demo_frames)
+    has_grasp = config.gripper_index is not None and config.state_dim > 0
+    return replace(
+        whole,
+        frames=resize_images(whole.frames[kept], config.image_size),
+        pick_state=whole.pick_state if has_grasp else None,
+        first_image=whole.frames[0],
+        states=None,
+        actions=None,
+    )
+
+
+def first_camera(observation: Mapping[str, Any], config: TaskConditionedConfig) -> NDArray[np.uint8]:
+    """Returns the image of a policy's first camera in an observation of the environment, (H, W, 3)."""
+    pixels = observation["pixels"]
+    return pixels[config.cameras[0].rpartition(".")[-1]] if isinstance(pixels, Mapping) else pixels
+
+
+def benchmark_env(config: Any, render_size: int) -> PickPlaceEnv:
+    """Makes an environment with the image size and the control that a policy was trained on.
+
+    Args:
+        config: Configuration of the policy.
+        render_size: Height and width of the frames of recordings, px.
+
+    Raises:
+        ValueError: The policy is not one for the benchmark.
+    """
+    sizes = [feature.shape[-1] for feature in config.image_features.values()]
+    control = control_of(config.image_features) or SceneConfig.control
+    scene = SceneConfig(image_size=sizes[0], control=control) if sizes else SceneConfig()
+    check_policy_fits(config, scene)
+    return PickPlaceEnv(scene=scene, render_mode="rgb_array", render_size=render_size)
+
+
+def load_conditioned(checkpoint: str | Path) -> LoadedPolicy:
+    """Loads a policy that takes a demonstration or an instruction.
+
+    Args:
+        checkpoint: Folder of a policy or of a training run, of which the last checkpoint is loaded; or id of
+            a repository on the Hugging Face Hub.
+
+    Raises:
+        ValueError: There is no checkpoint, or its policy is of another kind.
+    """
+    folder = Path(checkpoint)
+    if folder.exists() or len(folder.parts) != 2:
+        folder = find_checkpoints(folder)[-1].folder
+    loaded = load_policy(folder)
+    if not isinstance(loaded.policy, TaskConditionedPolicy):
+        raise ValueError(
+            f"{checkpoint} holds a policy of the type {loaded.policy.config.type!r}, which takes no "
+            "demonstrations. Name one of the type deltaco or deltaco_match."
+        )
+    return loaded

@@ -1,0 +1,1 @@
+"""Experiments: recipes that collect, train, evaluate and report."""

@@ -1,0 +1,1 @@
+"""Pages that show datasets, policies and episodes."""

@@ -1,0 +1,138 @@
+"""Pictures of where a policy looked, and videos of episodes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from lerobot_deltaco.data.demonstrations import Demonstration
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import Found
+
+# No object and no container of the benchmark has these colors. They differ in lightness, so that they can be
+# told apart without color vision.
+PICK_COLOR, PLACE_COLOR = (225, 0, 170), (90, 240, 255)
+VIDEO_FPS = 8  # a third of the nominal frame rate, which is too fast to watch
+MIN_SIDE = 320  # px, below which a scene is enlarged
+_OPACITY = 0.65  # of a map at its maximum
+_HELD_SECONDS = 1.0  # for which the last frame of a video stays
+
+Color = tuple[int, int, int]
+
+
+def draw_found(
+    scene: NDArray[np.uint8],
+    demonstration_ends: NDArray[np.uint8] | None,
+    found: Found,
+    sample: int = 0,
+    recorded: Tensor | None = None,
+) -> Image.Image:
+    """Draws where a policy looked: the demonstration, and to its right the scene at full resolution.
+
+    A magenta ring marks the pick location, a cyan square the place location.
+
+    Args:
+        scene: First image of the episode, (H, W, 3).
+        demonstration_ends: First and last image of the demonstration, (2, h, w, 3); None without one.
+        found: What the policy found.
+        sample: Index of the episode in the batch of `found`.
+        recorded: Pick and place locations in the dataset, (2, 2) in -1..1, which get white crosses.
+
+    Returns:
+        The picture. Scenes of less than 320 px are enlarged.
+    """
+    picture = Image.fromarray(scene)
+    scale = MIN_SIDE / min(picture.size)
+    if scale > 1:
+        size = (round(picture.width * scale), round(picture.height * scale))
+        picture = picture.resize(size, Image.Resampling.BICUBIC)
+    logits = found.maps[sample].float().cpu()
+    picture = _overlay(picture, logits.flatten(1).softmax(dim=1).view_as(logits), (PICK_COLOR, PLACE_COLOR))
+    if recorded is not None:
+        for location in recorded.tolist():
+            _draw_cross(picture, location)
+    pick, place = found.locations[sample].tolist()
+    draw_mark(picture, pick, PICK_COLOR, "pick")
+    draw_mark(picture, place, PLACE_COLOR, "place")
+    if demonstration_ends is None:
+        return picture
+    gap = max(4, picture.height // 80)
+    height = (picture.height - gap) // 2
+    width = round(height * demonstration_ends.shape[2] / demonstration_ends.shape[1])
+    image = Image.new("RGB", (width + gap + picture.width, picture.height), "white")
+    image.paste(picture, (width + gap, 0))
+    for n, (end, color) in enumerate(zip(demonstration_ends, (PICK_COLOR, PLACE_COLOR), strict=True)):
+        panel = Image.fromarray(end).resize((width, height), Image.Resampling.BICUBIC)
+        if found.attention is not None and found.by_demonstration[n]:
+            panel = _overlay(panel, found.attention[sample, n : n + 1].float().cpu(), (color,))
+        image.paste(panel, (0, n * (height + gap)))
+    return image
+
+
+def _overlay(picture: Image.Image, maps: Tensor, colors: tuple[Color, ...]) -> Image.Image:
+    """Lays maps (maps, h, w) of weights over a picture, each in its color."""
+    for weights, color in zip(maps, colors, strict=True):
+        # The square root shows less likely locations, too.
+        relative = (weights / weights.max().clamp_min(1e-12)).sqrt().numpy()
+        opacity = Image.fromarray(np.round(255 * _OPACITY * relative).astype(np.uint8))
+        opacity = opacity.resize(picture.size, Image.Resampling.BILINEAR)
+        picture = Image.composite(Image.new("RGB", picture.size, color), picture, opacity)
+    return picture
+
+
+def _pixel(picture: Image.Image, location: Sequence[float]) -> tuple[float, float]:
+    return (location[0] + 1) / 2 * picture.width, (location[1] + 1) / 2 * picture.height
+
+
+def draw_mark(picture: Image.Image, location: Sequence[float], color: Color, name: str) -> None:
+    """Draws a ring for a pick, or a square for a place, with its name."""
+    draw, (x, y) = ImageDraw.Draw(picture), _pixel(picture, location)
+    radius, line = min(picture.size) / 18, max(2, min(picture.size) // 130)
+    outline = draw.ellipse if name == "pick" else draw.rectangle
+    for reach, width, ink in ((radius + line, 3 * line, (0, 0, 0)), (radius, line, color)):
+        outline((x - reach, y - reach, x + reach, y + reach), outline=ink, width=width)
+    font = ImageFont.load_default(size=max(14, min(picture.size) // 22))
+    is_low = y > picture.height / 2
+    position = (x, y - radius - 2 * line) if is_low else (x, y + radius + 2 * line)
+    anchor = "mb" if is_low else "mt"
+    draw.text(position, name, "white", font, anchor, stroke_width=2, stroke_fill="black")
+
+
+def _draw_cross(picture: Image.Image, location: Sequence[float]) -> None:
+    draw, (x, y) = ImageDraw.Draw(picture), _pixel(picture, location)
+    reach, line = min(picture.size) / 30, max(2, min(picture.size) // 130)
+    for width, ink in ((3 * line, "black"), (line, "white")):
+        draw.line((x - reach, y - reach, x + reach, y + reach), ink, width)
+        draw.line((x - reach, y + reach, x + reach, y - reach), ink, width)
+
+
+def demonstration_ends(demonstration: Demonstration) -> NDArray[np.uint8]:
+    """Returns the first and the last image of a demonstration, (2, H, W, 3)."""
+    return demonstration.frames[[0, -1]].permute(0, 2, 3, 1).cpu().numpy()
+
+
+def encode_video(frames: Sequence[NDArray[np.uint8]], fps: int = VIDEO_FPS) -> bytes:
+    """Encodes an H.264 video in MP4, which browsers play. The last frame stays for a second.
+
+    Args:
+        frames: Images, (H, W, 3); an odd row or column is cut off.
+        fps: Frames per second.
+
+    Returns:
+        The content of the file.
+    """
+    content = io.BytesIO()
+    height, width = (side // 2 * 2 for side in frames[0].shape[:2])
+    with av.open(content, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=fps, options={"crf": "20"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for image in (*frames, *[frames[-1]] * round(_HELD_SECONDS * fps)):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return content.getvalue()

@@ -1,0 +1,1 @@
+"""What the policies share: configuration, episodes, networks, losses and checkpoints."""

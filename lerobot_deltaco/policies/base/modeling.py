@@ -1,0 +1,504 @@
+"""The base class of both policies: tasks of an episode, demonstration banks, checkpoints."""
+
+# No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
+
+import contextlib
+import copy
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
+from lerobot.utils.constants import ACTION
+from torch import Tensor, nn
+
+from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
+from lerobot_deltaco.data.demonstrations import (
+    Demonstration,
+    DemonstrationBank,
+    RobotData,
+    read_demonstrations,
+    read_robot_data,
+)
+from lerobot_deltaco.data.paraphrases import GRAMMAR, read_paraphrases
+from lerobot_deltaco.data.reading import (
+    check_episode_numbers,
+    compare_robots,
+    episodes_trained_on,
+    open_dataset,
+    training_argument,
+)
+from lerobot_deltaco.policies.base.action_queues import ActionQueues
+from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
+from lerobot_deltaco.policies.base.language import InstructionEmbeddings, Paraphrases
+from lerobot_deltaco.policies.base.losses import imitation_loss, join_action
+from lerobot_deltaco.policies.base.networks import ActionDistribution, PolicyNetwork, fuse_batch_norms
+from lerobot_deltaco.policies.base.normalization import StateLimits
+from lerobot_deltaco.policies.base.task_bank import (
+    PROCESSORS,
+    TASK_BANK,
+    checkpoint_file,
+    configuration_digests,
+    made_processors_digest,
+    processors_digest,
+    read_task_bank,
+    write_task_bank,
+)
+
+logger = logging.getLogger(__name__)
+
+# Normalized actions are in -1..1; a policy may overshoot, but not by that much.
+_ABSURD_ACTION = 100.0
+
+DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
+
+
+class TrainingDivergedError(FloatingPointError):
+    """Raised when the loss or a weight is not finite; the message names the likely cause."""
+
+
+class TaskConditionedPolicy(PreTrainedPolicy):
+    """A policy that performs the task of a demonstration, an instruction, or both.
+
+    In training, each sample's demonstration is another episode of its task in the training dataset. In
+    evaluation, `set_tasks` passes demonstrations and instructions at the start of an episode; without it, the
+    instruction is the batch's `task`, and its demonstration comes from the bank of the checkpoint.
+
+    Args:
+        config: Configuration of the policy. LeRobot fills in its input and output features beforehand.
+        dataset_stats: Statistics of the training dataset, used for normalization; None in evaluation.
+        dataset_meta: Metadata of the training dataset; None in evaluation.
+
+    Attributes:
+        model: Network that predicts actions.
+        instructions: Embeddings of instructions; None if the policy uses no sentence encoder.
+        demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
+    """
+
+    model: PolicyNetwork
+    config_class: ClassVar[type] = TaskConditionedConfig
+    name = "task_conditioned"
+
+    def __init__(
+        self,
+        config: TaskConditionedConfig,
+        dataset_stats: dict[str, dict[str, Tensor]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        super().__init__(config)
+        self.config: Any = config
+        self._meta, self._stats = dataset_meta, dataset_stats
+        self._processors_digest: str | None = None  # of the checkpoint that was loaded
+        if dataset_meta is not None:
+            config.set_dataset_feature_metadata(dataset_meta.features, dataset_stats or dataset_meta.stats)
+            config.set_dataset_length(dataset_meta)
+        config.validate_features()
+        self.state_limits = StateLimits(config.state_dim, dataset_stats)
+        self.instructions: InstructionEmbeddings | None = None
+        self.paraphrases = None if dataset_meta is None else _read_paraphrases(config, dataset_meta)
+        self.demonstrations: DemonstrationBank | None = self._read_evaluation_bank()
+        self.training_bank: DemonstrationBank | None = None
+        # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.
+        self._tasks: tuple[tuple[str, ...], DemonstrationsOfTasks] | None = None
+        self._episode: Any = None
+        self._turn = 0  # number of the next action in the running episode
+        # The actions of the running chunks that are still to be carried out, and the average of all chunks.
+        self._actions = ActionQueues(config.n_action_steps, config.gripper_index)
+        self._ensemble: ACTTemporalEnsembler | None = None
+        # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
+        self.register_buffer("step", torch.zeros((), dtype=torch.int64))
+
+    def get_optim_params(self) -> list[nn.Parameter]:
+        """Returns all trained weights, without those of frozen encoders."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    # Episodes
+
+    def reset(self) -> None:
+        """Ends the episode. The next action begins a new one."""
+        self._tasks = None
+        self._start(None)
+
+    def set_tasks(self, instructions: Sequence[str], demonstrations: DemonstrationsOfTasks) -> None:
+        """Sets the tasks of the episode that begins with the next action, until `reset`.
+
+        Args:
+            instructions: Instruction of each sample; an empty string leaves it out.
+            demonstrations: One or more demonstrations of each sample's task; an empty list leaves them out.
+
+        Raises:
+            ValueError: They differ in number.
+        """
+        if len(instructions) != len(demonstrations):
+            raise ValueError(
+                f"There must be as many lists of demonstrations as instructions. Got {len(demonstrations)} "
+                f"and {len(instructions)}."
+            )
+        self.reset()
+        self._tasks = (tuple(instructions), demonstrations)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """Returns the next action of a chunk, the mean of a likely component of its distribution.
+
+        Args:
+            batch: As in `forward`, without `action` and `episode_index`. `task` is not needed if `set_tasks`
+                gave the instructions. New instructions begin a new episode.
+
+        Returns:
+            Actions, (batch, action), normalized as in `forward`.
+
+        Raises:
+            ValueError: There is no instruction, or a task has no demonstration.
+            FloatingPointError: The action is not finite, or absurdly large.
+        """
+        # In bfloat16, in which LeRobot's training evaluates, an action would depend on the rest of the batch.
+        with torch.autocast(self.step.device.type, enabled=False):
+            action = self._next_action(batch)
+        self._turn += 1
+        return action
+
+    def _next_action(self, batch: dict[str, Any]) -> Tensor:
+        coefficient = self.config.temporal_ensemble_coeff
+        if coefficient is not None:
+            chunk = self.predict_action_chunk(batch)
+            if self._ensemble is None:
+                self._ensemble = ACTTemporalEnsembler(coefficient, chunk.shape[1])
+            return self._ensemble.update(chunk)
+        if self._begins_episode(batch) or self._actions.need_chunks:
+            self._actions.refill(self.predict_action_chunk(batch))
+        return self._actions.pop()
+
+    @property
+    def p_pick(self) -> Tensor | None:
+        """Probability that the policy gave what it picks, (batch,); None if it gives none."""
+        return None
+
+    def _begins_episode(self, batch: dict[str, Any]) -> bool:
+        """Returns whether an action for a batch begins an episode: after a reset, or for other tasks."""
+        return self._episode is None or self._episode.instructions != self._tasks_of(batch)[0]
+
+    def _start(self, episode: Any) -> None:
+        """Sets the running episode; None for none."""
+        self._episode, self._ensemble, self._turn = episode, None, 0
+        self._actions.clear()
+
+    def _tasks_of(self, batch: dict[str, Any]) -> tuple[tuple[str, ...], DemonstrationsOfTasks | None]:
+        """Returns the instructions of a batch, and the demonstrations that `set_tasks` gave, if any."""
+        if self._tasks is not None:
+            return self._tasks
+        tasks = batch.get("task")
+        if isinstance(tasks, (list, tuple)) and tasks and all(isinstance(task, str) for task in tasks):
+            return tuple(tasks), None
+        raise ValueError(
+            "`task` must be a list with an instruction for each sample of the batch. Got "
+            f"{'none' if tasks is None else repr(tasks)}. LeRobot takes it from the environment's "
+            '`task_description`, or from --task; in Python, set observation["task"] before the preprocessor.'
+        )
+
+    def banked_demonstrations(self, tasks: Sequence[str], n_each: int = 1) -> list[list[Demonstration]]:
+        """Returns demonstrations of tasks from the bank; samples of the same task take different ones.
+
+        Args:
+            tasks: Task string of each sample.
+            n_each: Number of demonstrations of each sample.
+
+        Raises:
+            ValueError: There is no demonstration of a task.
+        """
+        bank = self.demonstrations if self.demonstrations is not None else self.training_bank
+        if bank is None:
+            raise ValueError(
+                "The policy has no demonstrations. Name a dataset of them with --policy.demo_repo_id and "
+                "--policy.demo_root, or pass some to `set_tasks`."
+            )
+        if self.config.demo_episode is not None:
+            return [[bank.of_episode(self.config.demo_episode)] for _ in tasks]
+        found, n_taken = [], dict.fromkeys(tasks, 0)
+        for task in tasks:
+            known, first = bank.of_task(task), n_taken[task]
+            found.append([known[(first + n) % len(known)] for n in range(n_each)])
+            n_taken[task] += n_each
+        return found
+
+    # Observations
+
+    def _images(self, batch: dict[str, Any]) -> Tensor:
+        """Returns the images of all cameras, the demonstration camera first, (batch, cameras, 3, S, S)."""
+        return torch.stack([self._camera_image(batch, name) for name in self.config.cameras], dim=1)
+
+    def _camera_image(self, batch: dict[str, Any], name: str) -> Tensor:
+        """Returns the image of a camera, (batch, 3, S, S) in 0..1."""
+        image, size = batch[name], self.config.image_size
+        if image.shape[-2:] == (size, size):
+            return image
+        return F.interpolate(image, (size, size), mode="bilinear", antialias=True)
+
+    # Actions
+
+    def _imitation_loss(
+        self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None, gripper_kind: str
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the imitation loss of each sample, (batch,), and its parts to log. See `imitation_loss`."""
+        log_std, is_pad = self.model.log_std, batch.get(f"{ACTION}_is_pad")
+        return imitation_loss(
+            predicted, gripper, log_std, batch[ACTION], is_pad, self.config.gripper_index, gripper_kind
+        )
+
+    def _acting_network(self) -> PolicyNetwork:
+        """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
+        return self.model if self.training else fuse_batch_norms(self.model)
+
+    def _chosen(self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None) -> Tensor:
+        """Returns the actions of a chunk, (batch, steps, action); an absurd one is an error."""
+        opening = None if gripper is None else torch.sigmoid(gripper.float())
+        action = join_action(predicted.likely_mean(self._turn).float(), opening, self.config.gripper_index)
+        if bool((action.abs() < _ABSURD_ACTION).all()):  # False for NaN
+            return action
+        damaged = _not_finite(batch)
+        cause = (
+            f"In the observation, {', '.join(f'`{name}`' for name in damaged)} has numbers that are not "
+            "finite: check the sensors, and the normalization statistics of the checkpoint."
+            if damaged
+            else "The observation is finite, so the weights of the checkpoint are damaged. Fetch it again."
+        )
+        raise FloatingPointError(f"The policy's action is not finite, or absurdly large. {cause}")
+
+    # Training
+
+    def set_training_data(self, bank: DemonstrationBank, robot_data: RobotData | None) -> None:
+        """Sets the demonstrations for training; otherwise, they are read at the first batch.
+
+        Args:
+            bank: The training episodes.
+            robot_data: States and actions of the robot in them; None if the policy does not need them.
+        """
+        self.training_bank = bank.to(self.step.device)
+
+    def _prepare_training(self) -> None:
+        """Reads the training episodes unless they have been read."""
+        if self.training_bank is None:
+            # Models fitted to them choose their own precision.
+            with torch.autocast(self.step.device.type, enabled=False):
+                self._read_training_data()
+
+    def _read_training_data(self) -> None:
+        if self._meta is None:
+            raise ValueError("Training needs the metadata of the dataset. Pass them as `dataset_meta`.")
+        frames = getattr(self._meta, "frames_in_memory", None)
+        if frames is not None and self.config.demo_episodes is None:
+            bank = frames.demonstrations(
+                self.config.cameras[0], self.config.image_size, self.config.n_demo_frames
+            )
+            self.set_training_data(bank, frames.robot_data(self.config.cameras[0]))
+            return
+        meta = self._meta
+        if self.config.demo_episodes:
+            chosen = list(dict.fromkeys(self.config.demo_episodes))
+            check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
+        else:
+            chosen = episodes_trained_on(meta)
+        dataset = open_dataset("--dataset.root", meta.repo_id, meta.root, chosen)
+        bank = self._read_bank(dataset, chosen)
+        robot_data = None
+        if self.config.state_dim:
+            robot_data = read_robot_data(dataset, chosen, self.config.cameras[0])
+        self.set_training_data(bank, robot_data)
+
+    def _read_bank(self, dataset: LeRobotDataset, episodes: Sequence[int] | None) -> DemonstrationBank:
+        config = self.config
+        return read_demonstrations(
+            dataset, config.cameras[0], config.image_size, config.n_demo_frames, episodes
+        )
+
+    def _read_evaluation_bank(self) -> DemonstrationBank | None:
+        """Reads the demonstrations for evaluation that the configuration names."""
+        if self.config.demo_repo_id is None or not self.config.uses_demonstrations:
+            return None
+        dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
+        if self._meta is not None:
+            compare_robots(self._meta, dataset.meta)
+        bank = self._read_bank(dataset, None)
+        self._complete_bank(bank, dataset)
+        return bank
+
+    def _complete_bank(self, bank: DemonstrationBank, dataset: LeRobotDataset) -> None:
+        """Adds what else the policy needs of demonstrations for evaluation."""
+
+    def _step_generator(self) -> torch.Generator:
+        """Returns the random generator of a training step, on the CPU."""
+        step = int(self.step) if self.training else 0
+        rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
+        sequence = np.random.SeedSequence((self.config.seed, step, rank))
+        (state,) = sequence.generate_state(1, np.uint64)
+        return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+    def _draw_instructions(self, tasks: Sequence[str], generator: torch.Generator) -> list[str]:
+        """Returns the instruction of each training sample: its task string, or a sentence for it."""
+        if self.paraphrases is None:
+            return list(tasks)
+        return self.paraphrases.draw(tasks, generator)
+
+    def _finish_step(
+        self, batch: dict[str, Any], loss: Tensor, logged: dict[str, Tensor], reduction: str
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Checks and reduces the loss of each sample (batch,), and counts the training step."""
+        if self.training:
+            if not bool(torch.isfinite(loss).all()):
+                raise TrainingDivergedError(_why_not_finite(batch, int(self.step)))
+            self.step += 1
+        scalars = torch.stack([value.detach().float() for value in logged.values()]).tolist()
+        loss = loss.mean() if reduction == "mean" else loss
+        return loss, dict(zip(logged, scalars, strict=True))
+
+    def _autocast(self, device: torch.device) -> contextlib.AbstractContextManager:
+        """Returns a context in which training uses the configured precision."""
+        if self.config.dtype == "float32":
+            return contextlib.nullcontext()
+        return torch.autocast(device.type, torch.bfloat16)
+
+    # Checkpoints
+
+    def _save_pretrained(self, save_directory: Path, *args: Any, **kwargs: Any) -> None:
+        damaged = _not_finite(self.state_dict())
+        if damaged:
+            raise TrainingDivergedError(
+                f"After training step {int(self.step)}, the weight {damaged[0]} is not finite, and no "
+                "checkpoint is saved. Lower --policy.optimizer_lr, or limit the gradient with "
+                "--policy.grad_clip_norm=10, and continue from the last checkpoint with --resume=true."
+            )
+        # LeRobot 0.6.1 may pass a `state_dict`; later versions do not, and call this on every process.
+        super()._save_pretrained(save_directory, *args, **kwargs)
+        if not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0:
+            bank = self.demonstrations if self.config.uses_demonstrations else None
+            known = self.instructions
+            if known is not None and self.paraphrases is not None:
+                known = self.paraphrases.left_out_of(known)
+            digests = configuration_digests(self.config)
+            processors = self._processors_digest
+            if self._stats is not None:
+                processors = made_processors_digest(self.config, self._stats)
+            if processors is not None:
+                digests[PROCESSORS] = processors
+            write_task_bank(save_directory / TASK_BANK, known, bank, digests)
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:
+        """Loads a policy with the instructions and demonstrations that were saved with it.
+
+        See `PreTrainedPolicy.from_pretrained` for the arguments.
+
+        Raises:
+            ValueError: A file of the checkpoint is damaged, or does not fit the others.
+        """
+        policy = super().from_pretrained(pretrained_name_or_path, **{**kwargs, "strict": True})
+        path = checkpoint_file(pretrained_name_or_path, TASK_BANK, **kwargs)
+        digests = configuration_digests(policy.config)
+        processors = processors_digest(pretrained_name_or_path, **kwargs)
+        if processors is not None:
+            digests[PROCESSORS] = processors
+        if policy._stats is not None:  # It is trained, maybe on other data than the checkpoint.
+            digests = {name: digests[name] for name in ("image_size", "n_demo_frames")}
+        bank, saved_with = read_task_bank(path, policy.instructions, digests)
+        if policy._stats is not None and training_argument("resume"):
+            _check_resumed_data(policy, saved_with.get(PROCESSORS))
+        policy._processors_digest = saved_with.get(PROCESSORS)
+        # Demonstrations named on the command line replace those of the checkpoint.
+        if policy.demonstrations is None and bank is not None:
+            policy.demonstrations = bank.to(policy.config.device)
+        return policy
+
+    @classmethod
+    def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
+        limits = copy.deepcopy(model.state_limits)
+        try:
+            policy = super()._load_as_safetensor(model, model_file, map_location, strict)
+        except RuntimeError as error:
+            raise ValueError(
+                f"{model_file} does not have the weights of this policy: "
+                f"{str(error).splitlines()[-1].strip()} "
+                "The config.json beside it belongs to other weights, or to another version."
+            ) from error
+        if policy._stats is not None:
+            # Training normalizes states by its own dataset, not by that of the weights that it begins with.
+            policy.state_limits = limits
+        damaged = _not_finite(policy.state_dict())
+        if damaged:
+            raise ValueError(
+                f"{model_file} is damaged: the weight {damaged[0]} has numbers that are not finite."
+            )
+        return policy
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str,
+        model_type: str,
+        license: str | None,
+        tags: list[str] | None,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> Any:
+        """Returns the card of the policy on the Hugging Face Hub. The arguments are those of LeRobot."""
+        from lerobot_deltaco.collection.cards import policy_card
+
+        demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
+        return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
+
+
+def _check_resumed_data(policy: TaskConditionedPolicy, saved_with: str | None) -> None:
+    """Checks that a training resumes on the data that it began with.
+
+    LeRobot keeps the checkpoint's processors, which would normalize other data by the old statistics.
+
+    Raises:
+        ValueError: The statistics of the dataset differ.
+    """
+    assert policy._stats is not None
+    if saved_with is not None and saved_with != made_processors_digest(policy.config, policy._stats):
+        raise ValueError(
+            "The dataset is not the one that the training began with: its statistics differ. Resume on the "
+            "same data, or begin a new training from the checkpoint with --policy.path."
+        )
+
+
+def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadata) -> Paraphrases | None:
+    """Reads the sentences for training, by task string."""
+    if config.paraphrases is None:
+        return None
+    known = {task.instruction: task.index for task in (*TASKS, *COLOR_SHAPE_TASKS)}
+    needed = [known[text] for text in meta.tasks.index if text in known]
+    sentences = read_paraphrases(config.paraphrases, "train", needed)
+    by_task = {get_task(task_id).instruction: own for task_id, own in sentences.items()}
+    return Paraphrases(by_task, config.p_paraphrase, is_complete=config.paraphrases != GRAMMAR)
+
+
+def _not_finite(tensors: Mapping[str, Any]) -> list[str]:
+    """Returns the names of the tensors with numbers that are not finite."""
+    return [
+        name
+        for name, values in tensors.items()
+        if isinstance(values, Tensor) and values.is_floating_point() and not bool(values.isfinite().all())
+    ]
+
+
+def _why_not_finite(batch: dict[str, Any], step: int) -> str:
+    """Returns an error message for a loss that is not finite."""
+    damaged = _not_finite(batch)
+    cause = (
+        f"In its batch, {', '.join(f'`{name}`' for name in damaged)} has numbers that are not finite: the "
+        "dataset or its statistics are damaged."
+        if damaged
+        else "The batch was finite, so the training has diverged: lower --policy.optimizer_lr, or limit the "
+        "gradient with --policy.grad_clip_norm=10."
+    )
+    return (
+        f"The loss of training step {step + 1} is not finite. {cause} If a checkpoint was saved "
+        "before, continue from it with --resume=true."
+    )

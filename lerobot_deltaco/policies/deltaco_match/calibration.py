@@ -1,0 +1,174 @@
+"""Calibration of the camera: from robot states to locations, learned from images of episodes.
+
+Where the gripper closed around an object, the image stays changed: the object is gone while it is carried,
+and at the end. The map from states to locations sends the states at the grasps to the locations of these
+changes. So no calibrated camera is needed, only a fixed one.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from lerobot_deltaco.policies.base.networks import grid_of_centers
+
+logger = logging.getLogger(__name__)
+
+EPISODES_PER_CLUSTER = 60
+MIN_CLUSTERS, MAX_CLUSTERS = 12, 200
+MIN_EPISODES = 2 * MIN_CLUSTERS
+_ROUNDS = 10  # of k-means, of the robust regression and of the refinement
+_BLUR = 1 / 32  # standard deviation, as a fraction of the image's side
+_REACH = 1 / 8  # of the refinement around a predicted location, as a fraction of the image's side
+_RIDGE = 1e-2
+_DOUBTFUL = 1 / 16  # median distance of changes from where they are expected, as a fraction of the side
+
+
+class StateToImage(nn.Module):
+    """A map from robot states to locations in the image, quadratic in the state.
+
+    Args:
+        state_dim: Size of the robot's state.
+    """
+
+    mean: Tensor
+    scale: Tensor
+    weights: Tensor
+
+    def __init__(self, state_dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(state_dim))
+        self.register_buffer("scale", torch.zeros(state_dim))
+        self.register_buffer("weights", torch.zeros(_quadratic(self.mean).shape[-1], 2))
+
+    def fit(self, first: Tensor, carried: Tensor, last: Tensor, states: Tensor, scale: Tensor) -> None:
+        """Learns the map from episodes; warns if it fits badly.
+
+        Args:
+            first: First images of episodes, (episodes, 3, H, W) uint8.
+            carried: Images of the same episodes, halfway between grasp and release.
+            last: Last images of the same episodes.
+            states: States at their grasps, (episodes, state), at least `MIN_EPISODES`.
+            scale: Factor by which each dimension counts, (state,), such as 1 / its standard deviation over
+                all frames. So velocities, which are only noise at a grasp, hardly count.
+        """
+        states = states.float()
+        mean, std = states.mean(dim=0), states.std(dim=0)
+        self.mean.copy_(mean)
+        self.scale.copy_(torch.where(std > 1e-6 * (1 + mean.abs()), scale, 0.0))
+        changes = _changes(first, carried, last)  # (episodes, H, W)
+        x = (states - mean) * self.scale.to(mean)
+        centers, members = _clusters(x)
+        # A change in the episodes of a cluster, but not in others, belongs to the states of the cluster.
+        average = torch.stack([changes[members == k].mean(dim=0) for k in range(len(centers))])
+        peaks = _peaks(_blurred(average - average.mean(dim=0)))
+        linear = robust_fit(_linear(centers), peaks)
+        locations = _linear(x) @ linear
+        # Refine with each episode's own change near the expected location, which gives many more points.
+        smooth = _blurred(changes)
+        weights = F.pad(linear, (0, 0, 0, len(self.weights) - len(linear)))
+        for _ in range(_ROUNDS):
+            near = _peaks_near(smooth, locations)
+            weights = robust_fit(_quadratic(x), near)
+            locations = _quadratic(x) @ weights
+        self.weights.copy_(weights)
+        distance = float((near - locations).norm(dim=1).median()) / 2
+        if distance > _DOUBTFUL:
+            logger.warning(
+                "Objects do not disappear where the robot's states at the grasps suggest, but %.0f %% of the "
+                "image's side away (median), so the locations are probably wrong. See whether the rings of "
+                "`deltaco check` lie on the objects. Another camera (--policy.demo_camera) or larger images "
+                "(--policy.image_size) may help.",
+                100 * distance,
+            )
+
+    def forward(self, states: Tensor) -> Tensor:
+        """Maps states (..., state) to locations (..., 2)."""
+        return _quadratic((states.float() - self.mean) * self.scale) @ self.weights
+
+
+def _changes(first: Tensor, carried: Tensor, last: Tensor) -> Tensor:
+    """Returns the lasting change of each pixel in an episode, beyond its usual change, (episodes, H, W)."""
+    # The robot moves on, so that it hardly ever changes a pixel in both of the later images.
+    changes = torch.stack(
+        [
+            torch.minimum(*((image.float() - before.float()).abs().mean(dim=0) / 255 for image in later))
+            for before, *later in zip(first, carried, last, strict=True)
+        ]
+    )
+    # But it has left its first place in every episode.
+    return (changes - changes.mean(dim=0)) / (changes.std(dim=0) + 0.02)
+
+
+def _clusters(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns centers (clusters, dims) by k-means, none empty, and the cluster of each point, (points,)."""
+    n_clusters = max(MIN_CLUSTERS, min(MAX_CLUSTERS, len(x) // EPISODES_PER_CLUSTER))
+    generator = torch.Generator().manual_seed(0)
+    centers = x[torch.randperm(len(x), generator=generator)[:n_clusters].to(x.device)]
+    for _ in range(_ROUNDS):
+        members = torch.cdist(x, centers).argmin(dim=1)
+        centers = torch.stack([x[members == k].mean(dim=0) for k in members.unique()])
+    members = torch.cdist(x, centers).argmin(dim=1)
+    numbers, members = members.unique(return_inverse=True)
+    return centers[numbers], members
+
+
+def _blurred(maps: Tensor) -> Tensor:
+    """Convolves maps (n, H, W) with a Gaussian."""
+    height, width = maps.shape[-2:]
+    std = max(1.0, _BLUR * max(height, width))
+    radius = math.ceil(3 * std)
+    offsets = torch.arange(-radius, radius + 1, device=maps.device)
+    kernel = torch.exp(-(offsets**2) / (2 * std**2))
+    kernel = kernel / kernel.sum()
+    across = F.conv2d(maps[:, None], kernel.view(1, 1, 1, -1), padding=(0, radius))
+    return F.conv2d(across, kernel.view(1, 1, -1, 1), padding=(radius, 0))[:, 0]
+
+
+def _peaks(maps: Tensor) -> Tensor:
+    """Returns the locations of the maxima of maps (n, H, W), (n, 2)."""
+    return grid_of_centers(maps.shape[1], maps.shape[2], maps.device)[maps.flatten(1).argmax(dim=1)]
+
+
+def _peaks_near(maps: Tensor, locations: Tensor) -> Tensor:
+    """Returns the locations of the maxima within `_REACH` of locations (n, 2).
+
+    For the few locations farther outside the image, it is the top left corner, which the fit downweights as
+    an outlier.
+    """
+    grid = grid_of_centers(maps.shape[1], maps.shape[2], maps.device)
+    peaks = []
+    for some, around in zip(maps.split(512), locations.split(512), strict=True):
+        far = torch.cdist(around, grid) > 2 * _REACH  # (some, H * W)
+        peaks.append(grid[some.flatten(1).masked_fill(far, -math.inf).argmax(dim=1)])
+    return torch.cat(peaks)
+
+
+def robust_fit(features: Tensor, targets: Tensor) -> Tensor:
+    """Returns the weights (features, targets) of a linear regression that is robust to outliers."""
+    weights = torch.ones(len(features), device=features.device)
+    ridge = _RIDGE * len(features) * torch.eye(features.shape[1], device=features.device)
+    ridge[0, 0] = 0
+    for _ in range(_ROUNDS):
+        weighted = features * weights[:, None]
+        solution = torch.linalg.solve(weighted.T @ features + ridge, weighted.T @ targets)
+        errors = (features @ solution - targets).norm(dim=1)
+        usual = errors.median().clamp_min(0.02)
+        weights = 1 / (1 + (errors / (2 * usual)) ** 2) ** 2
+    return solution
+
+
+def _linear(x: Tensor) -> Tensor:
+    """Prepends 1 to numbers: (..., dims) to (..., 1 + dims)."""
+    return torch.cat([torch.ones_like(x[..., :1]), x], dim=-1)
+
+
+def _quadratic(x: Tensor) -> Tensor:
+    """Appends the products of numbers to these."""
+    n_dims = x.shape[-1]
+    i, j = torch.triu_indices(n_dims, n_dims, device=x.device)
+    return torch.cat([_linear(x), x[..., i] * x[..., j]], dim=-1)

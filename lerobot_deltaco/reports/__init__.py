@@ -1,0 +1,1 @@
+"""Tables, figures and the leaderboard, made from the records of evaluations."""

@@ -1,0 +1,73 @@
+"""Files of instructions that people wrote: formats, splits and errors."""
+
+import pytest
+
+from lerobot_deltaco.data.paraphrases import choose_instructions, read_paraphrases
+
+OURS = """task_id,instruction
+4,move the speckled hourglass into the green box
+4,"the dumbbel, please, to the green one"
+90,dropp the round  thing at the front
+4,Move the speckled hourglass into the GREEN box
+"""
+AUTHORS = ",Task ID,Instruction\r\n0,90,hourglass to green \r\n1,4,ring to the front\r\n"
+SHARED = "task_id,instruction\n0,a\n0,b\n0,c\n1,C\n1,d\n1,e\n2,e\n"
+
+
+def write(path, text):
+    path.write_text(text, encoding="utf-8", newline="")
+    return path
+
+
+def test_both_formats_are_read(tmp_path):
+    ours = read_paraphrases(write(tmp_path / "ours.csv", "\ufeff" + OURS))
+    assert ours == {
+        4: ("move the speckled hourglass into the green box", "the dumbbel, please, to the green one"),
+        90: ("dropp the round thing at the front",),
+    }
+    authors = read_paraphrases(write(tmp_path / "authors.csv", AUTHORS))
+    assert list(authors.items()) == [(4, ("ring to the front",)), (90, ("hourglass to green",))]
+
+
+def test_held_out_sentences_are_not_trained_on(tmp_path):
+    path = write(tmp_path / "shared.csv", SHARED)
+    assert read_paraphrases(path, "held_out") == {0: ("c",), 1: ("e",), 2: ("e",)}
+    assert read_paraphrases(path, "train") == {0: ("a", "b"), 1: ("d",)}
+    assert read_paraphrases(path, "all") == {0: ("a", "b", "c"), 1: ("C", "d", "e"), 2: ("e",)}
+    with pytest.raises(ValueError, match=r"one of all, train, held_out\. Got 'test'"):
+        read_paraphrases(path, "test")
+
+
+def test_invalid_file_is_an_error_that_names_the_line(tmp_path):
+    for text, message in [
+        ("", "line 1: expected the columns task_id,instruction or"),
+        ("4,a sentence\n", r"line 1: .* Got '4,a sentence'"),
+        ("task_id,instruction\n", "has no instructions"),
+        ("task_id,instruction\n4,put, it\n", r"line 2: expected 2 columns\. Got 3"),
+        ("task_id,instruction\n4,a\n300,b\n", r"line 3: .*from 0 to 299.* Got 300"),
+        ("task_id,instruction\nfour,a\n", r"line 2: .*from 0 to 299.* Got 'four'"),
+        ("task_id,instruction\n4,  \n", "line 2: the instruction is empty"),
+        ('task_id,instruction\n4,"put it\n', "line 2: "),
+    ]:
+        path = write(tmp_path / "mine.csv", text)
+        with pytest.raises(ValueError, match=f"mine.csv.*{message}"):
+            read_paraphrases(path)
+    # So is a file that cannot be read.
+    (tmp_path / "latin.csv").write_bytes("task_id,instruction\n4,caf\xe9\n".encode("latin-1"))
+    for path in (tmp_path / "missing.csv", tmp_path / "latin.csv", tmp_path):
+        with pytest.raises(ValueError, match=f"Cannot read the paraphrases {path}"):
+            read_paraphrases(path)
+
+
+def test_instructions_are_templates_a_file_or_one_sentence(tmp_path):
+    path = write(tmp_path / "shared.csv", SHARED)
+    assert choose_instructions([0, 1]) is None
+    assert choose_instructions([1], path, "held_out") == {1: ("e",)}
+    chosen = choose_instructions([4, 0], instruction=" put it  there ")
+    assert chosen == {4: ("put it there",), 0: ("put it there",)}
+    with pytest.raises(ValueError, match=r"no instruction for task 2 \('Put .*'\) and 1 more tasks"):
+        choose_instructions([0, 2, 3], path, "train")
+    with pytest.raises(ValueError, match="not both"):
+        choose_instructions([0], path, instruction="go")
+    with pytest.raises(ValueError, match="It is empty"):
+        choose_instructions([0], instruction=" ")

@@ -1,0 +1,109 @@
+"""`deltaco check`: its report agrees with the training."""
+
+import sys
+from itertools import islice
+
+import pytest
+import torch
+from small_policies import (
+    COLORS,
+    EPISODES,
+    TABLE_TASKS,
+    batch_of,
+    random_moves,
+    small_policy,
+    write_dataset,
+    write_table,
+)
+
+from gym_deltaco.env import PickPlaceEnv
+from gym_deltaco.expert import expert_episode
+from gym_deltaco.scene_config import SceneConfig
+from lerobot_deltaco import cli
+from lerobot_deltaco.arguments import CheckArguments, PolicyOptions
+from lerobot_deltaco.pages.check import _staying_edges, check
+
+
+def checked(root, out, **options):
+    """The report, and the page; a report of a refusal is that of the error."""
+    try:
+        policy = PolicyOptions(**{"image_size": 24, **options})
+        report = check(CheckArguments(str(root), policy, batch_size=4, steps=100, out=out))
+    except ValueError as error:
+        report = str(error)
+    return report, (out / "index.html").read_text()
+
+
+def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path):
+    report, page = checked(table.root, tmp_path)
+    assert "Training would refuse" not in report
+    assert "demo camera:    observation.image stands still" in report
+    assert "dimension 2 of the action (gripper); low values close it" in report
+    assert "its state:      nothing in the state follows these commands" in report
+    assert "in 48 of 48 episodes" in report
+    assert all(f"24 episodes, 24 with a grasp: {task}" in report for task in TABLE_TASKS)
+    assert "for 100 steps of 4" in report
+    # The training's own warning, of a joint that never moves.
+    assert report.count("warning:") == report.count("of the robot's state hardly move") == 1
+    assert page.count("data:image/jpeg;base64") == 4 * 48
+    assert "would refuse" not in page
+
+
+def test_the_direction_of_the_gripper_is_the_one_given(table, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "lerobot_deltaco.pages.check.follows_gripper", lambda states, *_: torch.arange(states.shape[1]) == 1
+    )
+    report, _ = checked(table.root, tmp_path, gripper_closed="high")
+    assert "high values close it" in report
+    assert "dimension 1 (b) of the state follows these commands" in report
+    assert "in 0 of 48 episodes" in report
+    assert report.count("left out:       episode") == 48
+    assert "Set --policy.gripper_closed=low" in report
+
+
+@pytest.mark.parametrize("n_episodes", [3, 24])
+def test_a_refusal_is_the_error_of_the_training(n_episodes, tmp_path, monkeypatch, short_fit):
+    # The second dataset has enough episodes, but each is of another task.
+    tasks = [f"move the red object {'x' * n}left" for n in range(n_episodes)]
+    for task in tasks:
+        monkeypatch.setitem(COLORS, task, COLORS[TABLE_TASKS[0]])
+    moves = [(task, *move[1:]) for task, move in zip(tasks, random_moves(n_episodes), strict=True)]
+    dataset = write_table(tmp_path / "data", moves)
+    report, page = checked(dataset.root, tmp_path / "out")
+    policy, before, _ = small_policy(dataset, "deltaco_match")
+    with pytest.raises(ValueError, match="episodes") as error:
+        policy(before(batch_of(dataset, [0])))
+    assert report.startswith(f"Training would refuse this dataset. {error.value}\n")
+    assert "would refuse" in page
+
+
+def test_what_does_not_fit_is_shown_without_a_policy(tmp_path):
+    dataset = write_dataset(tmp_path / "data")
+    report, page = checked(dataset.root, tmp_path / "out", gripper="none")
+    assert report.startswith("Training would refuse this dataset. `deltaco_match` learns where")
+    assert "observation.images.wrist moves" in report
+    assert "1 episodes, 0 with a grasp: wave" in report
+    assert "have a single episode" in report
+    assert page.count("data:image/jpeg;base64") == 4 * len(EPISODES)
+
+
+def test_the_command_ends_with_1_and_the_reason(tmp_path, monkeypatch, capsys):
+    dataset = write_dataset(tmp_path / "data")
+    options = ["--out", str(tmp_path / "out"), "--policy.demo_camera=observation.images.wrist"]
+    monkeypatch.setattr(sys, "argv", ["deltaco", "check", str(dataset.root), *options])
+    with pytest.raises(SystemExit, match="deltaco check: Training would refuse this dataset") as end:
+        cli.main()
+    assert "demo camera:    observation.images.wrist" in str(end.value.code)
+
+
+def test_a_moving_camera_is_told_from_one_that_stands_still():
+    env = PickPlaceEnv(4, SceneConfig(control="joints"))
+    steps = list(islice(expert_episode(env, 4, seed=0), 0, 91, 30))
+    env.close()
+    front, wrist = (
+        torch.stack([torch.from_numpy(step.observation["pixels"][name]) for step in steps])
+        for name in ("front", "wrist")
+    )
+    front, wrist = (_staying_edges(images.permute(0, 3, 1, 2)) for images in (front, wrist))
+    assert front > 0.5
+    assert wrist < 0.2

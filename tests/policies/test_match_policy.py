@@ -1,0 +1,313 @@
+"""`deltaco_match` on a small synthetic pick-and-place dataset: two objects, of which one is moved."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from lerobot.utils.constants import OBS_STATE
+from small_policies import (
+    TABLE_LENGTH,
+    TABLE_SIZE,
+    TABLE_TASKS,
+    batch_of,
+    demos_of,
+    draw_table,
+    observation,
+    random_moves,
+    small_policy,
+    state_at,
+    use_short_fit,
+    write_episodes,
+    write_table,
+)
+
+from lerobot_deltaco.data.demonstrations import DemonstrationBank
+from lerobot_deltaco.policies.base.normalization import StateLimits
+from lerobot_deltaco.policies.deltaco_match import matching as feature_matching
+from lerobot_deltaco.policies.deltaco_match import proposals
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+
+pytestmark = pytest.mark.usefixtures("short_fit")
+
+N_EPISODES, N_TRAINED = 48, 36
+MOVES = random_moves(N_EPISODES)  # of `table`
+RED, BLUE = TABLE_TASKS  # the tasks of the even and the odd episodes
+
+
+@pytest.fixture
+def make(table):
+    """Makes a policy that has its training data, with the same weights each time."""
+
+    def make(**options):
+        torch.manual_seed(0)
+        policy, _, _ = small_policy(table, "deltaco_match", **options)
+        policy._prepare_training()
+        return policy
+
+    return make
+
+
+def first_frames(episodes):
+    return [episode * TABLE_LENGTH for episode in episodes]
+
+
+def found_in(policy, scenes, instructions, demonstrations):
+    """Returns what a policy finds in the first images of episodes, by episodes that demonstrate."""
+    policy.reset()
+    rows = [policy.training_bank.episode_rows(torch.tensor(own)).tolist() for own in demonstrations]
+    policy.set_tasks(instructions, [[policy.training_bank[row] for row in own] for own in rows])
+    policy.select_action(scenes)
+    return policy.found
+
+
+@pytest.fixture(scope="module")
+def trained(table):
+    """A policy that has learned, on 36 of the 48 episodes, to find the locations."""
+    with pytest.MonkeyPatch.context() as patch:
+        use_short_fit(patch, 40)
+        patch.setattr(proposals, "_MIN_SCENES", 16)
+        patch.setattr(proposals, "_MAX_SCENES", 16)
+        patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
+        patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._LOCATED_FRACTION", 1.0)
+        patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._SHIFT_PADDING", 1)
+        policy, before, _ = small_policy(table, "deltaco_match")
+        optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
+        rng = np.random.default_rng(0)
+        for _ in range(50):
+            batch = before(batch_of(table, first_frames(rng.choice(N_TRAINED, 16))))
+            loss, _ = policy(batch)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    return policy.eval()
+
+
+def test_training_learns_to_find_what_a_demonstration_moved_and_an_instruction_names(trained, table):
+    held_out = range(N_TRAINED, N_EPISODES)
+    scenes, tasks = batch_of(table, first_frames(held_out)), [MOVES[n][0] for n in held_out]
+    shown = [[n - 2] for n in held_out]  # another episode of the same task
+    true = torch.tensor(np.stack([MOVES[n][1::2] for n in held_out])).float()  # picks and places
+    no_words, none_shown = [""] * len(tasks), [[]] * len(tasks)
+    for instructions, demonstrations in ((tasks, shown), (no_words, shown), (tasks, none_shown)):
+        found = found_in(trained, scenes, instructions, demonstrations)
+        errors = (found.locations - true).abs() * TABLE_SIZE / 2  # px
+        assert (errors[:, 0].amax(dim=1) < 3).float().mean() > 0.8
+        # The tasks say on which side the object is placed; its y is that of the object.
+        assert (errors[:, 1, 0] < 3).float().mean() > 0.8
+        assert found.heights.isfinite().all()
+
+
+def test_locations_of_training_episodes_are_where_objects_were_moved(make):
+    known = make().training_locations
+    true = torch.tensor(np.stack([move[1::2] for move in MOVES])).float().clamp(-1, 1)
+    assert known.has_grasp.all()
+    errors = (known.locations - true).norm(dim=2) * TABLE_SIZE / 2
+    assert errors.median() < 1.5  # px
+
+
+def test_episode_without_a_grasp_teaches_nothing(make, table):
+    policy = make()
+    batch = batch_of(table, first_frames([0, 1]))
+
+    def losses():
+        policy.step.zero_()
+        policy.zero_grad()
+        loss, _ = policy(batch, reduction="none")
+        loss[0].backward()
+        return loss.tolist(), [weight.grad for weight in policy.model.parameters() if weight.grad is not None]
+
+    known, gradients = losses()
+    assert any(gradient.any() for gradient in gradients)
+    policy.training_locations.has_grasp[0] = False
+    unknown, gradients = losses()
+    assert unknown == [0, known[1]]
+    assert not any(gradient.any() for gradient in gradients)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.2])
+def test_the_policy_network_learns_from_locations_with_the_noise_that_is_set(make, table, noise, monkeypatch):
+    policy, given = make(location_noise=noise), []
+    acting_loss = policy._acting_loss
+
+    def seen(batch, images, locations, *args):
+        given.append(locations)
+        return acting_loss(batch, images, locations, *args)
+
+    monkeypatch.setattr(policy, "_acting_loss", seen)
+    policy(batch_of(table, first_frames(range(N_EPISODES))))
+    spread = (given[0] - policy.training_locations.locations).std().item()
+    assert spread == pytest.approx(noise, rel=0.3)
+
+
+def test_samples_outside_of_the_demonstrations_teach_nothing(make, table):
+    policy = make()
+    bank = policy.training_bank
+    others = torch.where(bank.episodes == 0, 10_000, bank.episodes)
+    policy.training_bank = DemonstrationBank(bank.frames, bank.tasks, others)
+    losses, _ = policy(batch_of(table, first_frames([0, 1])), reduction="none")
+    assert losses[0] == 0
+    assert losses[1] > 0
+
+
+def test_too_few_grasps_are_an_error_before_training(table):
+    policy, _, _ = small_policy(table, "deltaco_match", demo_episodes=list(range(8)))
+    remedy = r"Collect more, or train --policy.type=deltaco with --policy.demo_encoder=attention"
+    gripper = r"dimension 2 of the action \(gripper\), whose low values"
+    with pytest.raises(ValueError, match=rf"at least 24 episodes .* Got 8\. {remedy}.* {gripper}"):
+        policy(batch_of(table, [0]))
+
+
+def test_greater_values_of_the_gripper_may_mean_closed(table, caplog):
+    frames = table.meta.frames_in_memory
+    bank = frames.demonstrations("observation.image", TABLE_SIZE, 2)
+    robot = frames.robot_data("observation.image")
+    inverted = robot._replace(actions=robot.actions * torch.tensor([1, 1, -1]))
+
+    def locations(data, **options):
+        caplog.clear()
+        policy, _, _ = small_policy(table, "deltaco_match", **options)
+        policy.set_training_data(copy.deepcopy(bank), data)
+        return policy.training_locations.locations
+
+    expected = locations(robot)
+    assert torch.equal(locations(inverted, gripper_closed="high"), expected)
+    assert "gripper_closed" not in caplog.text
+    with pytest.raises(ValueError, match=r"at least 24 episodes .* Got 0\."):
+        locations(inverted)
+    assert "Set --policy.gripper_closed=high." in caplog.text
+
+
+def test_validation_loss_of_held_out_episodes_is_that_at_their_recorded_locations(make, table, monkeypatch):
+    policy = make().eval()
+    batch = batch_of(table, [frame + 2 for frame in first_frames([0, 1, 1])])
+    known, logged = policy(batch, reduction="none")
+    held_out = torch.full((len(known),), -1)
+    monkeypatch.setattr(policy.training_bank, "episode_rows", lambda _: held_out)
+    losses, _ = policy(batch, reduction="none")
+    torch.testing.assert_close(losses, known)
+    assert policy(batch)[0] == losses.mean()
+    assert int(policy.step) == 0
+    assert {"action_nll", "gripper_accuracy"} <= set(logged)
+
+
+def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
+    policy = make()
+    policy.save_pretrained(tmp_path)
+    before = copy.deepcopy(policy.feature_matching.state_dict())
+    resumed = DeltacoMatchPolicy.from_pretrained(tmp_path, dataset_meta=table.meta).train()
+    resumed.config.seed = 5
+    resumed(batch_of(table, [0]))
+    after = resumed.feature_matching.state_dict()
+    assert all(torch.equal(before[name], value) for name, value in after.items())
+    assert resumed.config.known_words == ["blue", "left", "move", "object", "red", "right", "the"]
+
+
+def test_feature_matching_takes_images_of_any_size(table):
+    for size in (16, 19):
+        policy, _, _ = small_policy(table, "deltaco_match", image_size=size)
+        policy(batch_of(table, [0]))
+        found = found_in(policy.eval(), batch_of(table, [0, 0]), [RED, ""], [[0], [2]])
+        assert found.locations.isfinite().all()
+        assert found.locations.abs().max() <= 1
+
+
+def test_actions_that_cannot_be_carried_out_are_errors(make, table):
+    policy, scene = make().eval(), batch_of(table, [0])
+    assert found_in(policy, scene, [RED], [[0]]) is not None
+    unknown = {**scene, OBS_STATE: torch.full_like(scene[OBS_STATE], torch.nan)}
+    with pytest.raises(FloatingPointError, match=r"`observation\.state` has numbers that are not finite"):
+        policy.select_action(unknown)
+    with torch.no_grad():
+        for weights in policy.parameters():
+            weights.mul_(1e30)
+    with pytest.raises(FloatingPointError, match="the weights of the checkpoint are damaged"):
+        found_in(policy, scene, [RED], [[0]])
+
+
+def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):
+    stats = {OBS_STATE: {"std": np.array([0.5, 0.2, 1e-5, 0.3])}}
+    limits = StateLimits(4, stats)
+    assert "In the training data, dimension 2 of the robot's state hardly moves" in caplog.text
+    # Divided by 3 % of the median, 0.2, and clipped.
+    limited = limits(torch.tensor([1.0, -9.0, 300.0, 0.0]))
+    torch.testing.assert_close(limited, torch.tensor([1.0, -5.0, 0.5, 0.0]))
+    noise = limits.add_noise(torch.zeros(5000, 4), 0.1, torch.Generator().manual_seed(0))
+    assert (noise == 0).float().mean() == pytest.approx(0.5, abs=0.02)
+    assert (noise / 0.5**0.5).std(dim=0).tolist() == pytest.approx([0.1, 0.1, 1.0, 0.1], rel=0.1)
+    assert StateLimits(3, None)(torch.ones(3)).tolist() == [1, 1, 1]
+
+
+def test_what_is_left_out_does_not_matter(make, table):
+    policy = make().eval()
+    scene = batch_of(table, [0])
+
+    def found(instruction, *episodes):
+        return found_in(policy, scene, [instruction], [list(episodes)])
+
+    both, by_demonstration, by_instruction = found(RED, 0), found("", 0), found(RED)
+    assert both.by_demonstration == (True, False)
+    assert by_demonstration.by_demonstration == (True, True)
+    assert by_instruction.by_demonstration == (False, False)
+    assert by_instruction.attention is None
+    # With both, the demonstration alone says what to pick, and the instruction alone where to place it.
+    torch.testing.assert_close(both.maps[:, 1], found(RED, 1).maps[:, 1])
+    assert not torch.equal(both.maps[:, 0], found(RED, 1).maps[:, 0])
+    assert not torch.equal(both.maps[:, 1], found(BLUE, 0).maps[:, 1])
+    # But not everything can be left out, nor from some samples alone.
+    with pytest.raises(ValueError, match="Neither a demonstration nor an instruction is given"):
+        found("")
+    with pytest.raises(ValueError, match=r"as many demonstrations each. Got \[0, 1\]"):
+        found_in(policy, batch_of(table, [0, 0]), ["", ""], [[0], []])
+
+
+def test_several_demonstrations_are_combined(make, table):
+    policy = make(n_demonstrations=2).eval()
+    scene = batch_of(table, [0])
+    one, other, both = (found_in(policy, scene, [RED], [episodes]) for episodes in ([0], [2], [0, 2]))
+    for single in (one, other):
+        assert not torch.equal(both.maps[:, 0], single.maps[:, 0])
+        torch.testing.assert_close(both.maps[:, 1], single.maps[:, 1])
+    # Without `set_tasks`, the bank gives as many.
+    policy.reset()
+    policy.select_action(scene | {"task": [RED]})
+    torch.testing.assert_close(policy.found.maps, both.maps)
+
+
+def test_height_bias_is_added_when_acting(make, table):
+    policies = [make(grasp_height_bias=bias).eval() for bias in (0.0, 0.5)]
+    heights = [found_in(policy, batch_of(table, [0]), [RED], [[0]]).heights for policy in policies]
+    torch.testing.assert_close(heights[1], heights[0] + 0.5)
+
+
+def test_demonstrations_of_another_robot_and_a_missing_gripper_are_errors(table, dataset, tmp_path):
+    other = write_table(tmp_path / "other", MOVES[:2], n_joints=5)
+    with pytest.raises(ValueError, match="of another robot: their states and actions have 5 and 3 numbers"):
+        small_policy(table, "deltaco_match", **demos_of(other))
+    with pytest.raises(ValueError, match="have no camera 'observation.image', only observation.images.top"):
+        small_policy(table, "deltaco_match", **demos_of(dataset))
+    with pytest.raises(ValueError, match=r"needs the feature 'observation.state' and a gripper"):
+        small_policy(table, "deltaco_match", gripper="none")
+
+
+@pytest.mark.parametrize("tremble", [0, 0.1])
+def test_a_demonstration_may_be_given_by_hand_while_the_arm_rests(tremble, table, tmp_path, caplog):
+    task, start, other, end = MOVES[0]
+    frames = [
+        {
+            "observation.image": draw_table(task, start if step < 6 else end, other),
+            "observation.state": state_at(np.zeros(2)),
+            "action": np.array([0, 0, 1 - tremble * (4 <= step < 8)], np.float32),
+        }
+        for step in range(12)
+    ]
+    named = {"observation.state": list("abc"), "action": ["a", "b", "gripper"]}
+    demos = write_episodes(tmp_path / "demos", "test/hand", [(task, frames)], **named)
+    policy, before, _ = small_policy(table, "deltaco_match", **demos_of(demos))
+    policy._prepare_training()
+    policy.eval()
+    assert policy.demonstrations.pick_states.isnan().all()
+    assert "1 of 1 episodes have no grasp, and what they moved is found from their first" in caplog.text
+    action = policy.select_action(before(observation(table, [task])))
+    assert torch.isfinite(action).all()
+    assert policy.found.by_demonstration[0]
