@@ -5,7 +5,9 @@ import sys
 
 try:
     # These register `--env.type=deltaco`, and both policies with the steps of their processors.
-    import lerobot_deltaco.lerobot_env  # noqa: F401
+    import lerobot_deltaco.lerobot_env
+    import lerobot_deltaco.policies.deltaco.configuration_deltaco
+    import lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match  # noqa: F401
 except Exception as error:
     problem = (
         "lerobot_policy_deltaco could not be imported, so LeRobot does not know its types "

@@ -60,7 +60,12 @@ def test_lerobot_finds_the_distribution_and_its_types():
     # With hyphens in its name, it would silently not be found.
     assert PROJECT["name"] == "lerobot_policy_deltaco"
     register_third_party_plugins()
-    assert {"deltaco", "deltaco_match"} <= set(PreTrainedConfig.get_known_choices())
+    # In this process, another test may have imported them.
+    result = run_python(
+        "import lerobot_policy_deltaco; from lerobot.configs import PreTrainedConfig; "
+        "print(*PreTrainedConfig.get_known_choices())"
+    )
+    assert {"deltaco", "deltaco_match"} <= set(result.stdout.split()), result.stderr
     assert "deltaco" in EnvConfig.get_known_choices()
     assert get_policy_class("deltaco_match").name == "deltaco_match"
 
