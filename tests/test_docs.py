@@ -22,8 +22,8 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "results/README.md")),
-    ROOT / "checkpoints/pick_place/README.md",
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "NOTEBOOK.md")),
+    *(ROOT / folder / "README.md" for folder in ("results", "checkpoints/pick_place")),
     *sorted(DOCS.glob("*.md")),
 ]
 
