@@ -19,8 +19,8 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.processor import make_default_pre_post_processors
 from torch import Tensor, nn
 
-from lerobot_deltaco.data.demonstrations import read_demonstrations, read_robot_data
-from lerobot_deltaco.data.grasps import find_keyframes
+from lerobot_deltaco.data.gripper import Gripper
+from lerobot_deltaco.data.training_data import DatasetEpisodes, DemonstrationFormat, TrainingData
 
 N_WORDS, DIM = 4096, 32
 N_SCENES = 32  # of a batch's samples, on which finding is trained
@@ -108,10 +108,9 @@ class ExamplePolicy(PreTrainedPolicy):
     def forward(self, batch):
         if self.bank is None:  # once: of the training episodes, others than the sample's are demonstrations
             dataset = LeRobotDataset(self.meta.repo_id, root=self.meta.root)
-            self.bank = read_demonstrations(dataset, "observation.image", 48, 2).to(self.config.device)
-            robot = read_robot_data(dataset, range(len(self.bank)))
-            keyframes = find_keyframes(robot.states, robot.actions[:, 3], robot.spans)
-            self.targets = keyframes.states[..., HAND].to(self.config.device)
+            form = DemonstrationFormat("observation.image", 48, gripper=Gripper(3))
+            data = TrainingData.read(DatasetEpisodes(dataset), form).to(self.config.device)
+            self.bank, self.targets = data.demonstrations, data.grasps.states[..., HAND]
         generator = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
         own, tasks = batch["episode_index"][:N_SCENES], batch["task"][:N_SCENES]
         others = self.bank.draw_other_episodes(own, tasks, generator)

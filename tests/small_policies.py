@@ -216,8 +216,7 @@ class SharedFrames(FramesInMemory):
 
 def hold_in_memory(dataset, **options):
     """Lets policies that are made for a dataset get their training data from memory, which saves a second."""
-    opened = LeRobotDataset(dataset.repo_id, root=dataset.root, **options)
-    dataset.meta.frames_in_memory = SharedFrames(opened)
+    dataset.frames = SharedFrames(LeRobotDataset(dataset.repo_id, root=dataset.root, **options))
     return dataset
 
 
@@ -233,6 +232,8 @@ def small_policy(dataset, policy_type="deltaco", **options):
     """Makes a small policy and its processors, as LeRobot's training does."""
     config = make_policy_config(policy_type, **{"device": "cpu", **_SMALL[policy_type], **options})
     policy = make_policy(config, ds_meta=dataset.meta)
+    if hasattr(dataset, "frames") and config.uses_demonstrations and config.training_episodes is None:
+        policy.prepare_training(dataset.frames)
     before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
     return policy.train(), before, after
 

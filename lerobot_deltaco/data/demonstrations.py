@@ -6,35 +6,19 @@ evaluation passes them to the policy's `set_tasks`.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
-import torch.nn.functional as F  # noqa: N812
-from lerobot.datasets import LeRobotDataset
-from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_deltaco.data.reading import (
-    check_episode_numbers,
-    column,
-    episode_spans,
-    read_frame,
-    shortened,
-    source_of,
-)
-
-logger = logging.getLogger(__name__)
+from lerobot_deltaco.data.reading import shortened
 
 # Frames of an episode that are kept, evenly spaced, if a demonstration has more than its two ends.
 N_KEPT_FRAMES = 16
-# Index of the object that an episode moves, in datasets of the benchmark.
-TARGET_OBJECT = "benchmark.target_object"
-_RESIZED_AT_A_TIME = 256
+_IMAGES_AT_A_TIME = 256  # with a progress bar
 
 
 @dataclass(frozen=True)
@@ -79,10 +63,10 @@ class DemonstrationBank(torch.nn.Module):
         target_objects: Index of the object that each episode moves; None if the dataset does not say.
         first_images: First frames at the camera's own resolution, (episodes, 3, H', W') uint8; None if that
             is the resolution of `frames`.
-
-    Attributes:
         pick_states: The robot's state when its gripper closed, as in the dataset, (episodes, state) float32;
             NaN where it did not. None unless the policy needs them.
+
+    Attributes:
         features: Features of each by a frozen image encoder, (episodes, variants, features) float16; None
             unless the policy needs them.
     """
@@ -106,6 +90,7 @@ class DemonstrationBank(torch.nn.Module):
         episodes: Sequence[int],
         target_objects: Sequence[int] | None = None,
         first_images: Tensor | None = None,
+        pick_states: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.tasks = list(tasks)
@@ -124,7 +109,7 @@ class DemonstrationBank(torch.nn.Module):
             ("frames", frames),
             ("episodes", torch.as_tensor(episodes)),
             ("first_images", first_images),
-            ("pick_states", None),
+            ("pick_states", pick_states),
             ("features", None),
             ("_members", torch.nn.utils.rnn.pad_sequence(members, batch_first=True)),
             ("_count", torch.tensor([len(rows) for rows in members])),
@@ -232,7 +217,7 @@ class DemonstrationBank(torch.nn.Module):
             if tasks[sample] not in self.rows:
                 raise ValueError(
                     f"The task {tasks[sample]!r} has no episode among those that demonstrations are drawn "
-                    "from. Hold back fewer of its episodes, or name some in `demo_episodes`."
+                    "from. Hold back fewer of its episodes."
                 )
             rows[sample] = self.rows[tasks[sample]][0]
         return torch.tensor(rows, device=wanted.device)
@@ -277,80 +262,20 @@ class RobotData(NamedTuple):
     spans: list[tuple[int, int]]
     images: Callable[[list[int]], Tensor] | None = None
 
-    def images_at(self, frames: Sequence[int], size: int) -> Tensor:
-        """Returns the images of some frames, resized, (n, 3, size, size) uint8."""
+    def images_at(self, frames: Sequence[int]) -> Tensor:
+        """Returns the images of some frames, (n, 3, H, W) uint8."""
         assert self.images is not None
         found = []
         with tqdm(total=len(frames), desc="Reading images", unit="image", leave=False) as progress:
-            for n in range(0, len(frames), _RESIZED_AT_A_TIME):
-                some = list(frames[n : n + _RESIZED_AT_A_TIME])
-                found.append(resize_images(self.images(some), size))
+            for n in range(0, len(frames), _IMAGES_AT_A_TIME):
+                some = list(frames[n : n + _IMAGES_AT_A_TIME])
+                found.append(self.images(some))
                 progress.update(len(some))
         return torch.cat(found)
 
-
-def read_demonstrations(
-    dataset: LeRobotDataset,
-    camera: str,
-    image_size: int,
-    n_frames: int,
-    episodes: Sequence[int] | None = None,
-) -> DemonstrationBank:
-    """Reads the demonstrations of a LeRobotDataset.
-
-    Args:
-        dataset: The dataset.
-        camera: Key of the images, such as "observation.image".
-        image_size: Height and width to which images are scaled, px.
-        n_frames: Number of frames per demonstration; for more than 2, `N_KEPT_FRAMES` are kept.
-        episodes: Episodes to read; None for all.
-
-    Raises:
-        ValueError: The dataset has no such camera or episode.
-    """
-    meta, repo_id = dataset.meta, dataset.repo_id
-    camera = source_of(camera, meta.camera_keys)
-    if camera not in meta.camera_keys:
-        raise ValueError(
-            f"The demonstrations in {repo_id} have no camera {camera!r}, only {', '.join(meta.camera_keys)}. "
-            "If it has another name there, pass --rename_map."
-        )
-    episodes = list(range(meta.total_episodes)) if episodes is None else list(episodes)
-    check_episode_numbers(repo_id, meta.total_episodes, episodes)
-    spans = episode_spans(dataset)
-    frames, tasks, target_objects, first_images = [], [], [], []
-    for episode in tqdm(episodes, desc="Reading demonstrations", unit="episode", leave=False):
-        items = [read_frame(dataset, row, camera) for row in kept_frames(*spans[episode], n_frames).tolist()]
-        if TARGET_OBJECT in items[0]:
-            target_objects.append(int(items[0][TARGET_OBJECT]))
-        images = as_uint8(torch.stack([item[camera] for item in items]))
-        frames.append(resize_images(images, image_size))
-        first_images.append(images[0])
-        tasks.append(items[0]["task"])
-    native = torch.stack(first_images) if first_images[0].shape != frames[0][0].shape else None
-    return DemonstrationBank(torch.stack(frames), tasks, episodes, target_objects or None, native)
-
-
-def read_robot_data(dataset: LeRobotDataset, episodes: Sequence[int], camera: str | None = None) -> RobotData:
-    """Reads the states and actions of episodes of a LeRobotDataset.
-
-    Args:
-        dataset: The dataset.
-        episodes: Indices of the episodes.
-        camera: Key of the images that can be read later; None for none.
-    """
-    states, actions = (
-        torch.from_numpy(column(dataset, source_of(name, dataset.hf_dataset.column_names)).astype(np.float32))
-        for name in (OBS_STATE, ACTION)
-    )
-    spans, images = episode_spans(dataset), None
-    if camera is not None:
-        name = source_of(camera, dataset.meta.camera_keys)
-
-        def images(rows: list[int]) -> Tensor:
-            return as_uint8(torch.stack([read_frame(dataset, row, name)[name] for row in rows]))
-
-    return RobotData(states, actions, [spans[episode] for episode in episodes], images)
+    def to(self, device: torch.device) -> RobotData:
+        """Returns the states and actions on a device."""
+        return self._replace(states=self.states.to(device), actions=self.actions.to(device))
 
 
 def kept_frames(first: int, last: int, n_frames: int) -> Tensor:
@@ -364,22 +289,3 @@ def kept_frames(first: int, last: int, n_frames: int) -> Tensor:
     n_kept = 2 if n_frames == 2 else max(N_KEPT_FRAMES, n_frames)
     # In double precision, which holds every index of a large dataset.
     return torch.linspace(first, last, n_kept, dtype=torch.float64).round().long()
-
-
-def as_uint8(images: Tensor) -> Tensor:
-    """Returns images, uint8 or in 0..1, as uint8."""
-    return images if images.dtype == torch.uint8 else (images * 255).round().clamp(0, 255).to(torch.uint8)
-
-
-def resize_images(images: Tensor, size: int) -> Tensor:
-    """Resizes images (..., 3, H, W), uint8 or in 0..1, to (..., 3, size, size) uint8."""
-    images = as_uint8(images)
-    if images.shape[-2:] == (size, size):
-        return images
-    flat = images.flatten(0, -4)
-    # A few at a time, since they are floats meanwhile.
-    resized = [
-        F.interpolate(part.float(), (size, size), mode="bilinear", antialias=True).round().clamp(0, 255)
-        for part in flat.split(_RESIZED_AT_A_TIME)
-    ]
-    return torch.cat([part.to(torch.uint8) for part in resized]).view(*images.shape[:-2], size, size)

@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
-import io
-import os
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import psutil
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.feature_utils import get_delta_indices
-from lerobot.utils.constants import ACTION, OBS_STATE
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
-from torch.utils.data._utils.collate import default_collate_fn_map
-from torchvision.io import ImageReadMode, decode_image
 from tqdm import tqdm
 
-from lerobot_deltaco.data.demonstrations import (
-    TARGET_OBJECT,
-    DemonstrationBank,
-    RobotData,
-    as_uint8,
-    kept_frames,
-    resize_images,
-)
+from lerobot_deltaco.data.images import read_images, resize_images
 from lerobot_deltaco.data.reading import (
     check_dataset,
     column,
-    decoding,
     episode_spans,
-    frame_name,
-    read_frame,
-    source_of,
 )
 
-# Number of rows decoded at a time, and number of these that a thread takes at a time.
-_CHUNK, _PART = 1024, 32
+_CHUNK = 1024  # rows decoded at a time
 _MEMORY_FRACTION = 0.8  # of the free memory, that frames may take
 
 
@@ -50,24 +29,31 @@ class FramesInMemory(torch.utils.data.Dataset):
     """All frames that a dataset has selected, by their index in it.
 
     It replaces the dataset in LeRobot's training loop. A batch equals that of LeRobot's data loader,
-    including the windows of frames that `delta_timestamps` ask for.
+    including the windows of frames that `delta_timestamps` ask for. For a policy, it is `Episodes`.
 
     Args:
         dataset: The dataset; its `episodes` are kept in memory.
         image_size: Height and width to which images are scaled; None for their own.
+        rename_map: A policy's names of features, by the dataset's names.
 
     Raises:
         MemoryError: The frames do not fit into the memory of this machine.
         ValueError: The dataset transforms images when they are read.
     """
 
-    def __init__(self, dataset: LeRobotDataset, image_size: int | None = None) -> None:
+    def __init__(
+        self,
+        dataset: LeRobotDataset,
+        image_size: int | None = None,
+        rename_map: Mapping[str, str] | None = None,
+    ) -> None:
         if dataset.image_transforms is not None:
             raise ValueError(
                 "Frames in memory are decoded once and cannot be transformed at random each time. Leave out "
                 "--dataset.image_transforms, or train with `lerobot-train`."
             )
         self._dataset = dataset
+        self._names = {new: old for old, new in (rename_map or {}).items()}
         memory_for_frames(dataset, image_size)
         check_dataset(dataset)
         cameras = dataset.meta.camera_keys
@@ -85,7 +71,8 @@ class FramesInMemory(torch.utils.data.Dataset):
         self.tasks: NDArray[np.int64] = self.columns["task_index"].reshape(-1).numpy()
         self.spans = episode_spans(dataset)
         first, last = np.array(list(self.spans.values())).T
-        # First images of the episodes at their own resolution, where the others are scaled.
+        # First images of the episodes at their own resolution, where the others are scaled, and their places.
+        self._first_rows = {row: n for n, row in enumerate(first.tolist())}
         self._first_images: dict[str, Tensor] = {}
         for camera in cameras:
             native: list[Tensor] = []
@@ -113,11 +100,9 @@ class FramesInMemory(torch.utils.data.Dataset):
     def __len__(self) -> int:
         return len(self.tasks)
 
-    def __getitem__(self, index: int) -> _Frame:
-        return _Frame(self, index)
-
-    def __getitems__(self, indices: Sequence[int]) -> list[_Frame]:
-        return [_Frame(self, index) for index in indices]
+    def __getitem__(self, index: int) -> int:
+        """Returns the index: LeRobot's data loader carries indices, of which `batch` makes batches."""
+        return index
 
     def __getattr__(self, name: str) -> Any:
         # LeRobot's loop asks for the metadata, the episodes and the number of frames.
@@ -154,48 +139,32 @@ class FramesInMemory(torch.utils.data.Dataset):
         found["task"] = [self.task_names[task] for task in self.tasks[rows.numpy()]]
         return found
 
-    def demonstrations(self, camera: str, image_size: int, n_frames: int) -> DemonstrationBank:
-        """Returns all episodes as demonstrations.
+    # As `Episodes` of a policy
 
-        Args:
-            camera: Key of the images.
-            image_size: Height and width to which they are scaled, px.
-            n_frames: Number of frames of a demonstration.
-        """
-        camera = source_of(camera, list(self.columns))
-        rows = torch.stack([kept_frames(*span, n_frames) for span in self.spans.values()])
-        images = resize_images(self.columns[camera][rows], image_size)  # (episodes, kept, 3, S, S)
-        tasks = [self.task_names[self.tasks[first]] for first, _ in self.spans.values()]
-        objects = None
-        if TARGET_OBJECT in self.columns:
-            objects = self.columns[TARGET_OBJECT].reshape(-1)[rows[:, 0]].tolist()
-        native = self._first_images.get(camera)
-        if native is None and self.columns[camera].shape[-2:] != images.shape[-2:]:
-            native = self.columns[camera][rows[:, 0]]
-        return DemonstrationBank(images, tasks, list(self.spans), objects, native)
+    def episode_tasks(self) -> list[str]:
+        """Returns the task string of each episode."""
+        return [self.task_names[self.tasks[first]] for first, _ in self.spans.values()]
 
-    def robot_data(self, camera: str) -> RobotData | None:
-        """Returns the robot's states and actions, and a camera's images; None without states."""
-        names = [source_of(name, list(self.columns)) for name in (OBS_STATE, ACTION, camera)]
-        if names[0] not in self.columns:
-            return None
-        states, actions, images = (self.columns[name] for name in names)
-        return RobotData(states, actions, list(self.spans.values()), lambda rows: images[rows])
+    def values(self, feature: str) -> Tensor | None:
+        """Returns the numbers of a feature in all rows, (rows, ...); None without that feature."""
+        return self.columns.get(self._source(feature))
 
+    def images(self, camera: str, rows: Sequence[int], size: int | None) -> Tensor:
+        """Returns images of a camera, (images, 3, H, W) uint8. See `Episodes.images`."""
+        name = self._source(camera)
+        if name not in self.meta.camera_keys:
+            raise ValueError(
+                f"{self.repo_id} has no camera {camera!r}, only {', '.join(self.meta.camera_keys)}. If it "
+                "has another name there, pass --rename_map."
+            )
+        if size is None and name in self._first_images:
+            return self._first_images[name][[self._first_rows[row] for row in rows]]
+        images = self.columns[name][torch.as_tensor(rows)]
+        return images if size is None else resize_images(images, size)
 
-@dataclass
-class _Frame:
-    """A frame that is gathered with the others of its batch when the data loader collates them."""
-
-    frames: FramesInMemory
-    index: int
-
-
-def _collate(batch: Sequence[_Frame], *, collate_fn_map: Any = None) -> dict[str, Any]:
-    return batch[0].frames.batch([frame.index for frame in batch])
-
-
-default_collate_fn_map[_Frame] = _collate
+    def _source(self, feature: str) -> str:
+        """Returns the dataset's name of a policy's feature."""
+        return feature if feature in self.columns else self._names.get(feature, feature)
 
 
 def memory_for_frames(dataset: LeRobotDataset, image_size: int | None) -> int:
@@ -234,16 +203,12 @@ def _camera_images(
         first: Rows of the first images of episodes.
         native: If images are scaled, gets those of `first` at their own resolution.
     """
-    read = _stored_images if dataset.meta.features[camera]["dtype"] == "image" else _video_images
     n_frames = dataset.num_frames
     images: Tensor | None = None
-    with (
-        ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads,
-        tqdm(total=n_frames, desc=f"Decoding {camera}", unit="frame") as progress,
-    ):
+    with tqdm(total=n_frames, desc=f"Decoding {camera}", unit="frame") as progress:
         for start in range(0, n_frames, _CHUNK):
             rows = range(start, min(start + _CHUNK, n_frames))
-            chunk = read(dataset, camera, rows, threads)
+            chunk = read_images(dataset, camera, rows)
             if image_size is not None and chunk.shape[-2:] != (image_size, image_size):
                 native.extend(chunk[row - start].clone() for row in rows if row in first)
                 chunk = resize_images(chunk, image_size)
@@ -253,41 +218,3 @@ def _camera_images(
             progress.update(len(chunk))
     assert images is not None
     return images
-
-
-def _stored_images(dataset: LeRobotDataset, camera: str, rows: range, threads: ThreadPoolExecutor) -> Tensor:
-    """Decodes the stored files of an `image` feature, (rows, 3, H, W) uint8."""
-    files = dataset.hf_dataset.with_format("arrow")[rows.start : rows.stop][camera].to_pylist()
-    shape = dataset.meta.features[camera]["shape"]
-
-    def decode(row: int) -> Tensor:
-        with decoding(dataset, row, camera):
-            image = _decoded(files[row - rows.start]["bytes"])
-        if sorted((*image.shape[1:], min(shape))) != sorted(shape):
-            raise ValueError(
-                f"The image {camera} in {frame_name(dataset, row)} has {image.shape[2]} x {image.shape[1]} "
-                f"pixels, but by meta/info.json the shape is {shape}. Record the episode again, or leave it "
-                "out with --dataset.episodes."
-            )
-        return image
-
-    parts = [rows[first : first + _PART] for first in range(0, len(rows), _PART)]
-    return torch.cat(list(threads.map(lambda part: torch.stack([decode(row) for row in part]), parts)))
-
-
-def _decoded(file: bytes) -> Tensor:
-    """Decodes an image, (3, H, W) uint8."""
-    try:
-        # Unlike Pillow's, this decoder releases the interpreter lock; it supports fewer formats.
-        image = decode_image(torch.frombuffer(bytearray(file), dtype=torch.uint8), ImageReadMode.RGB)
-    except RuntimeError:
-        image = None
-    if image is not None and image.dtype == torch.uint8:
-        return image
-    return torch.from_numpy(np.array(Image.open(io.BytesIO(file)).convert("RGB"))).permute(2, 0, 1)
-
-
-def _video_images(dataset: LeRobotDataset, camera: str, rows: range, _: ThreadPoolExecutor) -> Tensor:
-    """Reads images of a `video` feature, (rows, 3, H, W) uint8; threads must not share its decoder."""
-    with patch.object(dataset.reader, "delta_indices", None):  # single frames instead of windows
-        return torch.stack([as_uint8(read_frame(dataset, row, camera)[camera]) for row in rows])

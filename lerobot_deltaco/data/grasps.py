@@ -70,6 +70,16 @@ class Keyframes(NamedTuple):
     has_grasp: Tensor
     missing: tuple[str | None, ...]
 
+    def to(self, device: torch.device) -> Keyframes:
+        """Returns the keyframes on a device."""
+        return Keyframes(
+            self.states.to(device),
+            self.approach.to(device),
+            self.carried.to(device),
+            self.has_grasp.to(device),
+            self.missing,
+        )
+
     @property
     def pick_states(self) -> Tensor:
         """The states in which the gripper has closed, (episodes, state); NaN where there are none."""

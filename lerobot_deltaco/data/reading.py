@@ -7,7 +7,6 @@ have a table of episodes, statistics or tasks that do not belong to the frames.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,9 +14,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import yaml
 from huggingface_hub import constants
-from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from numpy.typing import NDArray
@@ -124,7 +121,7 @@ def check_episode_numbers(repo_id: str, total: int, episodes: Sequence[int]) -> 
     if not len(episodes) or not all(0 <= episode < total for episode in episodes):
         raise ValueError(
             f"{repo_id} has the episodes 0 to {total - 1}. Got {shortened(episodes)}. Name others in "
-            "`demo_episodes` or --dataset.episodes."
+            "--dataset.episodes or `training_episodes`."
         )
 
 
@@ -132,47 +129,6 @@ def shortened(numbers: Sequence[int], n_shown: int = 10) -> str:
     """Returns the first of some numbers as text."""
     text = ", ".join(map(str, numbers[:n_shown]))
     return f"{text}, ..." if len(numbers) > n_shown else text or "none"
-
-
-def training_argument(name: str) -> Any:
-    """Returns an argument of the running `lerobot-train`, such as "dataset.episodes"; None if it has none.
-
-    LeRobot tells a policy neither of the episodes that it is trained on, nor how features are renamed.
-    """
-    given, path = parser.parse_arg(name), parser.parse_arg("config_path")
-    if given is not None:
-        return yaml.safe_load(given)
-    value = yaml.safe_load(Path(path).read_text()) if path and Path(path).is_file() else {}
-    for part in name.split("."):
-        value = value.get(part) if isinstance(value, dict) else None
-    return value
-
-
-def episodes_trained_on(meta: LeRobotDatasetMetadata) -> list[int]:
-    """Returns the episodes of the dataset that the running `lerobot-train` trains on.
-
-    These are --dataset.episodes without those of --dataset.eval_split, which are the last ones of each task.
-
-    Raises:
-        ValueError: There is no such episode.
-    """
-    chosen = list(dict.fromkeys(training_argument("dataset.episodes") or range(meta.total_episodes)))
-    check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
-    eval_split = training_argument("dataset.eval_split")
-    if not eval_split:
-        return chosen
-    # As LeRobot's `make_train_eval_datasets`, which does not tell.
-    of_task: dict[str, list[int]] = {}
-    for episode, tasks in zip(chosen, meta.episodes.select(chosen)["tasks"], strict=True):
-        of_task.setdefault(next(iter(tasks), ""), []).append(episode)
-    held_out = {n for own in of_task.values() for n in own[len(own) - math.ceil(len(own) * eval_split) :]}
-    return [episode for episode in chosen if episode not in held_out]
-
-
-def source_of(feature: str, available: Sequence[str]) -> str:
-    """Returns the name that a policy's feature has in a dataset, before --rename_map."""
-    renamed = {new: old for old, new in (training_argument("rename_map") or {}).items()}
-    return feature if feature in available else renamed.get(feature, feature)
 
 
 # Frames

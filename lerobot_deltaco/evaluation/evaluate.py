@@ -114,7 +114,8 @@ class Evaluation:
             infos = run_episodes(
                 self.loaded, self._envs, batch, demonstrations, joint_noise=self.plan.joint_noise
             )
-        p_pick = self.loaded.policy.p_pick if isinstance(self.loaded.policy, TaskConditionedPolicy) else None
+        policy = self.loaded.policy
+        p_pick = policy.pick_confidence if isinstance(policy, TaskConditionedPolicy) else None
         p_picks = [math.nan] * len(batch) if p_pick is None else p_pick.tolist()
         rows = []
         for episode, info, given, p_pick in zip(batch, infos, demonstrations, p_picks, strict=True):

@@ -16,7 +16,8 @@ from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.layout import Layout
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import Task
-from lerobot_deltaco.data.demonstrations import Demonstration, kept_frames, resize_images
+from lerobot_deltaco.data.demonstrations import Demonstration, kept_frames
+from lerobot_deltaco.data.images import resize_images
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy, find_checkpoints, load_policy
 from lerobot_deltaco.evaluation.episodes import Episode
 from lerobot_deltaco.evaluation.evaluate import run_episodes
@@ -24,7 +25,7 @@ from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstratio
 from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import Found
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
 
 
 class Recording(NamedTuple):
@@ -41,7 +42,7 @@ class Recording(NamedTuple):
 
     frames: list[NDArray[np.uint8]]
     observed: NDArray[np.uint8]
-    found: Found | None
+    found: PickPlace | None
     info: dict[str, Any]
     layout: Layout
     placed: frozenset[tuple[int, int]]
@@ -83,7 +84,7 @@ def record_episode(
     with torch.inference_mode():
         (info,) = run_episodes(loaded, [env], [episode], [demonstrations], record)
     in_containers = frozenset(pair for pair in placed if pair[1] >= 0)
-    found = getattr(loaded.policy, "found", None)
+    found = getattr(loaded.policy, "localization", None)
     return Recording(frames, first["observed"], found, info, first["layout"], in_containers)
 
 

@@ -27,17 +27,13 @@ from tqdm import tqdm
 
 from gym_deltaco.atomic_files import write_text
 from lerobot_deltaco.arguments import CheckArguments
-from lerobot_deltaco.data.demonstrations import (
-    DemonstrationBank,
-    as_uint8,
-    read_demonstrations,
-    read_robot_data,
-    resize_images,
-)
+from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.data.frames import memory_for_frames
 from lerobot_deltaco.data.grasps import Grasp, find_grasps, follows_gripper
+from lerobot_deltaco.data.images import as_uint8, resize_images
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import open_folder_or_hub
+from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
 from lerobot_deltaco.pages.html import picture_uri, render
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.policies.base.configuration import dimension_names
@@ -90,13 +86,14 @@ class TrainingStart:
         size = image_size_in_memory(dataset, config)
         self.bytes = memory_for_frames(dataset, size)
         self.policy = make_policy(config, ds_meta=dataset.meta).train()
-        self.policy.feature_matching.fitted.fill_(True)  # the fit takes minutes, and is left out
-        data = read_robot_data(dataset, range(dataset.meta.total_episodes), config.cameras[0])
-        opening = config.gripper_opening(data.actions)
-        self.grasps = find_grasps(opening, data.spans)
-        self.gripper_states = follows_gripper(data.states, opening, data.spans).nonzero().flatten().tolist()
-        self.bank = read_demonstrations(dataset, config.cameras[0], config.image_size, config.n_demo_frames)
-        self.policy.set_training_data(self.bank, data)
+        data = TrainingData.read(DatasetEpisodes(dataset), config.demonstration_format)
+        self.bank, robot, command = data.demonstrations, data.robot, config.gripper_command
+        assert robot is not None
+        assert command is not None
+        opening = command.opening(robot.actions)
+        self.grasps = find_grasps(opening, robot.spans, command.usual_range)
+        self.gripper_states = follows_gripper(robot.states, opening, robot.spans).nonzero().flatten().tolist()
+        self.policy.fit_locations(data.to(self.policy.step.device))
         with_grasp = zip(self.bank.tasks, self.grasps, strict=True)
         feature_matching._Pairs([task for task, grasp in with_grasp if isinstance(grasp, Grasp)])
 
@@ -299,7 +296,9 @@ def _facts(
         unit = "-1..1, or meters" if greatest <= 1 else unit
         facts.append(("units", f"{feature}: from {low:.4g} to {high:.4g}, so probably {unit}"))
     if OBS_STATE in meta.features:
-        paused = paused_frames(read_robot_data(dataset, range(meta.total_episodes)), dataset.fps)
+        robot = read_robot_data(DatasetEpisodes(dataset), config.demonstration_format)
+        assert robot is not None
+        paused = paused_frames(robot, dataset.fps)
         facts.append(("pauses", f"the robot stands still in {100 * paused.mean():.0f} % of the frames"))
     return facts
 

@@ -15,8 +15,10 @@ from gym_deltaco.atomic_files import write_text
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.arguments import LookArguments
-from lerobot_deltaco.data.demonstrations import as_uint8, read_demonstrations, read_robot_data
+from lerobot_deltaco.data.grasps import find_keyframes
+from lerobot_deltaco.data.images import as_uint8
 from lerobot_deltaco.data.reading import open_folder_or_hub
+from lerobot_deltaco.data.training_data import DatasetEpisodes, read_demonstrations, read_robot_data
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import (
     benchmark_env,
@@ -34,7 +36,7 @@ from lerobot_deltaco.pages.pictures import (
     encode_video,
 )
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, Found
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, PickPlace
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -122,17 +124,18 @@ def _dataset_views(
     policy, config, meta = loaded.policy, loaded.policy.config, dataset.meta
     _check_features(config, dataset)
     tasks = [names[0] for names in meta.episodes["tasks"]]
-    data = read_robot_data(dataset, range(len(tasks)))
-    keyframes = policy.keyframes_of(data)
+    episodes, form = DatasetEpisodes(dataset), config.demonstration_format
+    data = read_robot_data(episodes, form)
+    assert data is not None
+    assert form.gripper is not None
+    opening = form.gripper.opening(data.actions)
+    keyframes = find_keyframes(data.states, opening, data.spans, form.gripper.usual_range)
     chosen = _spread(len(tasks), n_episodes)
     partners = {episode: _partner(tasks, episode) for episode in chosen}
     bank = None
     if config.uses_demonstrations:
         needed = sorted(set(partners.values()))
-        bank = read_demonstrations(
-            dataset, config.cameras[0], config.image_size, config.n_demo_frames, needed
-        )
-        bank.pick_states = keyframes.pick_states[needed]
+        bank = read_demonstrations(DatasetEpisodes(dataset, needed), form)
     for episode in chosen:
         shown = [] if bank is None else [bank.of_episode(partners[episode])]
         item = dataset[data.spans[episode][0]]
@@ -142,7 +145,7 @@ def _dataset_views(
         policy.set_tasks([tasks[episode]], [shown])
         with torch.inference_mode():
             policy.select_action(loaded.preprocessor({**observation, "task": tasks[episode]}))
-        found: Found = policy.found
+        found: PickPlace = policy.localization
         recorded, right, text = None, (None, None), "no grasp is recorded"
         if bool(keyframes.has_grasp[episode]):
             states = keyframes.states[episode].to(config.device)
@@ -179,13 +182,13 @@ def _image(dataset: LeRobotDataset, row: int, camera: str) -> NDArray[np.uint8]:
     return as_uint8(dataset[row][camera]).permute(1, 2, 0).numpy()
 
 
-def _how_sure(policy: DeltacoMatchPolicy, instruction: str, found: Found) -> str:
+def _how_sure(policy: DeltacoMatchPolicy, instruction: str, found: PickPlace) -> str:
     """Returns how sure a policy is of what to pick, and which words count, as the end of a sentence."""
     words = [
         word if word == meant else f"{word}, understood as {meant}"
         for word, meant in policy.feature_matching.understood(instruction)
     ]
-    return f"; {100 * found.p_pick[0]:.0f} % sure; words for the object: {', '.join(words) or 'none'}"
+    return f"; {100 * found.confidence[0]:.0f} % sure; words for the object: {', '.join(words) or 'none'}"
 
 
 def _check_features(config: TaskConditionedConfig, dataset: LeRobotDataset) -> None:

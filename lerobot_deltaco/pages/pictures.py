@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lerobot_deltaco.data.demonstrations import Demonstration
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import Found
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
 
 # No object and no container of the benchmark has these colors. They differ in lightness, so that they can be
 # told apart without color vision.
@@ -28,7 +28,7 @@ Color = tuple[int, int, int]
 def draw_found(
     scene: NDArray[np.uint8],
     demonstration_ends: NDArray[np.uint8] | None,
-    found: Found,
+    found: PickPlace,
     sample: int = 0,
     recorded: Tensor | None = None,
 ) -> Image.Image:

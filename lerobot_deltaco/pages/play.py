@@ -178,7 +178,7 @@ class Player:
             picture = picture_uri(draw_found(recording.frames[0], ends, recording.found))
             words = dict(self._loaded.policy.feature_matching.understood(sentence))
             read = ", ".join(f"“{typed}” as “{word}”" for typed, word in words.items() if typed != word)
-            confidence = f"The policy was {recording.found.p_pick.item():.0%} sure of the object"
+            confidence = f"The policy was {recording.found.confidence.item():.0%} sure of the object"
             confidence += f", and understood {read}." if read else "."
         demonstrated = demonstration.task if shown else ""
         grasped = recording.info["grasped_object"]

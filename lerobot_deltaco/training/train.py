@@ -1,51 +1,70 @@
 """`deltaco train`: LeRobot's own training loop, over frames in memory and batches of tasks.
 
-Two names that the loop looks up are replaced during training: the function that makes its datasets, and the
-sampler. Everything else, from the arguments to the checkpoints, is LeRobot's.
+Arguments, loop, optimizer, logging and checkpoints are LeRobot's. The dataset, the sampler and the policy are
+made here, so that the policy is given the training episodes before the first step.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
+import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
+from lerobot.datasets.factory import make_train_eval_datasets
+from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.scripts import lerobot_train
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import (
+    ACTION,
+    OBS_STATE,
+    POLICY_PREPROCESSOR_DEFAULT_NAME,
+    PRETRAINED_MODEL_DIR,
+)
 from lerobot.utils.feature_utils import dataset_to_policy_features
+from lerobot.utils.utils import cycle
 from numpy.typing import NDArray
+from safetensors.numpy import load_file
 
-from gym_deltaco import CONTROL_FPS
 from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.data.grasps import Grasp, find_grasps
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import check_dataset_folder, missing_files_named
+from lerobot_deltaco.data.training_data import read_robot_data
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig, check_image_shapes
+from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
 from lerobot_deltaco.policies.base.optimization import keep_freed_memory
+from lerobot_deltaco.training.lerobot_loop import replaced
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
+_FPS_OF_OPTION = 24  # frames per second of `frames_after_release`
 
-def train() -> None:
-    """Trains as the command line says, with the arguments of `lerobot-train`."""
+
+def train(config: TrainPipelineConfig | None = None) -> None:
+    """Trains a policy.
+
+    Args:
+        config: What `lerobot-train` would be given; None for the options on the command line.
+    """
     keep_freed_memory()
     training = _InMemoryTraining()
-    with (
-        patch.object(lerobot_train, "make_train_eval_datasets", training.make_datasets),
-        patch.object(lerobot_train, "EpisodeAwareSampler", training.make_sampler),
+    with replaced(
+        make_train_eval_datasets=training.make_datasets,
+        make_policy=training.make_policy,
+        EpisodeAwareSampler=training.make_sampler,
+        cycle=training.batches,
     ):
-        lerobot_train.main()
+        lerobot_train.main() if config is None else lerobot_train.train(config)
 
 
 class _InMemoryTraining:
-    """Replacements for LeRobot's dataset and sampler during one training run."""
+    """Replacements for what LeRobot's loop makes during one training run."""
 
     def __init__(self) -> None:
-        self._make_datasets = lerobot_train.make_train_eval_datasets
         self._config: TrainPipelineConfig | None = None
         self._frames: FramesInMemory | None = None
 
@@ -63,12 +82,26 @@ class _InMemoryTraining:
             check_dataset_folder("--policy.demo_root", policy.demo_root)
         config.num_workers = 0
         with missing_files_named(config.dataset.repo_id, config.dataset.root, config.dataset.episodes):
-            dataset, held_back = self._make_datasets(config)
+            dataset, held_back = make_train_eval_datasets(config)
+        if config.resume and config.checkpoint_path is not None:
+            check_statistics(config.checkpoint_path / PRETRAINED_MODEL_DIR, dataset.meta.stats)
         image_size = image_size_in_memory(dataset, policy)
-        self._config, self._frames = config, FramesInMemory(dataset, image_size)
-        # The policy, which gets the metadata, draws its demonstrations from these frames.
-        dataset.meta.frames_in_memory = self._frames
+        self._config, self._frames = config, FramesInMemory(dataset, image_size, config.rename_map)
         return self._frames, held_back
+
+    def make_policy(self, **options: Any) -> PreTrainedPolicy:
+        """Makes LeRobot's policy, and gives it the training episodes."""
+        assert self._frames is not None
+        policy = make_policy(**options)
+        if isinstance(policy, TaskConditionedPolicy) and policy.config.uses_demonstrations:
+            policy.prepare_training(self._frames)
+        return policy
+
+    def batches(self, indices: Iterator[torch.Tensor]) -> Iterator[dict[str, Any]]:
+        """Yields the batches of the indices that LeRobot's data loader gives, without an end."""
+        assert self._frames is not None
+        for rows in cycle(indices):
+            yield self._frames.batch(rows.cpu())
 
     def make_sampler(self, *arguments: Any, **options: Any) -> EpisodeAwareSampler | TaskBatchSampler:
         """Makes a sampler of batches of tasks if the policy wants them, else LeRobot's."""
@@ -82,7 +115,7 @@ class _InMemoryTraining:
         use = np.zeros(len(tasks), dtype=bool)
         use[stock.indices] = True
         use &= _until_release(self._frames, policy)
-        data = self._frames.robot_data(policy.cameras[0]) if policy.trim_pauses else None
+        data = read_robot_data(self._frames, policy.demonstration_format) if policy.trim_pauses else None
         if data is not None:
             paused = paused_frames(data, self._frames.fps)
             self._frames.skip(paused)
@@ -134,11 +167,11 @@ def _until_release(frames: FramesInMemory, policy: TaskConditionedConfig) -> NDA
     """Returns which frames come before the gripper's last opening in their episode, or soon after it."""
     use = np.ones(len(frames), dtype=bool)
     n_after = getattr(policy, "frames_after_release", None)
-    if n_after is None or policy.gripper_index is None:
+    if n_after is None or policy.gripper_command is None:
         return use
     spans = list(frames.spans.values())
-    gripper = policy.gripper_opening(frames.columns[ACTION])
-    n_after = round(n_after * frames.fps / CONTROL_FPS)
+    gripper = policy.gripper_command.opening(frames.columns[ACTION])
+    n_after = round(n_after * frames.fps / _FPS_OF_OPTION)
     for grasp, (_, last) in zip(find_grasps(gripper, spans), spans, strict=True):
         if isinstance(grasp, Grasp):
             use[grasp.opened + 1 + n_after : last + 1] = False
@@ -161,3 +194,25 @@ def _upsampled(pattern: str | None, task_names: Sequence[str], present: set[int]
             f"{task_names[0]!r}."
         )
     return found
+
+
+def check_statistics(checkpoint: Path, stats: Mapping[str, Mapping[str, Any]]) -> None:
+    """Checks that a training resumes on the data that it began with.
+
+    LeRobot keeps the checkpoint's processors, which would normalize other data by the old statistics.
+
+    Raises:
+        ValueError: The statistics of the dataset differ.
+    """
+    saved: dict[str, NDArray] = {}
+    for path in checkpoint.glob(f"{POLICY_PREPROCESSOR_DEFAULT_NAME}*.safetensors"):
+        saved |= load_file(path)
+    for feature in (OBS_STATE, ACTION):
+        for name, values in stats.get(feature, {}).items():
+            known = saved.get(f"{feature}.{name}")
+            if known is not None and not np.allclose(known, np.asarray(values), rtol=1e-5):
+                raise ValueError(
+                    f"The dataset is not the one that the training began with: its statistics of `{feature}` "
+                    "differ. Resume on the same data, or begin a new training from the checkpoint with "
+                    "--policy.path."
+                )

@@ -20,9 +20,9 @@ from small_policies import (
     write_dataset,
 )
 
-from lerobot_deltaco.data.demonstrations import read_demonstrations
 from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.data.reading import open_dataset
+from lerobot_deltaco.data.training_data import DatasetEpisodes, DemonstrationFormat, read_demonstrations
 from lerobot_deltaco.policies.base import language
 from lerobot_deltaco.policies.base.configuration import check_image_shapes, dimension_names
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
@@ -115,7 +115,7 @@ def test_a_cut_image_and_one_of_another_size_name_their_frame(root, row):
         FramesInMemory(dataset)
     if row == 10:  # the first of its episode
         with pytest.raises(ValueError, match=message):
-            read_demonstrations(dataset, TOP, 16, 2)
+            read_demonstrations(DatasetEpisodes(dataset), DemonstrationFormat(TOP, 16))
     # So does an image of another size.
     other = pq.read_table(root / DATA)["observation.images.wrist"].to_pylist()[0]
     change(root / DATA, TOP, put(row, other))
@@ -187,7 +187,7 @@ def test_instructions_that_the_policy_cannot_tell_apart(tmp_path, monkeypatch, c
 def banks(spy):
     """Demonstrations that policies are trained with."""
     banks = []
-    spy(TaskConditionedPolicy, "set_training_data", lambda _, bank, robot_data: banks.append(bank))
+    spy(TaskConditionedPolicy, "fit", lambda _, data: banks.append(data.demonstrations))
     return banks
 
 
@@ -197,6 +197,8 @@ def test_only_the_chosen_episodes_are_needed(root, tmp_path, banks, in_memory):
     change(root / DATA, TOP, lambda values: values.__setitem__(5, cut(values[5])))
     change(root / DATA, "action", put(7, np.nan, 1))
     options = {**DELTACO, "dataset.episodes": "[0,2,3]", "policy.demo_encoder": "attention"}
+    if not in_memory:  # LeRobot does not tell a policy
+        options["policy.training_episodes"] = options["dataset.episodes"]
     run_training(root, tmp_path / "run", options, in_memory, steps=1, save_freq=1)
     assert banks[0].episodes.tolist() == [0, 2, 3]
 
@@ -207,22 +209,21 @@ def test_held_out_episodes_are_not_demonstrations(root, tmp_path, banks, step):
     order = [*range(len(tasks))][::step]
     options = {**DELTACO, "policy.demo_encoder": "attention", "dataset.eval_split": 0.5}
     options["dataset.episodes"] = str(order)
-    run_training(root, tmp_path / "run", options, in_memory=False, steps=1, save_freq=1)
+    run_training(root, tmp_path / "run", options, steps=1, save_freq=1)
     halves = [[n for n in order if tasks[n] == task] for task in set(tasks)]
     assert set(banks[0].episodes.tolist()) == {n for half in halves for n in half[: len(half) // 2]}
 
 
-@pytest.mark.parametrize("in_memory", [True, False])
-def test_fine_tuning_honors_the_rename_map(root, tmp_path, banks, in_memory):
+def test_fine_tuning_honors_the_rename_map(root, tmp_path, banks):
     first = run_training(root, tmp_path / "first", {**DELTACO, "policy.demo_encoder": "attention"}, steps=2)
     banks.clear()
     other = write_dataset(tmp_path / "other", EPISODES, ("front", "hand")).root
     names = {"observation.images.front": TOP, "observation.images.hand": "observation.images.wrist"}
     options = {"policy.path": first / "000002" / "pretrained_model", "rename_map": json.dumps(names)}
-    options |= {"policy.demo_repo_id": "test/small", "policy.demo_root": other}
-    tuned = run_training(other, tmp_path / "tuned", options, in_memory, steps=1, save_freq=1)
+    tuned = run_training(other, tmp_path / "tuned", options, steps=1, save_freq=1)
     assert (tuned / "000001").is_dir()
-    expected = read_demonstrations(open_dataset("", "test/small", other), "observation.images.front", 48, 2)
+    form = DemonstrationFormat("observation.images.front", 48)
+    expected = read_demonstrations(DatasetEpisodes(open_dataset("", "test/small", other)), form)
     assert torch.equal(banks[0].frames, expected.frames)
 
 

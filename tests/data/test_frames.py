@@ -12,9 +12,16 @@ from PIL import Image
 from small_policies import batch_of, write_episodes
 
 from lerobot_deltaco.data import frames as frames_module
-from lerobot_deltaco.data.demonstrations import RobotData, read_demonstrations, read_robot_data
+from lerobot_deltaco.data import images as images_module
+from lerobot_deltaco.data.demonstrations import RobotData
 from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.data.pauses import paused_frames
+from lerobot_deltaco.data.training_data import (
+    DatasetEpisodes,
+    DemonstrationFormat,
+    TrainingData,
+    read_demonstrations,
+)
 
 TASKS = ["stack the cups", "pour the tea", "wave"] * 2
 LENGTH = 5
@@ -127,14 +134,15 @@ def test_videos_equal_those_of_lerobot(video_root, seconds):
 
 @pytest.mark.parametrize("n_frames", [2, 3])
 def test_demonstrations_and_robot_data_equal_those_that_are_read(root, n_frames):
-    dataset = read(root, episodes=[0, 2, 5])
-    frames = FramesInMemory(dataset)
-    found = frames.demonstrations(WRIST, 16, n_frames)
-    expected = read_demonstrations(read(root), WRIST, 16, n_frames, [0, 2, 5])
+    form = DemonstrationFormat(WRIST, 16, n_frames)
+    from_memory = TrainingData.read(FramesInMemory(read(root, episodes=[0, 2, 5]), image_size=16), form)
+    from_disk = TrainingData.read(DatasetEpisodes(read(root), [0, 2, 5]), form)
+    found, expected = from_memory.demonstrations, from_disk.demonstrations
     assert found.tasks == expected.tasks
     assert torch.equal(found.episodes, expected.episodes)
     assert torch.equal(found.frames, expected.frames)
-    robot, expected_robot = frames.robot_data(TOP), read_robot_data(read(root), [0, 2, 5], TOP)
+    assert torch.equal(found.first_images, expected.first_images)
+    robot, expected_robot = from_memory.robot, from_disk.robot
     for (first, last), (a, b) in zip(robot.spans, expected_robot.spans, strict=True):
         assert torch.equal(robot.states[first : last + 1], expected_robot.states[a : b + 1])
         assert torch.equal(robot.actions[first : last + 1], expected_robot.actions[a : b + 1])
@@ -142,7 +150,7 @@ def test_demonstrations_and_robot_data_equal_those_that_are_read(root, n_frames)
 
 
 def test_demonstrations_are_read_from_videos(video_root):
-    bank = read_demonstrations(read(video_root, video_backend="pyav"), TOP, 16, 2)
+    bank = read_demonstrations(DatasetEpisodes(read(video_root)), DemonstrationFormat(TOP, 16))
     shades = bank.frames.float().mean(dim=(2, 3, 4))
     torch.testing.assert_close(shades, torch.tensor([[0.0, 40], [60, 100]]), atol=6, rtol=0)
 
@@ -157,7 +165,7 @@ def test_any_image_format_is_decoded():
     for kind in ("PNG", "TIFF", "BMP"):
         file = io.BytesIO()
         Image.fromarray(image).save(file, kind)
-        assert torch.equal(frames_module._decoded(file.getvalue()), torch.from_numpy(image).permute(2, 0, 1))
+        assert torch.equal(images_module._decoded(file.getvalue()), torch.from_numpy(image).permute(2, 0, 1))
 
 
 def test_frames_that_do_not_fit_into_memory_are_refused(root, monkeypatch):

@@ -17,13 +17,12 @@ from small_policies import (
     write_dataset,
 )
 
-from gym_deltaco.tasks import get_task
 from lerobot_deltaco.data.demonstrations import (
     DemonstrationBank,
     kept_frames,
-    read_demonstrations,
     sample_frames,
 )
+from lerobot_deltaco.data.training_data import DatasetEpisodes, DemonstrationFormat, read_demonstrations
 from lerobot_deltaco.policies.base.language import Paraphrases
 
 pytestmark = pytest.mark.usefixtures("fake_language")
@@ -50,7 +49,7 @@ def acting(make, demos):
 
 @pytest.fixture(scope="module")
 def bank(dataset):
-    return read_demonstrations(dataset, "observation.images.top", 16, 2)
+    return read_demonstrations(DatasetEpisodes(dataset), DemonstrationFormat("observation.images.top", 16))
 
 
 def test_demonstrations_are_the_first_and_the_last_frame(bank):
@@ -74,14 +73,14 @@ def test_training_draws_another_episode_of_the_task(bank):
 
 
 def test_episode_that_is_held_back_is_demonstrated_by_any_of_its_task(make, dataset):
-    policy, before, _ = make(demo_episodes=[4, 0, 1])  # in any order
+    policy, before, _ = make(training_episodes=[4, 0, 1])  # in any order
     loss, _ = policy.eval()(before(batch_of(dataset, [2 * LENGTH, 3 * LENGTH])))
     assert torch.isfinite(loss)
-    bank, generator = policy.training_bank, torch.Generator().manual_seed(0)
+    bank, generator = policy.training_data.demonstrations, torch.Generator().manual_seed(0)
     assert bank.episode_rows(torch.arange(6)).tolist() == [1, 2, -1, -1, 0, -1]
     rows = bank.draw_other_episodes(torch.full((100,), 2), [STACK] * 100, generator)
     assert set(bank.episodes[rows].tolist()) == {0, 1}
-    with pytest.raises(ValueError, match="'wave' has no episode among .*`demo_episodes`"):
+    with pytest.raises(ValueError, match="'wave' has no episode among .*Hold back fewer"):
         policy(before(batch_of(dataset, [5 * LENGTH])))
 
 
@@ -106,9 +105,9 @@ def test_demonstrations_that_do_not_exist_are_errors(bank, dataset, tmp_path, ma
         bank.of_episode(9)
     for episodes in ([6], [-1], []):
         with pytest.raises(ValueError, match="has the episodes 0 to 5. Got "):
-            read_demonstrations(dataset, "observation.images.top", 16, 2, episodes)
+            DatasetEpisodes(dataset, episodes)
     with pytest.raises(ValueError, match="no camera 'observation.image', only observation.images.top, obs"):
-        read_demonstrations(dataset, "observation.image", 16, 2)
+        read_demonstrations(DatasetEpisodes(dataset), DemonstrationFormat("observation.image", 16))
     with pytest.raises(FileNotFoundError, match="--policy.demo_root is .*/nothing, but there is no dataset"):
         make(demo_repo_id="me/demos", demo_root=str(tmp_path / "nothing"))
 
@@ -163,9 +162,9 @@ def test_paraphrases_are_drawn_evenly():
 
 def test_training_embeds_paraphrases_of_its_tasks_alone(make, dataset, tmp_path):
     file = tmp_path / "sentences.csv"
-    file.write_text("task_id,instruction\n4,first\n4,second\n")
+    file.write_text(f"task,instruction\n{STACK},first\n{STACK},second\n{STACK},first\nother,third\n")
     policy, before, _ = make(paraphrases=str(file))
-    assert policy.paraphrases.sentences == {get_task(4).instruction: ("first",)}
+    assert policy.paraphrases.sentences[STACK] == ("first", "second")
     policy.paraphrases = Paraphrases(SENTENCES)
     losses = []
     for _ in range(2):
@@ -178,6 +177,14 @@ def test_training_embeds_paraphrases_of_its_tasks_alone(make, dataset, tmp_path)
     assert set(policy.instructions.rows) == set(embedded)
     policy.save_pretrained(tmp_path)  # keeps the templates alone
     assert type(policy).from_pretrained(tmp_path).instructions.rows.keys() <= SENTENCES.keys()
+    for text, message in (
+        ("task_id,instruction\n4,first\n", "must have the columns task and instruction"),
+        (f"task,instruction\n{STACK}\n", "line 2: expected a task and a sentence"),
+        ("task,instruction\nother,third\n", "none of the dataset's tasks, such as 'stack the cups'"),
+    ):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            make(paraphrases=str(file))
     with pytest.raises(ValueError, match=r"Cannot read the paraphrases missing\.csv"):
         make(paraphrases="missing.csv")
 
@@ -300,8 +307,9 @@ def test_missing_tasks_are_errors(acting, make, dataset):
     with pytest.raises(ValueError, match="as many lists of demonstrations as instructions. Got 0 and 1"):
         policy.set_tasks([WAVE], [])
     without, _, _ = make()
+    without.training_data = None
     with pytest.raises(ValueError, match="no demonstrations. Name a dataset of them with --policy.demo_re"):
         without.eval().select_action(seen)
     without._meta, batch = None, before(batch_of(dataset, [0]))
-    with pytest.raises(ValueError, match="needs the metadata of the dataset"):
+    with pytest.raises(ValueError, match="needs the episodes: call `prepare_training`"):
         without.train()(batch)

@@ -24,7 +24,7 @@ from lerobot_deltaco.pages import look as room
 from lerobot_deltaco.pages.html import render
 from lerobot_deltaco.pages.look import look
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_found, encode_video
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import Found
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
 
 
 def found_at(pick, place, by_demonstration=(True, True), size=24):
@@ -34,7 +34,7 @@ def found_at(pick, place, by_demonstration=(True, True), size=24):
         maps[0, n, row, column] = 20
     locations = (torch.tensor([[pick, place]]) + 0.5) / size * 2 - 1
     attention = maps.flatten(2).softmax(2).view_as(maps)
-    return Found(locations, torch.zeros(1), maps, attention, by_demonstration, torch.ones(1))
+    return PickPlace(locations, torch.zeros(1), maps, attention, by_demonstration, torch.ones(1))
 
 
 def test_maps_are_drawn_at_the_scenes_own_resolution():

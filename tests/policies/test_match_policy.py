@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import OBS_STATE
 from small_policies import (
     TABLE_LENGTH,
@@ -22,7 +23,6 @@ from small_policies import (
     write_table,
 )
 
-from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.policies.base.normalization import StateLimits
 from lerobot_deltaco.policies.deltaco_match import matching as feature_matching
 from lerobot_deltaco.policies.deltaco_match import proposals
@@ -42,7 +42,6 @@ def make(table):
     def make(**options):
         torch.manual_seed(0)
         policy, _, _ = small_policy(table, "deltaco_match", **options)
-        policy._prepare_training()
         return policy
 
     return make
@@ -55,10 +54,11 @@ def first_frames(episodes):
 def found_in(policy, scenes, instructions, demonstrations):
     """Returns what a policy finds in the first images of episodes, by episodes that demonstrate."""
     policy.reset()
-    rows = [policy.training_bank.episode_rows(torch.tensor(own)).tolist() for own in demonstrations]
-    policy.set_tasks(instructions, [[policy.training_bank[row] for row in own] for own in rows])
+    bank = policy.training_data.demonstrations
+    rows = [bank.episode_rows(torch.tensor(own)).tolist() for own in demonstrations]
+    policy.set_tasks(instructions, [[bank[row] for row in own] for own in rows])
     policy.select_action(scenes)
-    return policy.found
+    return policy.localization
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def trained(table):
         patch.setattr(proposals, "_MIN_SCENES", 16)
         patch.setattr(proposals, "_MAX_SCENES", 16)
         patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
-        patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._LOCATED_FRACTION", 1.0)
+        patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._PLACE_FRACTION", 1.0)
         patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._SHIFT_PADDING", 1)
         policy, before, _ = small_policy(table, "deltaco_match")
         optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
@@ -130,9 +130,9 @@ def test_the_policy_network_learns_from_locations_with_the_noise_that_is_set(mak
     policy, given = make(location_noise=noise), []
     acting_loss = policy._acting_loss
 
-    def seen(batch, images, locations, *args):
-        given.append(locations)
-        return acting_loss(batch, images, locations, *args)
+    def seen(batch, images, located, *args):
+        given.append(located.locations)
+        return acting_loss(batch, images, located, *args)
 
     monkeypatch.setattr(policy, "_acting_loss", seen)
     policy(batch_of(table, first_frames(range(N_EPISODES))))
@@ -140,41 +140,40 @@ def test_the_policy_network_learns_from_locations_with_the_noise_that_is_set(mak
     assert spread == pytest.approx(noise, rel=0.3)
 
 
-def test_samples_outside_of_the_demonstrations_teach_nothing(make, table):
-    policy = make()
-    bank = policy.training_bank
-    others = torch.where(bank.episodes == 0, 10_000, bank.episodes)
-    policy.training_bank = DemonstrationBank(bank.frames, bank.tasks, others)
-    losses, _ = policy(batch_of(table, first_frames([0, 1])), reduction="none")
-    assert losses[0] == 0
-    assert losses[1] > 0
+def test_a_batch_from_an_episode_that_the_policy_was_not_given_is_an_error(table):
+    policy, _, _ = small_policy(table, "deltaco_match", training_episodes=list(range(24)))
+    assert policy(batch_of(table, first_frames([0, 23])))[0] > 0
+    remedy = r"`deltaco train`, or name the training episodes in --policy.training_episodes"
+    with pytest.raises(ValueError, match=rf"Episode 24 is to be trained on, but was not .*{remedy}"):
+        policy(batch_of(table, first_frames([0, 24])))
+    assert policy.eval()(batch_of(table, first_frames([24])))[0].isfinite()
+    # A policy that read all episodes itself does not know which ones are held out.
+    policy, _, _ = small_policy(LeRobotDataset(table.repo_id, root=table.root), "deltaco_match")
+    policy(batch_of(table, first_frames([0])))
+    with pytest.raises(ValueError, match=rf"Episode 24 is held out, but was among .*{remedy}"):
+        policy.eval()(batch_of(table, first_frames([24])))
 
 
 def test_too_few_grasps_are_an_error_before_training(table):
-    policy, _, _ = small_policy(table, "deltaco_match", demo_episodes=list(range(8)))
+    policy, _, _ = small_policy(table, "deltaco_match", training_episodes=list(range(8)))
     remedy = r"Collect more, or train --policy.type=deltaco with --policy.demo_encoder=attention"
-    gripper = r"dimension 2 of the action \(gripper\), whose low values"
+    gripper = r"dimension 2 of the action, whose low values"
     with pytest.raises(ValueError, match=rf"at least 24 episodes .* Got 8\. {remedy}.* {gripper}"):
         policy(batch_of(table, [0]))
 
 
 def test_greater_values_of_the_gripper_may_mean_closed(table, caplog):
-    frames = table.meta.frames_in_memory
-    bank = frames.demonstrations("observation.image", TABLE_SIZE, 2)
-    robot = frames.robot_data("observation.image")
-    inverted = robot._replace(actions=robot.actions * torch.tensor([1, 1, -1]))
-
-    def locations(data, **options):
-        caplog.clear()
-        policy, _, _ = small_policy(table, "deltaco_match", **options)
-        policy.set_training_data(copy.deepcopy(bank), data)
-        return policy.training_locations.locations
-
-    expected = locations(robot)
-    assert torch.equal(locations(inverted, gripper_closed="high"), expected)
+    expected = small_policy(table, "deltaco_match")[0].training_locations.locations
+    inverted = copy.copy(table)
+    inverted.frames = copy.copy(table.frames)
+    inverted.frames.columns = dict(table.frames.columns)
+    inverted.frames.columns["action"] = table.frames.columns["action"] * torch.tensor([1, 1, -1])
+    caplog.clear()
+    policy, _, _ = small_policy(inverted, "deltaco_match", gripper_closed="high")
+    assert torch.equal(policy.training_locations.locations, expected)
     assert "gripper_closed" not in caplog.text
     with pytest.raises(ValueError, match=r"at least 24 episodes .* Got 0\."):
-        locations(inverted)
+        small_policy(inverted, "deltaco_match")
     assert "Set --policy.gripper_closed=high." in caplog.text
 
 
@@ -183,7 +182,7 @@ def test_validation_loss_of_held_out_episodes_is_that_at_their_recorded_location
     batch = batch_of(table, [frame + 2 for frame in first_frames([0, 1, 1])])
     known, logged = policy(batch, reduction="none")
     held_out = torch.full((len(known),), -1)
-    monkeypatch.setattr(policy.training_bank, "episode_rows", lambda _: held_out)
+    monkeypatch.setattr(policy.training_data.demonstrations, "episode_rows", lambda _: held_out)
     losses, _ = policy(batch, reduction="none")
     torch.testing.assert_close(losses, known)
     assert policy(batch)[0] == losses.mean()
@@ -271,7 +270,7 @@ def test_several_demonstrations_are_combined(make, table):
     # Without `set_tasks`, the bank gives as many.
     policy.reset()
     policy.select_action(scene | {"task": [RED]})
-    torch.testing.assert_close(policy.found.maps, both.maps)
+    torch.testing.assert_close(policy.localization.maps, both.maps)
 
 
 def test_height_bias_is_added_when_acting(make, table):
@@ -284,7 +283,7 @@ def test_demonstrations_of_another_robot_and_a_missing_gripper_are_errors(table,
     other = write_table(tmp_path / "other", MOVES[:2], n_joints=5)
     with pytest.raises(ValueError, match="of another robot: their states and actions have 5 and 3 numbers"):
         small_policy(table, "deltaco_match", **demos_of(other))
-    with pytest.raises(ValueError, match="have no camera 'observation.image', only observation.images.top"):
+    with pytest.raises(ValueError, match="has no camera 'observation.image', only observation.images.top"):
         small_policy(table, "deltaco_match", **demos_of(dataset))
     with pytest.raises(ValueError, match=r"needs the feature 'observation.state' and a gripper"):
         small_policy(table, "deltaco_match", gripper="none")
@@ -304,10 +303,9 @@ def test_a_demonstration_may_be_given_by_hand_while_the_arm_rests(tremble, table
     named = {"observation.state": list("abc"), "action": ["a", "b", "gripper"]}
     demos = write_episodes(tmp_path / "demos", "test/hand", [(task, frames)], **named)
     policy, before, _ = small_policy(table, "deltaco_match", **demos_of(demos))
-    policy._prepare_training()
     policy.eval()
     assert policy.demonstrations.pick_states.isnan().all()
     assert "1 of 1 episodes have no grasp, and what they moved is found from their first" in caplog.text
     action = policy.select_action(before(observation(table, [task])))
     assert torch.isfinite(action).all()
-    assert policy.found.by_demonstration[0]
+    assert policy.localization.by_demonstration[0]

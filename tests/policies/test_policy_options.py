@@ -8,7 +8,6 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.scripts import lerobot_train
 
-from gym_deltaco.env import ACTION_NAMES
 from lerobot_deltaco.policies.base import configuration as base_config
 from lerobot_deltaco.policies.deltaco.configuration_deltaco import DeltacoConfig
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
@@ -46,7 +45,7 @@ def test_invalid_options_say_what_is_valid():
         ({"demo_encoder": "pretrained"}, "have 512 numbers, and the instructions' have 384"),
         ({"vision_encoder": "dino"}, "`vision_encoder` must be one of clip-vit-base-patch32, r3m-resnet18"),
         ({"normalization_mapping": {"VISUAL": MEAN_STD}}, "`normalization_mapping` must be IDENTITY for VIS"),
-        ({"p_hue_augmentation": 1.5}, "`p_hue_augmentation` must be from 0 to 1"),
+        ({"p_color_jitter": 1.5}, "`p_color_jitter` must be from 0 to 1"),
         ({"location_noise": -0.1}, "`location_noise` must be from 0 to 1"),
         ({"state_noise": -1}, "`state_noise` must be from 0 to 10"),
         ({"n_demonstrations": 0}, "`n_demonstrations` must be from 1"),
@@ -107,15 +106,6 @@ def test_gripper_is_found_by_name_or_given(names, gripper, index, caplog):
     assert config.gripper_index == index
     assert ("moves most, dimension 1 of the action (Gripper)" in caplog.text) == isinstance(names, dict)
     assert config.normalization_mapping["ACTION"] is NormalizationMode.MIN_MAX
-
-
-def test_actions_of_the_benchmark_are_not_scaled():
-    config = features_config(action=(4,))
-    config.set_dataset_feature_metadata({"action": {"names": list(ACTION_NAMES)}})
-    assert config.gripper_index == 3
-    assert config.normalization_mapping["ACTION"] is NormalizationMode.IDENTITY
-    for other in (DeltacoConfig, DeltacoMatchConfig):  # no other configuration is changed with it
-        assert other(device="cpu").normalization_mapping["ACTION"] is NormalizationMode.MIN_MAX
 
 
 def test_features_that_do_not_fit_are_errors():

@@ -227,7 +227,7 @@ def test_loss_matches_the_papers_formulas(dataset, method):
     known = policy.instructions(distinct, "cpu").numpy().astype(np.float64)
     demo = None
     if policy.config.uses_demonstrations:
-        frames = policy.training_bank.frames[rows].numpy() / 255
+        frames = policy.training_data.demonstrations.frames[rows].numpy() / 255
         demo = reference.encoder(weights_of(policy, "demo_encoder."), frames, 1, stride.demo_stride)
     model = weights_of(policy, "model.")
     imitation = functools.partial(

@@ -30,7 +30,7 @@ OPTIONS = {
         "shift_padding": [0, 4, -1],
         "language_head": [None, [8], [0]],
         "gripper": ["auto", "2", "0", "none", "7", "left"],
-        "demo_episodes": [None, [0, 3, 5], [99]],
+        "training_episodes": [None, [0, 3, 5], [99]],
         "scheduler_name": ["constant", "cosine", "linear"],
     },
     "deltaco_match": {
@@ -39,7 +39,7 @@ OPTIONS = {
         "grasp_height_bias": [0.0, 0.75, 99],
         "location_noise": [0.0, 0.01, -1],
         "state_noise": [0.0, 0.5, -1],
-        "p_hue_augmentation": [0.0, 0.5, 1.5],
+        "p_color_jitter": [0.0, 0.5, 1.5],
         "frames_after_release": [None, 2, -1],
     },
 }

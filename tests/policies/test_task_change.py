@@ -11,7 +11,6 @@ from small_policies import TABLE_LENGTH, TABLE_TASKS, demos_of, small_policy
 @pytest.mark.parametrize("chunk_size", [1, 4])
 def test_a_new_task_is_found_in_the_current_image(table, chunk_size):
     policy, before, after = small_policy(table, "deltaco_match", chunk_size=chunk_size, **demos_of(table))
-    policy._prepare_training()
     policy.eval()
     names = table.meta.features["action"]["names"]
 
@@ -27,16 +26,16 @@ def test_a_new_task_is_found_in_the_current_image(table, chunk_size):
     running = engine(TABLE_TASKS[0])
     running.reset()
     running.get_action(seen(0))
-    at_first = policy.found
+    at_first = policy.localization
     running.get_action(seen(TABLE_LENGTH))
-    assert policy.found is at_first  # in the same episode, the scene is not looked at again
+    assert policy.localization is at_first  # in the same episode, the scene is not looked at again
     running._task = TABLE_TASKS[1]  # as `set_task` does
     actions = [running.get_action(seen(TABLE_LENGTH)) for _ in range(2)]
-    locations = policy.found.locations
-    assert policy.found is not at_first
+    locations = policy.localization.locations
+    assert policy.localization is not at_first
     fresh = engine(TABLE_TASKS[1])
     fresh.reset()
     # Nothing of the old task is left, not even the rest of its chunk.
     for action in actions:
         assert torch.equal(action, fresh.get_action(seen(TABLE_LENGTH)))
-    assert torch.equal(locations, policy.found.locations)
+    assert torch.equal(locations, policy.localization.locations)

@@ -19,6 +19,7 @@ from small_policies import ACT, DELTACO, MATCH, POLICIES, TASK_IDS, as_options, 
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco import cli
 from lerobot_deltaco.data.frames import FramesInMemory
+from lerobot_deltaco.data.gripper import Gripper
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy, TrainingDivergedError
 from lerobot_deltaco.policies.deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
@@ -35,7 +36,7 @@ def train(benchmark, tmp_path):
     """Trains in this process, and returns the folder of the checkpoints. LeRobot's loop is left as it was."""
 
     def train(options, name="run", **more):
-        names = "make_train_eval_datasets", "EpisodeAwareSampler"
+        names = "make_train_eval_datasets", "make_policy", "EpisodeAwareSampler", "cycle"
         before = [getattr(lerobot_train, name) for name in names]
         checkpoints = run_training(benchmark, tmp_path / name, options, **more)
         assert [getattr(lerobot_train, name) for name in names] == before
@@ -117,7 +118,7 @@ def test_a_run_does_not_resume_on_other_data(train, benchmark, tmp_path):
     statistics = json.loads((other / "meta" / "stats.json").read_text())
     statistics["observation.state"]["mean"][0] += 0.5
     (other / "meta" / "stats.json").write_text(json.dumps(statistics))
-    with pytest.raises(ValueError, match=r"statistics differ.*--policy\.path"):
+    with pytest.raises(ValueError, match=r"statistics of `observation.state` differ.*--policy\.path"):
         train({}, config_path=saved, resume=True, steps=4, **{"dataset.root": other})
 
 
@@ -156,7 +157,7 @@ def test_two_processes_train_alike_from_the_disk_and_from_memory(benchmark, tmp_
 @pytest.mark.parametrize("policy", ["deltaco", "act"])
 def test_episodes_and_the_split_are_respected(train, seen, spy, policy):
     banks = []
-    spy(DeltacoPolicy, "set_training_data", lambda _, bank, robot_data: banks.append(bank))
+    spy(DeltacoPolicy, "fit", lambda _, data: banks.append(data.demonstrations))
     split = {"dataset.episodes": "[1,2,3,7,8,9]", "dataset.eval_split": 0.5, "eval_steps": 2}
     train({**POLICIES[policy], **split}, batch_size=30, steps=2)
     trained, held_back = (
@@ -204,7 +205,7 @@ def test_frames_after_the_release_are_as_many_seconds_at_any_rate():
     # Closed from 20 to 40, and open again from 50 on.
     course = np.interp(np.arange(100), [0, 10, 20, 40, 50, 60], [1, 1, 0, 0, 1, 1])
     actions = torch.from_numpy(np.stack([course, course], axis=1))
-    policy = SimpleNamespace(frames_after_release=12, gripper_index=0, gripper_opening=lambda a: a[:, 0])
+    policy = SimpleNamespace(frames_after_release=12, gripper_command=Gripper(0))
     last = []
     for fps in (24, 48):
         frames = MagicMock(columns={"action": actions}, spans={0: (0, 99)}, fps=fps)

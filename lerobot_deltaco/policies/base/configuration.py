@@ -14,8 +14,8 @@ import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from gym_deltaco.env import ACTION_NAMES
-from lerobot_deltaco.data.paraphrases import GRAMMAR
+from lerobot_deltaco.data.gripper import Gripper
+from lerobot_deltaco.data.training_data import DemonstrationFormat
 from lerobot_deltaco.policies.base.optimization import CosineSchedulerConfig, FusedAdamWConfig
 
 logger = logging.getLogger(__name__)
@@ -31,10 +31,9 @@ class TaskConditionedConfig(PreTrainedConfig):
     """Options of a policy that performs the task of a demonstration, an instruction, or both.
 
     Args:
-        paraphrases: Sentences in people's words for the benchmark's tasks, from which instructions are drawn
-            in training: "grammar" for those that the benchmark makes from phrases; or a CSV file, of whose
-            sentences the last one of each task is held out. With "grammar", the tasks of other datasets keep
-            their task strings.
+        paraphrases: CSV file of other sentences for the tasks, from which instructions are drawn in training:
+            columns `task` (the task string) and `instruction`, one sentence per row. Other tasks keep their
+            task strings.
         p_paraphrase: Probability that a training sample's instruction is such a sentence; otherwise, it is
             the task string.
         image_size: Height and width to which images are scaled, px.
@@ -58,8 +57,9 @@ class TaskConditionedConfig(PreTrainedConfig):
         demo_root: Folder of that dataset, if it is not in LeRobot's cache.
         demo_episode: Episode of that dataset to use as the demonstration of every instruction, such as a
             sentence of your own.
-        demo_episodes: Episodes of the training dataset from which demonstrations are drawn. By default, all
-            training episodes.
+        training_episodes: Episodes that the policy is trained on, if not all of the dataset. Only
+            `lerobot-train` with --dataset.episodes or --dataset.eval_split needs it, which tells a policy of
+            neither; `deltaco train` does.
         tasks_per_batch: Largest number of tasks in a batch of `deltaco train`, with equally many samples of
             each (the paper: 16 tasks x 64 samples); 0 for samples of any tasks.
         upsampled_tasks: Regular expression for the instructions of the tasks that get `upsampled_fraction` of
@@ -88,7 +88,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     demo_repo_id: str | None = None
     demo_root: str | None = None
     demo_episode: int | None = None
-    demo_episodes: list[int] | None = None
+    training_episodes: list[int] | None = None
     tasks_per_batch: int = 16
     upsampled_tasks: str | None = None
     upsampled_fraction: float = 0.5
@@ -186,7 +186,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     def set_dataset_feature_metadata(
         self, features: dict[str, dict[str, Any]], stats: dict[str, dict[str, Any]] | None = None
     ) -> None:
-        """Finds out which dimension is the gripper, and how actions are scaled.
+        """Finds out which dimension of the action is the gripper.
 
         LeRobot calls this with the training dataset's features, before it makes the policy. The policy calls
         it again with the statistics, which tell which of several grippers moves.
@@ -195,9 +195,6 @@ class TaskConditionedConfig(PreTrainedConfig):
             ValueError: The names of the action's dimensions cannot be read.
         """
         action = features.get("action", {})
-        if action.get("names") == ACTION_NAMES:
-            # The benchmark's actions are in -1..1 already.
-            self.normalization_mapping["ACTION"] = NormalizationMode.IDENTITY
         if self.gripper != "auto":
             return
         names = dimension_names(action)
@@ -265,10 +262,15 @@ class TaskConditionedConfig(PreTrainedConfig):
         """Dimension of the action that is the gripper; None without one."""
         return int(self.gripper) if self.gripper.isdecimal() else None
 
-    def gripper_opening(self, actions: torch.Tensor) -> torch.Tensor:
-        """Returns the gripper commands in actions (frames, action); larger is more open, (frames,)."""
-        command = actions[:, self.gripper_index]
-        return command if self.gripper_closed == "low" else -command
+    @property
+    def gripper_command(self) -> Gripper | None:
+        """How the gripper is read from an action; None without one."""
+        return None if self.gripper_index is None else Gripper(self.gripper_index, self.gripper_closed)
+
+    @property
+    def demonstration_format(self) -> DemonstrationFormat:
+        """What the policy takes from an episode as a demonstration."""
+        return DemonstrationFormat(self.cameras[0], self.image_size, self.n_demo_frames)
 
     @property
     def state_dim(self) -> int:
@@ -290,8 +292,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     def _save_pretrained(self, save_directory: Path) -> None:
         saved = copy.copy(self)
         for name in SOURCES:
-            if getattr(saved, name) != GRAMMAR:
-                setattr(saved, name, None)
+            setattr(saved, name, None)
         PreTrainedConfig._save_pretrained(saved, save_directory)
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:

@@ -3,7 +3,7 @@
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
 import contextlib
-import copy
+import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,42 +12,27 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
-from lerobot_deltaco.data.demonstrations import (
-    Demonstration,
-    DemonstrationBank,
-    RobotData,
-    read_demonstrations,
-    read_robot_data,
-)
-from lerobot_deltaco.data.paraphrases import GRAMMAR, read_paraphrases
-from lerobot_deltaco.data.reading import (
-    check_episode_numbers,
-    compare_robots,
-    episodes_trained_on,
-    open_dataset,
-    training_argument,
-)
+from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
+from lerobot_deltaco.data.reading import compare_robots, open_dataset
+from lerobot_deltaco.data.training_data import DatasetEpisodes, Episodes, TrainingData
 from lerobot_deltaco.policies.base.action_queues import ActionQueues
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.base.language import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.policies.base.losses import imitation_loss, join_action
 from lerobot_deltaco.policies.base.networks import ActionDistribution, PolicyNetwork, fuse_batch_norms
 from lerobot_deltaco.policies.base.normalization import StateLimits
+from lerobot_deltaco.policies.base.sentences import read_sentences
 from lerobot_deltaco.policies.base.task_bank import (
-    PROCESSORS,
     TASK_BANK,
     checkpoint_file,
-    configuration_digests,
-    made_processors_digest,
-    processors_digest,
     read_task_bank,
     write_task_bank,
 )
@@ -56,6 +41,10 @@ logger = logging.getLogger(__name__)
 
 # Normalized actions are in -1..1; a policy may overshoot, but not by that much.
 _ABSURD_ACTION = 100.0
+
+# Options that a policy keeps after its training, and those that only further training may change.
+_TRAINED_OPTIONS = ("image_size", "chunk_size", "num_mixture_components")
+_DATASET_OPTIONS = ("gripper", "gripper_closed", "demo_camera")
 
 DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
 
@@ -80,6 +69,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         model: Network that predicts actions.
         instructions: Embeddings of instructions; None if the policy uses no sentence encoder.
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
+        training_data: The training episodes; None before `prepare_training`.
     """
 
     model: PolicyNetwork
@@ -95,7 +85,6 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         super().__init__(config)
         self.config: Any = config
         self._meta, self._stats = dataset_meta, dataset_stats
-        self._processors_digest: str | None = None  # of the checkpoint that was loaded
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features, dataset_stats or dataset_meta.stats)
             config.set_dataset_length(dataset_meta)
@@ -104,11 +93,12 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self.instructions: InstructionEmbeddings | None = None
         self.paraphrases = None if dataset_meta is None else _read_paraphrases(config, dataset_meta)
         self.demonstrations: DemonstrationBank | None = self._read_evaluation_bank()
-        self.training_bank: DemonstrationBank | None = None
+        self.training_data: TrainingData | None = None
+        self._knows_all_episodes = False  # for it read them itself
         # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.
         self._tasks: tuple[tuple[str, ...], DemonstrationsOfTasks] | None = None
         self._episode: Any = None
-        self._turn = 0  # number of the next action in the running episode
+        self._component_index = 0  # number of the next action in the running episode
         # The actions of the running chunks that are still to be carried out, and the average of all chunks.
         self._actions = ActionQueues(config.n_action_steps, config.gripper_index)
         self._ensemble: ACTTemporalEnsembler | None = None
@@ -162,7 +152,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         # In bfloat16, in which LeRobot's training evaluates, an action would depend on the rest of the batch.
         with torch.autocast(self.step.device.type, enabled=False):
             action = self._next_action(batch)
-        self._turn += 1
+        self._component_index += 1
         return action
 
     def _next_action(self, batch: dict[str, Any]) -> Tensor:
@@ -177,7 +167,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         return self._actions.pop()
 
     @property
-    def p_pick(self) -> Tensor | None:
+    def pick_confidence(self) -> Tensor | None:
         """Probability that the policy gave what it picks, (batch,); None if it gives none."""
         return None
 
@@ -187,7 +177,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     def _start(self, episode: Any) -> None:
         """Sets the running episode; None for none."""
-        self._episode, self._ensemble, self._turn = episode, None, 0
+        self._episode, self._ensemble, self._component_index = episode, None, 0
         self._actions.clear()
 
     def _tasks_of(self, batch: dict[str, Any]) -> tuple[tuple[str, ...], DemonstrationsOfTasks | None]:
@@ -213,7 +203,9 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         Raises:
             ValueError: There is no demonstration of a task.
         """
-        bank = self.demonstrations if self.demonstrations is not None else self.training_bank
+        bank = self.demonstrations
+        if bank is None and self.training_data is not None:
+            bank = self.training_data.demonstrations
         if bank is None:
             raise ValueError(
                 "The policy has no demonstrations. Name a dataset of them with --policy.demo_repo_id and "
@@ -256,10 +248,13 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
         return self.model if self.training else fuse_batch_norms(self.model)
 
-    def _chosen(self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None) -> Tensor:
+    def _sample_action(
+        self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None
+    ) -> Tensor:
         """Returns the actions of a chunk, (batch, steps, action); an absurd one is an error."""
         opening = None if gripper is None else torch.sigmoid(gripper.float())
-        action = join_action(predicted.likely_mean(self._turn).float(), opening, self.config.gripper_index)
+        mean = predicted.likely_mean(self._component_index).float()
+        action = join_action(mean, opening, self.config.gripper_index)
         if bool((action.abs() < _ABSURD_ACTION).all()):  # False for NaN
             return action
         damaged = _not_finite(batch)
@@ -273,50 +268,55 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     # Training
 
-    def set_training_data(self, bank: DemonstrationBank, robot_data: RobotData | None) -> None:
-        """Sets the demonstrations for training; otherwise, they are read at the first batch.
+    def prepare_training(self, episodes: Episodes) -> None:
+        """Takes the training episodes, and fits what depends only on them.
+
+        `deltaco train` calls this before the first step. Otherwise the first batch does, with the episodes
+        that `training_episodes` names, or all of the dataset.
 
         Args:
-            bank: The training episodes.
-            robot_data: States and actions of the robot in them; None if the policy does not need them.
+            episodes: The episodes that the policy is trained on.
+
+        Raises:
+            ValueError: The episodes do not suffice, or cannot be read.
         """
-        self.training_bank = bank.to(self.step.device)
+        # Models that are fitted choose their own precision.
+        with torch.autocast(self.step.device.type, enabled=False):
+            self.fit(TrainingData.read(episodes, self.config.demonstration_format).to(self.step.device))
 
-    def _prepare_training(self) -> None:
-        """Reads the training episodes unless they have been read."""
-        if self.training_bank is None:
-            # Models fitted to them choose their own precision.
-            with torch.autocast(self.step.device.type, enabled=False):
-                self._read_training_data()
+    def fit(self, data: TrainingData) -> None:
+        """Fits what depends only on the training episodes. See `prepare_training`."""
+        self.training_data = data
 
-    def _read_training_data(self) -> None:
-        if self._meta is None:
-            raise ValueError("Training needs the metadata of the dataset. Pass them as `dataset_meta`.")
-        frames = getattr(self._meta, "frames_in_memory", None)
-        if frames is not None and self.config.demo_episodes is None:
-            bank = frames.demonstrations(
-                self.config.cameras[0], self.config.image_size, self.config.n_demo_frames
+    def _training_rows(self, episodes: Tensor) -> Tensor:
+        """Returns the rows of episodes among the training episodes, (batch,); -1 for those held out.
+
+        Raises:
+            ValueError: A sample to train on is of another episode, or one that is held out was trained on.
+        """
+        if self.training_data is None:
+            if self._meta is None:
+                raise ValueError(
+                    "Training needs the episodes: call `prepare_training`, or pass the dataset's metadata as "
+                    "`dataset_meta`."
+                )
+            chosen = self.config.training_episodes
+            dataset = open_dataset("--dataset.root", self._meta.repo_id, self._meta.root, chosen)
+            self.prepare_training(DatasetEpisodes(dataset, chosen))
+            self._knows_all_episodes = chosen is None
+        assert self.training_data is not None
+        rows = self.training_data.demonstrations.episode_rows(episodes)
+        wrong = (rows < 0) if self.training else (rows >= 0) & self._knows_all_episodes
+        if bool(wrong.any()):
+            episode = int(episodes[wrong][0])
+            problem = "to be trained on, but was not" if self.training else "held out, but was"
+            raise ValueError(
+                f"Episode {episode} is {problem} among the training episodes that the policy was "
+                "given. `lerobot-train` does not tell a policy of --dataset.episodes and "
+                "--dataset.eval_split: train with `deltaco train`, or name the training episodes in "
+                "--policy.training_episodes."
             )
-            self.set_training_data(bank, frames.robot_data(self.config.cameras[0]))
-            return
-        meta = self._meta
-        if self.config.demo_episodes:
-            chosen = list(dict.fromkeys(self.config.demo_episodes))
-            check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
-        else:
-            chosen = episodes_trained_on(meta)
-        dataset = open_dataset("--dataset.root", meta.repo_id, meta.root, chosen)
-        bank = self._read_bank(dataset, chosen)
-        robot_data = None
-        if self.config.state_dim:
-            robot_data = read_robot_data(dataset, chosen, self.config.cameras[0])
-        self.set_training_data(bank, robot_data)
-
-    def _read_bank(self, dataset: LeRobotDataset, episodes: Sequence[int] | None) -> DemonstrationBank:
-        config = self.config
-        return read_demonstrations(
-            dataset, config.cameras[0], config.image_size, config.n_demo_frames, episodes
-        )
+        return rows
 
     def _read_evaluation_bank(self) -> DemonstrationBank | None:
         """Reads the demonstrations for evaluation that the configuration names."""
@@ -325,12 +325,12 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset = open_dataset("--policy.demo_root", self.config.demo_repo_id, self.config.demo_root)
         if self._meta is not None:
             compare_robots(self._meta, dataset.meta)
-        bank = self._read_bank(dataset, None)
-        self._complete_bank(bank, dataset)
-        return bank
+        data = TrainingData.read(DatasetEpisodes(dataset), self.config.demonstration_format)
+        self._check_demonstrations(data)
+        return data.demonstrations
 
-    def _complete_bank(self, bank: DemonstrationBank, dataset: LeRobotDataset) -> None:
-        """Adds what else the policy needs of demonstrations for evaluation."""
+    def _check_demonstrations(self, data: TrainingData) -> None:
+        """Checks demonstrations for evaluation, and adds what else the policy needs of them."""
 
     def _step_generator(self) -> torch.Generator:
         """Returns the random generator of a training step, on the CPU."""
@@ -381,13 +381,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             known = self.instructions
             if known is not None and self.paraphrases is not None:
                 known = self.paraphrases.left_out_of(known)
-            digests = configuration_digests(self.config)
-            processors = self._processors_digest
-            if self._stats is not None:
-                processors = made_processors_digest(self.config, self._stats)
-            if processors is not None:
-                digests[PROCESSORS] = processors
-            write_task_bank(save_directory / TASK_BANK, known, bank, digests)
+            write_task_bank(save_directory / TASK_BANK, known, bank)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:
@@ -398,42 +392,30 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         Raises:
             ValueError: A file of the checkpoint is damaged, or does not fit the others.
         """
-        policy = super().from_pretrained(pretrained_name_or_path, **{**kwargs, "strict": True})
-        path = checkpoint_file(pretrained_name_or_path, TASK_BANK, **kwargs)
-        digests = configuration_digests(policy.config)
-        processors = processors_digest(pretrained_name_or_path, **kwargs)
-        if processors is not None:
-            digests[PROCESSORS] = processors
-        if policy._stats is not None:  # It is trained, maybe on other data than the checkpoint.
-            digests = {name: digests[name] for name in ("image_size", "n_demo_frames")}
-        bank, saved_with = read_task_bank(path, policy.instructions, digests)
-        if policy._stats is not None and training_argument("resume"):
-            _check_resumed_data(policy, saved_with.get(PROCESSORS))
-        policy._processors_digest = saved_with.get(PROCESSORS)
-        # Demonstrations named on the command line replace those of the checkpoint.
-        if policy.demonstrations is None and bank is not None:
-            policy.demonstrations = bank.to(policy.config.device)
-        return policy
-
-    @classmethod
-    def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:
-        limits = copy.deepcopy(model.state_limits)
         try:
-            policy = super()._load_as_safetensor(model, model_file, map_location, strict)
+            policy = super().from_pretrained(pretrained_name_or_path, **{**kwargs, "strict": True})
         except RuntimeError as error:
             raise ValueError(
-                f"{model_file} does not have the weights of this policy: "
-                f"{str(error).splitlines()[-1].strip()} "
-                "The config.json beside it belongs to other weights, or to another version."
+                f"{pretrained_name_or_path} does not have the weights of this policy: "
+                f"{str(error).splitlines()[-1].strip()} Its config.json belongs to other weights, or to "
+                "another version."
             ) from error
-        if policy._stats is not None:
-            # Training normalizes states by its own dataset, not by that of the weights that it begins with.
-            policy.state_limits = limits
         damaged = _not_finite(policy.state_dict())
         if damaged:
             raise ValueError(
-                f"{model_file} is damaged: the weight {damaged[0]} has numbers that are not finite."
+                f"{pretrained_name_or_path} is damaged: the weight {damaged[0]} has numbers that are not "
+                "finite."
             )
+        saved = json.loads(checkpoint_file(pretrained_name_or_path, CONFIG_NAME, **kwargs).read_text())
+        _check_options(policy.config, saved, policy._stats is not None)
+        if policy._stats is not None:
+            # Training normalizes states by its own dataset, not by that of the weights that it begins with.
+            policy.state_limits = StateLimits(policy.config.state_dim, policy._stats).to(policy.step.device)
+        path = checkpoint_file(pretrained_name_or_path, TASK_BANK, **kwargs)
+        bank = read_task_bank(path, policy.instructions)
+        # Demonstrations named on the command line replace those of the checkpoint.
+        if policy.demonstrations is None and bank is not None:
+            policy.demonstrations = bank.to(policy.config.device)
         return policy
 
     def generate_model_card(
@@ -452,31 +434,36 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
 
 
-def _check_resumed_data(policy: TaskConditionedPolicy, saved_with: str | None) -> None:
-    """Checks that a training resumes on the data that it began with.
+def _check_options(config: TaskConditionedConfig, saved: Mapping[str, Any], is_trained: bool) -> None:
+    """Checks that no option is changed that says what the numbers of observations and actions mean.
 
-    LeRobot keeps the checkpoint's processors, which would normalize other data by the old statistics.
+    Args:
+        config: The configuration, with options of the command line.
+        saved: The checkpoint's configuration.
+        is_trained: Whether the policy is trained further, maybe on other data.
 
     Raises:
-        ValueError: The statistics of the dataset differ.
+        ValueError: One is changed.
     """
-    assert policy._stats is not None
-    if saved_with is not None and saved_with != made_processors_digest(policy.config, policy._stats):
-        raise ValueError(
-            "The dataset is not the one that the training began with: its statistics differ. Resume on the "
-            "same data, or begin a new training from the checkpoint with --policy.path."
-        )
+    for name in _TRAINED_OPTIONS if is_trained else (*_TRAINED_OPTIONS, *_DATASET_OPTIONS):
+        if name in saved and getattr(config, name) != saved[name]:
+            raise ValueError(
+                f"The checkpoint was trained with `{name}` {saved[name]!r}, and cannot be used with "
+                f"{getattr(config, name)!r}. Leave out --policy.{name}."
+            )
 
 
 def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadata) -> Paraphrases | None:
     """Reads the sentences for training, by task string."""
     if config.paraphrases is None:
         return None
-    known = {task.instruction: task.index for task in (*TASKS, *COLOR_SHAPE_TASKS)}
-    needed = [known[text] for text in meta.tasks.index if text in known]
-    sentences = read_paraphrases(config.paraphrases, "train", needed)
-    by_task = {get_task(task_id).instruction: own for task_id, own in sentences.items()}
-    return Paraphrases(by_task, config.p_paraphrase, is_complete=config.paraphrases != GRAMMAR)
+    sentences = read_sentences(config.paraphrases)
+    if not sentences.keys() & set(meta.tasks.index):
+        raise ValueError(
+            f"{config.paraphrases} has sentences for none of the dataset's tasks, such as "
+            f"{meta.tasks.index[0]!r}, but for tasks such as {next(iter(sentences))!r}."
+        )
+    return Paraphrases(sentences, config.p_paraphrase, is_complete=False)
 
 
 def _not_finite(tensors: Mapping[str, Any]) -> list[str]:

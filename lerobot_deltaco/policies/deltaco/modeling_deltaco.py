@@ -16,12 +16,13 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank, sample_frames
 from lerobot_deltaco.data.reading import warn_of_equal_instructions
+from lerobot_deltaco.data.training_data import TrainingData
 from lerobot_deltaco.policies.base.language import InstructionEmbeddings
 from lerobot_deltaco.policies.base.losses import contrastive_logits, contrastive_loss, cosine_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
@@ -163,7 +164,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         self, batch: dict[str, Any], images: Tensor, film: Tensor | None, concat: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the imitation loss L_pi (equation 2) of each sample, (batch,), and its parts to log."""
-        predicted, gripper = self.model(images, film, self._concatenated(batch, concat))
+        predicted, gripper = self.model(images, film, self._fuse_inputs(batch, concat))
         return self._imitation_loss(batch, predicted, gripper, self.config.gripper_loss)
 
     # Acting
@@ -175,8 +176,8 @@ class DeltacoPolicy(TaskConditionedPolicy):
         if self._begins_episode(batch):
             self._start(self._begin_episode(*self._tasks_of(batch), images.device))
         episode: Episode = self._episode
-        concat = self._concatenated(batch, episode.concat)
-        return self._chosen(batch, *episode.network(images, episode.film, concat))
+        concat = self._fuse_inputs(batch, episode.concat)
+        return self._sample_action(batch, *episode.network(images, episode.film, concat))
 
     def _begin_episode(
         self,
@@ -264,10 +265,10 @@ class DeltacoPolicy(TaskConditionedPolicy):
         self, episodes: Tensor, tasks: Sequence[str], generator: torch.Generator
     ) -> Tensor:
         """Returns embeddings of other episodes of the samples' tasks, (batch, embedding)."""
-        self._prepare_training()
-        bank, config = self.training_bank, self.config
-        assert bank is not None
+        self._training_rows(episodes)
+        assert self.training_data is not None
         assert self.demo_encoder is not None
+        bank, config = self.training_data.demonstrations, self.config
         rows = bank.draw_other_episodes(episodes, tasks, generator)
         if config.demo_encoder == "pretrained":
             is_random = config.demo_shift_padding > 0 or config.n_demo_frames > 2
@@ -292,9 +293,9 @@ class DeltacoPolicy(TaskConditionedPolicy):
         with torch.autocast(bank.frames.device.type, enabled=False):
             return encode_bank(bank, encoder, frames, rows, n_variants, padding, config.seed)
 
-    def _complete_bank(self, bank: DemonstrationBank, dataset: LeRobotDataset) -> None:
+    def _check_demonstrations(self, data: TrainingData) -> None:
         if self.config.demo_encoder == "pretrained":
-            bank.features = self._encode_bank(bank, n_variants=0)
+            data.demonstrations.features = self._encode_bank(data.demonstrations, n_variants=0)
 
     def _conditioning_inputs(
         self, tasks: Sequence[str], demo: Tensor | None, language: Tensor | None, device: torch.device
@@ -319,7 +320,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         film, concat, _ = self.config.conditioning
         return source(film), source(concat)
 
-    def _concatenated(self, batch: dict[str, Any], embedding: Tensor | None) -> Tensor | None:
+    def _fuse_inputs(self, batch: dict[str, Any], embedding: Tensor | None) -> Tensor | None:
         """Concatenates an embedding and the robot's state, which join the feature points."""
         parts = [] if embedding is None else [embedding]
         if self.config.state_dim:

@@ -2,12 +2,14 @@
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_deltaco.data.gripper import Gripper
+from lerobot_deltaco.data.training_data import DemonstrationFormat
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 
 
@@ -24,14 +26,14 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             image and as a fraction of its side: about the size of a large object.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation.
         grasp_height_bias: Height offset that is added to the estimate when the policy acts, in standard
-            deviations over the training episodes; larger is farther along the approach. A gripper that closes
-            too early misses flat objects; on a robot, one that goes too far may touch the table.
+            deviations over the training episodes; larger is farther along the approach. On a robot, a gripper
+            that goes too far presses into the table. The benchmark's recipes choose 0.5, for flat objects.
         location_noise: Standard deviation of the noise on the pick and place locations in training, where the
             image's edges are at -1 and 1; by default, a pixel of 48. If that is more than the gripper's room
             beside an object, choose less, but no less than the error of the locations.
         state_noise: Standard deviation of the noise on half of the numbers of the robot's state in training,
             in their standard deviations over the training episodes. Less is more precise.
-        p_hue_augmentation: Probability that a training sample's observation and demonstration undergo the
+        p_color_jitter: Probability that a training sample's observation and demonstration undergo the
             same random change of hue, saturation and brightness.
         frames_after_release: Number of frames after the gripper has opened for the last time in an episode
             that `deltaco train` trains on, at 24 frames per second and proportionally at others; None for
@@ -42,12 +44,11 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     crop_size: float = 0.17
     n_demonstrations: int = 1
     num_mixture_components: int = 5
-    grasp_height_bias: float = 0.5
+    grasp_height_bias: float = 0.0
     location_noise: float = 0.04
     state_noise: float = 0.1
-    p_hue_augmentation: float = 0.7
+    p_color_jitter: float = 0.7
     frames_after_release: int | None = 2
-    paraphrases: str | None = "grammar"
     p_paraphrase: float = 0.5
     dtype: str = "bfloat16"
     optimizer_lr: float = 1e-3
@@ -70,7 +71,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             grasp_height_bias=(-10, 10),
             location_noise=(0, 1),
             state_noise=(0, 10),
-            p_hue_augmentation=(0, 1),
+            p_color_jitter=(0, 1),
             frames_after_release=(0, 1_000_000),
         )
         if self.n_demonstrations > 1 and self.demo_episode is not None:
@@ -95,6 +96,17 @@ class DeltacoMatchConfig(TaskConditionedConfig):
                 for quantile, end in (("q01", "min"), ("q99", "max"))
             )
             self.gripper_range = float(most - least)
+
+    @property
+    def gripper_command(self) -> Gripper | None:
+        """How the gripper is read from an action, with the range of its commands in the training dataset."""
+        command = super().gripper_command
+        return None if command is None else replace(command, usual_range=self.gripper_range)
+
+    @property
+    def demonstration_format(self) -> DemonstrationFormat:
+        """What the policy takes from an episode as a demonstration: the grasp, too."""
+        return super().demonstration_format._replace(gripper=self.gripper_command)
 
     def validate_features(self) -> None:
         """Checks the inputs and outputs that LeRobot found in the dataset.

@@ -1,18 +1,17 @@
 r"""`deltaco_match`: describes what a demonstration moved, finds it in the scene, and acts.
 
-    demonstration ----- describe ----> descriptor, height of the grasp
-                                           |
-    first image of the episode -------- find ----> pick and place locations, grasp height
-                                           |                    |
-    instruction ---------------------------+                    |
-                                                                v
-    image, robot state -------------------------------------- act ----> action
+    demonstration ---- describe ---> descriptor, height of the grasp
+                                         |
+    first image of the episode --- localize ---> pick and place locations, grasp height
+                                         |                    |
+    instruction -------------------------+                    |
+                                                              v
+    image, robot state ------------------------------------- act ----> action
 
-Describing and finding happen once, at the start of an episode (`_find`). Feature matching chooses what to
-pick among proposals, by the demonstration and by the instruction's words; the place network finds where to
-place it, by the instruction, or by the demonstration if there is none. The policy network is given the two
-locations, and how far the robot's state is from where it would be at each of them
-(`predict_action_chunk`).
+Localization happens once, at the start of an episode. Feature matching chooses what to pick among proposals,
+by the demonstration and by the instruction's words; the place network finds where to place it, by the
+instruction, or by the demonstration if there is none. The policy network is given both locations, and how far
+the robot's state is from the state that it would have at each of them.
 
 In training, feature matching is fitted first. The policy network is given the locations of each sample's own
 episode, with noise; they follow from the robot's states when the gripper closed and opened. So it does not
@@ -21,33 +20,23 @@ have to wait for the place network, which learns beside it.
 
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain, starmap
 from typing import Any, NamedTuple
 
 import torch
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_transition
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank, RobotData, read_robot_data
-from lerobot_deltaco.data.grasps import (
-    Keyframes,
-    find_keyframes,
-    follows_gripper,
-    warn_of_missing,
-)
+from lerobot_deltaco.data.grasps import follows_gripper, warn_of_missing
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
+from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
-from lerobot_deltaco.policies.base.networks import (
-    BACKBONES,
-    PolicyNetwork,
-    random_shifts,
-    shift_images,
-)
+from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork, random_shifts, shift_images
 from lerobot_deltaco.policies.deltaco_match.calibration import MIN_EPISODES
 from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
@@ -67,15 +56,15 @@ from lerobot_deltaco.policies.deltaco_match.words import (
 )
 
 _GRIPPER_LOSS = "cross_entropy"
-_LOCATED_FRACTION = 0.25  # of a batch's samples, on which the locations are learned to be found
-_HEIGHT_NOISE = 0.1  # in standard deviations of heights
-_SHIFT_PADDING = 4  # px, of scenes and demonstrations when locations are learned to be found
-_P_PLACE_BY_DEMONSTRATION = 0.25  # in these samples; in the others, the instruction says where
+_PLACE_FRACTION = 0.25  # of a batch's samples, which train the place network and the attention
+_HEIGHT_NOISE = 0.1  # of the policy network's heights, in standard deviations over the training episodes
+_SHIFT_PADDING = 4  # px, of the random shifts of the place network's images
+_P_PLACE_BY_DEMONSTRATION = 0.25  # of the place network's samples; in the others, the instruction says where
 _MIN_ATTENTION = 1e-9
 
 
-class Found(NamedTuple):
-    """Locations found in the first images of episodes, and why.
+class PickPlace(NamedTuple):
+    """Where to pick and place in the scenes of a batch, and why.
 
     Attributes:
         locations: Pick and place, (batch, 2, 2) in -1..1.
@@ -83,9 +72,9 @@ class Found(NamedTuple):
         maps: Pick and place maps over the scenes, as logits (batch, 2, h, w).
         attention: Maps of what the (first) demonstration moved and where it was put, (batch, 2, h, w); None
             without demonstrations.
-        by_demonstration: Whether the pick and the place location were found by the demonstration. Otherwise,
+        by_demonstration: Whether the demonstration decided on the pick and on the place location. Otherwise,
             the attention is meaningless.
-        p_pick: Probability of the pick location among the proposals, (batch,).
+        confidence: Probability of the pick location among the proposals, (batch,).
     """
 
     locations: Tensor
@@ -93,18 +82,18 @@ class Found(NamedTuple):
     maps: Tensor
     attention: Tensor | None
     by_demonstration: tuple[bool, bool]
-    p_pick: Tensor
+    confidence: Tensor
 
 
-class Episode(NamedTuple):
-    """The running episode: its instructions, what was found, and the network that acts."""
+class RunningEpisode(NamedTuple):
+    """What is computed once, at the start of an episode."""
 
     instructions: tuple[str, ...]
-    found: Found
+    localization: PickPlace
     network: PolicyNetwork
 
 
-class StackedDemonstrations(NamedTuple):
+class DemonstrationBatch(NamedTuple):
     """Demonstrations of a batch of tasks.
 
     Attributes:
@@ -128,6 +117,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         attention: Finds what a demonstration moved, and where it was put.
         place: Finds where to place it.
         instruction_encoder: Embeds instructions for `place`.
+        training_locations: Locations of the training episodes; None before `fit`.
     """
 
     config_class = DeltacoMatchConfig
@@ -169,10 +159,10 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self.training_locations: TrainingLocations | None = None
         self._held_out: dict[int, TrainingLocations] = {}
 
-    # The loss
+    # Training
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Returns the loss of a batch: of the actions, and of finding the locations.
+        """Returns the loss of a batch: of the actions, and in training of the place maps.
 
         Args:
             batch: Batch from the preprocessor; it is not changed.
@@ -190,46 +180,62 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             ValueError: The training data do not fit; the message says why.
             TrainingDivergedError: The loss is not finite.
         """
-        self._prepare_training()
-        generator, tasks = self._step_generator(), list(batch["task"])
+        rows = self._training_rows(batch["episode_index"])
+        generator = self._step_generator()
         with self._autocast(batch[ACTION].device):
             if self.training:
-                loss, logged = self._training_loss(batch, tasks, generator)
-            else:
-                loss, logged = self._validation_loss(batch)
+                loss, logged = self._training_loss(batch, rows, generator)
+            else:  # at the recorded locations of episodes that are held out
+                recorded = self._recorded_locations(batch["episode_index"].tolist(), rows.tolist())
+                loss, logged = self._acting_loss(batch, self._images(batch), recorded)
         return self._finish_step(batch, loss, logged, reduction)
 
     def _training_loss(
-        self, batch: dict[str, Any], tasks: list[str], generator: torch.Generator
+        self, batch: dict[str, Any], rows: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the loss of each sample, (batch,), and its parts to log."""
         config, located = self.config, self.training_locations
         assert located is not None
-        assert self.training_bank is not None
-        images, rows = self._images(batch), self.training_bank.episode_rows(batch["episode_index"])
-        instructions = self._draw_instructions(tasks, generator)
-        changes = random_color_changes(len(rows), config.p_hue_augmentation, generator)
-        # Some samples, evenly spaced in the batch, train the finding of places.
-        n_some = max(1, round(_LOCATED_FRACTION * len(rows)))
+        instructions = self._draw_instructions(list(batch["task"]), generator)
+        changes = random_color_changes(len(rows), config.p_color_jitter, generator)
+        # Some samples, evenly spaced in the batch, train the place network and the attention.
+        n_some = max(1, round(_PLACE_FRACTION * len(rows)))
         some = torch.arange(n_some) * len(rows) // n_some
-        finding = self._place_losses(
+        place_losses = self._place_losses(
             batch["episode_index"][some.to(rows.device)],
-            [tasks[sample] for sample in some.tolist()],
+            [batch["task"][sample] for sample in some.tolist()],
             [instructions[sample] for sample in some.tolist()],
             changes[some],
             generator,
         )  # (some, 2)
-        noise = torch.randn(located.locations[rows].shape, generator=generator).to(rows.device)
-        locations = located.locations[rows] + config.location_noise * noise
-        noise = torch.randn(len(rows), generator=generator).to(rows.device)
-        heights = located.heights[rows] + _HEIGHT_NOISE * noise
-        images = change_colors(images, changes)
-        loss, logged = self._acting_loss(batch, images, locations, heights, generator)
-        # An episode without a grasp has no locations, and teaches nothing.
-        loss = torch.where((rows >= 0) & located.has_grasp[rows], loss, 0.0)
-        loss = loss.index_add(0, some.to(rows.device), len(rows) / n_some * finding.sum(dim=1))
+        location_noise = torch.randn(located.locations[rows].shape, generator=generator).to(rows.device)
+        height_noise = torch.randn(len(rows), generator=generator).to(rows.device)
+        noisy = TrainingLocations(
+            located.locations[rows] + config.location_noise * location_noise,
+            located.heights[rows] + _HEIGHT_NOISE * height_noise,
+            located.has_grasp[rows],
+        )
+        images = change_colors(self._images(batch), changes)
+        loss, logged = self._acting_loss(batch, images, noisy, generator)
+        loss = loss.index_add(0, some.to(rows.device), len(rows) / n_some * place_losses.sum(dim=1))
         names = ("place_loss", "attention_loss")
-        return loss, logged | dict(zip(names, finding.mean(dim=0), strict=True))
+        return loss, logged | dict(zip(names, place_losses.mean(dim=0), strict=True))
+
+    def _acting_loss(
+        self,
+        batch: dict[str, Any],
+        images: Tensor,
+        located: TrainingLocations,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the imitation loss of each sample, (batch,), and its parts to log.
+
+        An episode without a grasp has no locations, and no loss.
+        """
+        inputs = self._fuse_inputs(batch, located.locations, located.heights, generator)
+        predicted, gripper = self.model(images, None, inputs, located.locations)
+        loss, logged = self._imitation_loss(batch, predicted, gripper, _GRIPPER_LOSS)
+        return torch.where(located.has_grasp, loss, 0.0), logged
 
     def _place_losses(
         self,
@@ -239,7 +245,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         changes: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """Computes the losses of finding the places in the first images of episodes.
+        """Computes the losses of the place maps, and of the attention to demonstrations.
 
         Args:
             episodes: Episodes of the samples, (batch,), as indices of the dataset.
@@ -251,16 +257,16 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         Returns:
             Losses of the place and of the attention, (batch, 2); 0 for an episode without a grasp.
         """
-        bank, located = self.training_bank, self.training_locations
-        assert bank is not None
-        assert located is not None
+        assert self.training_data is not None
+        assert self.training_locations is not None
+        bank, located = self.training_data.demonstrations, self.training_locations
         rows, device = bank.episode_rows(episodes), episodes.device
         others = bank.draw_other_episodes(episodes, tasks, generator)
-        both_grasp = (rows >= 0) & located.has_grasp[rows] & located.has_grasp[others]
-        scenes, locations = _shifted(
+        both_grasp = located.has_grasp[rows] & located.has_grasp[others]
+        scenes, locations = _augment(
             bank.frames[rows, 0].float() / 255, located.locations[rows, 1:], generator
         )  # (batch, 3, H, W)
-        ends, demonstrated = _shifted(
+        ends, demonstrated = _augment(
             bank.frames[others][:, [0, -1]].float() / 255, located.locations[others], generator
         )  # (batch, 2, 3, H, W)
         attention = self.attention(change_colors(ends, changes))
@@ -271,6 +277,79 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         attention_losses = location_loss(log_attention, demonstrated).sum(dim=1, keepdim=True)
         losses = torch.cat([location_loss(maps[:, None], locations), attention_losses], dim=1)
         return torch.where(both_grasp[:, None], losses, 0.0)
+
+    # Acting
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
+        """Returns the actions of a chunk, (batch, steps, action). See `select_action`."""
+        if self._begins_episode(batch):
+            instructions, demonstrations = self._tasks_of(batch)
+            if demonstrations is None:
+                demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
+            localization = self.localize(batch, instructions, demonstrations)
+            self._start(RunningEpisode(instructions, localization, self._acting_network()))
+        episode: RunningEpisode = self._episode
+        locations, heights = episode.localization.locations, episode.localization.heights
+        inputs = self._fuse_inputs(batch, locations, heights)
+        return self._sample_action(batch, *episode.network(self._images(batch), None, inputs, locations))
+
+    @property
+    def localization(self) -> PickPlace | None:
+        """Where the policy picks and places in the running episode; None before its first action."""
+        return None if self._episode is None else self._episode.localization
+
+    @property
+    def pick_confidence(self) -> Tensor | None:
+        """Probability of the pick location among the proposals, (batch,); None before the first action."""
+        return None if self._episode is None else self._episode.localization.confidence
+
+    @torch.no_grad()
+    def localize(
+        self, batch: dict[str, Any], instructions: Sequence[str], demonstrations: DemonstrationsOfTasks
+    ) -> PickPlace:
+        """Finds where to pick and place in the first images of episodes.
+
+        Args:
+            batch: As in `select_action`, at the start of the episodes.
+            instructions: Instruction of each sample; an empty string leaves it out.
+            demonstrations: Demonstrations of each sample, the same number for each; an empty list leaves them
+                out.
+
+        Raises:
+            ValueError: Neither is given, or samples have different numbers of demonstrations.
+        """
+        camera = self.config.cameras[0]
+        scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
+        by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
+        given = self._batch_demonstrations(demonstrations, scenes.device)
+        attention = last = descriptors = heights = None
+        if given is None:
+            if not bool(by_instruction.all()):
+                raise ValueError("Neither a demonstration nor an instruction is given. Pass one of them.")
+        else:
+            n_each = given.ends.shape[1]
+            ends, states = given.ends.flatten(0, 1), given.pick_states.flatten(0, 1)
+            attentions = self.attention(ends)
+            attended = peak_locations(attentions.clamp_min(_MIN_ATTENTION).log())[:, 0]
+            picks, first_images = self.robot_states.pick_locations(states), given.first_images.flatten(0, 1)
+            descriptors = self.feature_matching.describe(ends[:, 0], first_images, picks, attended)
+            descriptors = descriptors.unflatten(0, (-1, n_each)).mean(dim=1)
+            heights = self.robot_states.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
+            attention, last = attentions[::n_each], ends[::n_each, 1]
+        candidates = self.feature_matching.find(scenes, batch[camera], instructions, descriptors, heights)
+        pick, confidence, height = candidates.best
+        place_maps = self._place_maps(
+            scenes, by_instruction, instructions, last, None if attention is None else attention[:, 1]
+        )
+        return PickPlace(
+            locations=torch.stack([pick, peak_locations(place_maps[:, None])[:, 0]], dim=1),
+            heights=height + self.config.grasp_height_bias,
+            maps=torch.stack([candidates.map(place_maps.shape[1:]), place_maps], dim=1),
+            attention=attention,
+            by_demonstration=(given is not None, given is not None and not bool(by_instruction.all())),
+            confidence=confidence,
+        )
 
     def _place_maps(
         self,
@@ -298,148 +377,28 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             target = torch.where(by_instruction[:, None], target, self.place.target(last, attention))
         return self.place(scenes, instruction, target)
 
-    def _validation_loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Returns the imitation loss at the recorded locations; 0 for an episode without a grasp."""
-        recorded = self._recorded_locations(batch["episode_index"].tolist())
-        images = self._images(batch)
-        loss, logged = self._acting_loss(batch, images, recorded.locations, recorded.heights)
-        return torch.where(recorded.has_grasp, loss, 0.0), logged
-
-    def _recorded_locations(self, episodes: Sequence[int]) -> TrainingLocations:
-        """Returns the locations of episodes of the training dataset, (batch, ...); reads held-out ones."""
-        located, bank = self.training_locations, self.training_bank
-        meta, device = self._meta, self.step.device
-        assert located is not None
-        assert bank is not None
-        bank_rows = bank.episode_rows(torch.tensor(episodes, device=device))
-        rows = dict(zip(episodes, bank_rows.tolist(), strict=True))
-        new = [episode for episode, row in rows.items() if row < 0 and episode not in self._held_out]
-        if new:
-            assert meta is not None
-            data = read_robot_data(open_dataset("--dataset.root", meta.repo_id, meta.root, new), new)
-            keyframes = self.keyframes_of(data._replace(states=data.states.to(device)))
-            read = zip(*self.robot_states.locate(keyframes), strict=True)
-            self._held_out.update(zip(new, starmap(TrainingLocations, read), strict=True))
-        each = [
-            self._held_out[episode] if rows[episode] < 0 else [part[rows[episode]] for part in located]
-            for episode in episodes
-        ]
-        return TrainingLocations(*map(torch.stack, zip(*each, strict=True)))
-
-    def _acting_loss(
-        self,
-        batch: dict[str, Any],
-        images: Tensor,
-        locations: Tensor,
-        heights: Tensor,
-        generator: torch.Generator | None = None,
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Returns the imitation loss of each sample, (batch,), and its parts to log."""
-        concat = self._concatenated(batch, locations, heights, generator)
-        predicted, gripper = self.model(images, None, concat, locations)
-        return self._imitation_loss(batch, predicted, gripper, _GRIPPER_LOSS)
-
-    # Acting
-
-    @torch.no_grad()
-    def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """Returns the actions of a chunk, (batch, steps, action). See `select_action`."""
-        if self._begins_episode(batch):
-            instructions, demonstrations = self._tasks_of(batch)
-            if demonstrations is None:
-                demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
-            found = self._find(batch, instructions, demonstrations)
-            self._start(Episode(instructions, found, self._acting_network()))
-        episode: Episode = self._episode
-        locations, heights = episode.found.locations, episode.found.heights
-        concat = self._concatenated(batch, locations, heights)
-        return self._chosen(batch, *episode.network(self._images(batch), None, concat, locations))
-
-    @property
-    def found(self) -> Found | None:
-        """What was found at the start of the running episode; None before its first action."""
-        return None if self._episode is None else self._episode.found
-
-    @property
-    def p_pick(self) -> Tensor | None:
-        """Probability of the pick location among the proposals, (batch,); None before the first action."""
-        return None if self._episode is None else self._episode.found.p_pick
-
-    def keyframes_of(self, data: RobotData) -> Keyframes:
-        """Returns the keyframes of episodes that the policy was not trained on."""
-        gripper, usual = self.config.gripper_opening(data.actions), self.config.gripper_range
-        return find_keyframes(data.states, gripper, data.spans, usual)
-
-    @torch.no_grad()
-    def _find(
-        self,
-        batch: dict[str, Any],
-        instructions: Sequence[str],
-        demonstrations: DemonstrationsOfTasks,
-    ) -> Found:
-        """Finds the locations of tasks in the first images of episodes.
-
-        Args:
-            batch: As in `select_action`, at the start of the episodes.
-            instructions: Instruction of each sample; an empty string leaves it out.
-            demonstrations: Demonstrations of each sample, the same number for each; an empty list leaves them
-                out.
-        """
-        camera = self.config.cameras[0]
-        scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
-        by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
-        stacked = self._stacked(demonstrations, scenes.device)
-        attention = last = described = heights = None
-        if stacked is None:
-            if not bool(by_instruction.all()):
-                raise ValueError("Neither a demonstration nor an instruction is given. Pass one of them.")
-        else:
-            n_each = stacked.ends.shape[1]
-            ends, states = stacked.ends.flatten(0, 1), stacked.pick_states.flatten(0, 1)
-            every = self.attention(ends)
-            attended = peak_locations(every.clamp_min(_MIN_ATTENTION).log())[:, 0]
-            picks, native = self.robot_states.pick_locations(states), stacked.first_images.flatten(0, 1)
-            described = self.feature_matching.describe(ends[:, 0], native, picks, attended)
-            described = described.unflatten(0, (-1, n_each)).mean(dim=1)
-            heights = self.robot_states.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
-            attention, last = every[::n_each], ends[::n_each, 1]
-        candidates = self.feature_matching.find(scenes, batch[camera], instructions, described, heights)
-        pick, p_pick, height = candidates.best
-        place_maps = self._place_maps(
-            scenes, by_instruction, instructions, last, None if attention is None else attention[:, 1]
-        )
-        locations = torch.stack([pick, peak_locations(place_maps[:, None])[:, 0]], dim=1)
-        maps = torch.stack([candidates.map(place_maps.shape[1:]), place_maps], dim=1)
-        by_demonstration = (stacked is not None, stacked is not None and not bool(by_instruction.all()))
-        bias = self.config.grasp_height_bias
-        return Found(locations, height + bias, maps, attention, by_demonstration, p_pick)
-
-    # Inputs
-
-    def _stacked(
+    def _batch_demonstrations(
         self, demonstrations: DemonstrationsOfTasks, device: torch.device
-    ) -> StackedDemonstrations | None:
-        """Stacks the demonstrations of a batch; None if they are left out."""
-        counts = {len(own) for own in demonstrations}
+    ) -> DemonstrationBatch | None:
+        """Batches the demonstrations of several tasks; None if they are left out."""
+        counts = {len(shown) for shown in demonstrations}
         if len(counts) != 1:
             raise ValueError(
                 f"The samples of a batch must have as many demonstrations each. Got {sorted(counts)}."
             )
-        if counts == {0}:
+        (n_each,) = counts
+        if not n_each:
             return None
+        flat = list(chain.from_iterable(demonstrations))
         unknown = torch.full((self.config.state_dim,), torch.nan)
-
-        def stacked(part: Callable[[Demonstration], Tensor]) -> Tensor:
-            rows = [torch.stack([part(each) for each in own]) for own in demonstrations]
-            return torch.stack(rows).to(device)
-
-        return StackedDemonstrations(
-            stacked(lambda each: each.frames[[0, -1]]).float() / 255,
-            stacked(lambda each: each.frames[0] if each.first_image is None else each.first_image),
-            stacked(lambda each: unknown if each.pick_state is None else each.pick_state.cpu()),
+        parts = (
+            torch.stack([shown.frames[[0, -1]] for shown in flat]).to(device).float() / 255,
+            torch.stack([s.frames[0] if s.first_image is None else s.first_image for s in flat]).to(device),
+            torch.stack([unknown if s.pick_state is None else s.pick_state.cpu() for s in flat]).to(device),
         )
+        return DemonstrationBatch(*(part.unflatten(0, (-1, n_each)) for part in parts))
 
-    def _concatenated(
+    def _fuse_inputs(
         self,
         batch: dict[str, Any],
         locations: Tensor,
@@ -453,74 +412,114 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         offsets = self.robot_states(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
 
-    # Training data
+    # Before the first step
 
-    def set_training_data(self, bank: DemonstrationBank, robot_data: RobotData | None) -> None:
-        """Finds the locations of the training episodes, and fits everything that depends only on them.
+    def fit(self, data: TrainingData) -> None:
+        """Finds the locations of the training episodes, and fits feature matching to them.
 
         Args:
-            bank: The training episodes.
-            robot_data: States and actions of the robot in them.
+            data: The training episodes.
 
         Raises:
             ValueError: There are too few episodes in which the gripper closes and opens, or no task with two
                 of them.
             PretrainedWeightsError: The weights that feature matching needs are missing.
         """
-        super().set_training_data(bank, robot_data)
-        assert robot_data is not None
-        assert self.training_bank is not None
-        config, device, frames = self.config, self.step.device, self.training_bank.frames
-        states = robot_data.states.to(device)
-        gripper = config.gripper_opening(robot_data.actions).to(device)
-        keyframes = find_keyframes(states, gripper, robot_data.spans)
-        warn_of_missing(keyframes, bank.episodes.tolist(), "are not trained on")
-        warn_if_inverted(gripper, robot_data, config.gripper_closed)
-        zero_and_one = torch.stack([torch.zeros(states.shape[1]), torch.ones(states.shape[1])])
-        shift, end = self._normalized(zero_and_one).to(device)
-        is_arm = ~follows_gripper(states, gripper, robot_data.spans)
-        n_grasps = int(keyframes.has_grasp.sum())
-        if n_grasps < MIN_EPISODES:
-            assert self._meta is not None
-            raise ValueError(
-                f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} episodes "
-                f"in which the gripper closes and opens. Got {n_grasps}. Collect more, or train "
-                "--policy.type=deltaco with --policy.demo_encoder=attention, which needs none. The gripper "
-                f"is {config.name_gripper(self._meta.features)}, whose {config.gripper_closed} values close "
-                "it; see --policy.gripper and --policy.gripper_closed."
-            )
-        carried = robot_data.images_at(keyframes.carried.tolist(), config.image_size).to(device)
-        images = (frames[:, 0], carried, frames[:, -1])
-        located = self.robot_states.fit(keyframes, *images, end - shift, shift, is_arm)
-        self.training_locations = located
-        self.training_bank.pick_states = keyframes.pick_states
+        self.fit_locations(data)
         if not bool(self.feature_matching.fitted):
-            picks = torch.where(located.has_grasp[:, None], located.locations[:, 0], torch.nan)
-            native = self.training_bank.first_images
-            tasks = self.training_bank.tasks
-            self.feature_matching.fit(
-                frames[:, 0],
-                frames[:, -1],
-                frames[:, 0] if native is None else native,
-                picks,
-                located.heights,
-                tasks,
-                self._sentences(tasks),
-                config.seed,
-                in_bfloat16=config.dtype == "bfloat16",
+            self.fit_matching()
+
+    def fit_locations(self, data: TrainingData) -> None:
+        """Fits the map from robot states to image locations, and the states at locations, in seconds.
+
+        Args:
+            data: The training episodes.
+
+        Raises:
+            ValueError: There are too few episodes in which the gripper closes and opens.
+        """
+        super().fit(data)
+        bank, robot, grasps = data.demonstrations, data.robot, data.grasps
+        assert robot is not None
+        assert grasps is not None
+        assert self.config.gripper_command is not None
+        opening = self.config.gripper_command.opening(robot.actions)
+        warn_of_missing(grasps, bank.episodes.tolist(), "are not trained on")
+        warn_if_inverted(opening, robot, self.config.gripper_closed)
+        n_grasps = int(grasps.has_grasp.sum())
+        if n_grasps < MIN_EPISODES:
+            raise ValueError(
+                f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} "
+                f"episodes in which the gripper closes and opens. Got {n_grasps}. Collect more, or train "
+                "--policy.type=deltaco with --policy.demo_encoder=attention, which needs none. The gripper "
+                f"is dimension {self.config.gripper} of the action, whose {self.config.gripper_closed} "
+                "values close it; see --policy.gripper and --policy.gripper_closed."
             )
+        zero_and_one = torch.stack([torch.zeros(self.config.state_dim), torch.ones(self.config.state_dim)])
+        shift, end = self._normalize_states(zero_and_one).to(robot.states.device)
+        carried = robot.images_at(grasps.carried.tolist()).to(bank.frames.device)
+        self.training_locations = self.robot_states.fit(
+            grasps,
+            bank.frames[:, 0],
+            carried,
+            bank.frames[:, -1],
+            end - shift,
+            shift,
+            ~follows_gripper(robot.states, opening, robot.spans),
+        )
+
+    def fit_matching(self) -> None:
+        """Fits feature matching to the first images of the training episodes, in minutes.
+
+        Raises:
+            ValueError: No task has two episodes with a grasp, or no proposal is near a grasp.
+            PretrainedWeightsError: The encoder's weights are missing.
+        """
+        assert self.training_data is not None
+        assert self.training_locations is not None
+        bank, located = self.training_data.demonstrations, self.training_locations
+        self.feature_matching.fit(
+            bank.frames[:, 0],
+            bank.frames[:, -1],
+            bank.frames[:, 0] if bank.first_images is None else bank.first_images,
+            torch.where(located.has_grasp[:, None], located.locations[:, 0], torch.nan),
+            located.heights,
+            bank.tasks,
+            self._sentences(bank.tasks),
+            self.config.seed,
+            in_bfloat16=self.config.dtype == "bfloat16",
+        )
+
+    def _recorded_locations(self, episodes: Sequence[int], rows: Sequence[int]) -> TrainingLocations:
+        """Returns the locations of episodes, (batch, ...); reads those that are held out."""
+        meta, device, located = self._meta, self.step.device, self.training_locations
+        assert located is not None
+        row_of = dict(zip(episodes, rows, strict=True))
+        new = [episode for episode, row in row_of.items() if row < 0 and episode not in self._held_out]
+        if new:
+            assert meta is not None
+            dataset = open_dataset("--dataset.root", meta.repo_id, meta.root, new)
+            data = TrainingData.read(DatasetEpisodes(dataset, new), self.config.demonstration_format)
+            assert data.grasps is not None
+            read = zip(*self.robot_states.locate(data.grasps.to(device)), strict=True)
+            self._held_out.update(zip(new, starmap(TrainingLocations, read), strict=True))
+        found = [
+            self._held_out[episode] if row < 0 else TrainingLocations(*(part[row] for part in located))
+            for episode, row in zip(episodes, rows, strict=True)
+        ]
+        return TrainingLocations(*map(torch.stack, zip(*found, strict=True)))
 
     def _sentences(self, tasks: Iterable[str]) -> dict[str, list[str]]:
         """Returns the instructions of tasks in training; a task string is repeated by its probability."""
         sentences = {}
         for task in dict.fromkeys(tasks):
-            own = [] if self.paraphrases is None else list(self.paraphrases.of(task))
-            p = self.config.p_paraphrase if own else 0.0
-            n_templates = 1 if p == 0 else round(len(own) * (1 - p) / p)
-            sentences[task] = [task] * n_templates + (own if p else [])
+            others = [] if self.paraphrases is None else list(self.paraphrases.of(task))
+            p = self.config.p_paraphrase if others else 0.0
+            n_templates = 1 if p == 0 else round(len(others) * (1 - p) / p)
+            sentences[task] = [task] * n_templates + (others if p else [])
         return sentences
 
-    def _normalized(self, states: Tensor) -> Tensor:
+    def _normalize_states(self, states: Tensor) -> Tensor:
         """Normalizes robot states (n, state) as the network gets them, without clipping, on the CPU."""
         step = NormalizerProcessorStep(
             {OBS_STATE: self.config.robot_state_feature}, self.config.normalization_mapping, self._stats
@@ -528,25 +527,24 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         normalized = step(create_transition(observation={OBS_STATE: states}))
         return normalized[TransitionKey.OBSERVATION][OBS_STATE] * self.state_limits.scale.cpu()
 
-    def _complete_bank(self, bank: DemonstrationBank, dataset: LeRobotDataset) -> None:
-        data = read_robot_data(dataset, bank.episodes.tolist())
-        assert self.config.action_feature is not None
-        sizes = (data.states.shape[1], data.actions.shape[1])
-        expected = (self.config.state_dim, self.config.action_feature.shape[0])
-        if sizes != expected:
-            raise ValueError(
-                f"The demonstrations in {self.config.demo_repo_id} are of another robot: their states and "
-                f"actions have {sizes[0]} and {sizes[1]} numbers, those of the policy {expected[0]} and "
-                f"{expected[1]}. Name a dataset of the policy's robot."
-            )
-        keyframes = self.keyframes_of(data)
-        warn_of_missing(
-            keyframes, bank.episodes.tolist(), "what they moved is found from their first and last image"
-        )
-        bank.pick_states = keyframes.pick_states
+    def _check_demonstrations(self, data: TrainingData) -> None:
+        if data.grasps is not None:
+            episodes = data.demonstrations.episodes.tolist()
+            consequence = "what they moved is found from their first and last image"
+            warn_of_missing(data.grasps, episodes, consequence)
+            assert data.robot is not None
+            assert self.config.action_feature is not None
+            sizes = (data.robot.states.shape[1], data.robot.actions.shape[1])
+            expected = (self.config.state_dim, self.config.action_feature.shape[0])
+            if sizes != expected:
+                raise ValueError(
+                    f"The demonstrations in {self.config.demo_repo_id} are of another robot: their states "
+                    f"and actions have {sizes[0]} and {sizes[1]} numbers, those of the policy "
+                    f"{expected[0]} and {expected[1]}. Name a dataset of the policy's robot."
+                )
 
 
-def _shifted(images: Tensor, locations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _augment(images: Tensor, locations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Shifts images (batch, ..., H, W) and locations in them (batch, n, 2) at random."""
     shifts = random_shifts(len(images), _SHIFT_PADDING, generator)
     height, width = images.shape[-2:]
