@@ -185,7 +185,7 @@ def policy(batch_size: int = 128, seconds: float = 5.0) -> dict[str, float]:
         seen = {name: value[:1] for name, value in samples.items() if name.startswith("observation.")}
         seen["task"] = samples["task"][:1]
         for name, options in variants.items():
-            config = make_policy_config(**options, device=device(), dtype="float32")
+            config = make_policy_config(**options, device=device(), precision="float32")
             made: Any = make_policy(config, ds_meta=dataset.meta).train()
             before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
             optimizer = config.get_optimizer_preset().build(made.get_optim_params())

@@ -224,7 +224,7 @@ def hold_in_memory(dataset, **options):
 
 _SMALL = {
     "deltaco": {"image_size": 16, "backbone": "strided"},
-    "deltaco_match": {"image_size": TABLE_SIZE, "num_mixture_components": 2, "dtype": "float32"},
+    "deltaco_match": {"image_size": TABLE_SIZE, "num_mixture_components": 2, "precision": "float32"},
 }
 
 
@@ -301,8 +301,7 @@ def load_tiny_policy(folder, **options):
 # Trainings
 
 DELTACO = {"policy.type": "deltaco", "policy.backbone": "strided", "policy.tasks_per_batch": 2}
-# accelerate keeps its precision for the whole process.
-MATCH = {"policy.type": "deltaco_match", "policy.tasks_per_batch": 2, "policy.dtype": "float32"}
+MATCH = {"policy.type": "deltaco_match", "policy.tasks_per_batch": 2, "policy.precision": "float32"}
 _SMALL_ACT = {
     **{"type": "act", "pretrained_backbone_weights": "null", "push_to_hub": False},
     **{"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "chunk_size": 5, "n_action_steps": 5},

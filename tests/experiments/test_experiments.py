@@ -289,7 +289,7 @@ def test_policies_accept_their_options():
 
     for name in experiment_names():
         options = dict(read_recipe(name).policy)
-        options.pop("dtype", None)  # depends on the CPU
+        options.pop("precision", None)  # depends on the CPU
         kind = PreTrainedConfig.get_choice_class(options.pop("type"))
         config = kind(**options)
         assert {option: getattr(config, option) for option in options} == options

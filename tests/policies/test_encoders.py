@@ -202,7 +202,7 @@ def pretrained(make, dataset, fake_language):
 @pytest.mark.parametrize(
     "options",
     [
-        {"demo_rows": 2, "demo_head": [8], "dtype": "bfloat16"},
+        {"demo_rows": 2, "demo_head": [8], "precision": "bfloat16"},
         {"method": "demo_only", "encoder_loss": "none"},
         {"method": "mcil", "demo_head": [8]},
     ],

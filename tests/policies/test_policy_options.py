@@ -25,7 +25,7 @@ def test_defaults_of_deltaco_are_those_of_the_paper():
     optimizer = config.get_optimizer_preset()
     assert (optimizer.lr, optimizer.weight_decay, optimizer.grad_clip_norm) == (3e-4, 0, 0)
     assert config.get_scheduler_preset() is None
-    assert (config.tasks_per_batch, config.push_to_hub, config.dtype) == (16, False, "float32")
+    assert (config.tasks_per_batch, config.push_to_hub, config.precision) == (16, False, "float32")
     modes = NormalizationMode.IDENTITY, MEAN_STD, NormalizationMode.MIN_MAX
     assert config.normalization_mapping == dict(zip(("VISUAL", "STATE", "ACTION"), modes, strict=True))
 
@@ -61,9 +61,9 @@ def test_invalid_options_say_what_is_valid():
 
 
 def test_bfloat16_needs_instructions_of_the_processor(monkeypatch, caplog):
-    for supported, dtype in ((True, "bfloat16"), (False, "float32")):
+    for supported, precision in ((True, "bfloat16"), (False, "float32")):
         monkeypatch.setattr(base_config, "has_bfloat16", lambda: supported)  # noqa: B023
-        assert DeltacoMatchConfig(device="cpu").dtype == dtype
+        assert DeltacoMatchConfig(device="cpu").precision == precision
         assert ("no bfloat16 instructions" in caplog.text) == (not supported)
 
 

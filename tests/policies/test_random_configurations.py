@@ -14,7 +14,7 @@ COMMON = {
     "num_mixture_components": [1, 5, 0],
     "gripper_closed": ["low", "x"],
     "demo_camera": [None, "observation.images.none"],
-    "dtype": ["float32", "bfloat16", "int8"],
+    "precision": ["float32", "bfloat16", "int8"],
     "optimizer_lr": [3e-4, 0.0],
     "grad_clip_norm": [0.0, 1.0, -1.0],
 }

@@ -66,7 +66,7 @@ class TaskConditionedConfig(PreTrainedConfig):
             each batch of `deltaco train`.
         upsampled_fraction: Fraction of each batch for the upsampled tasks; 0.5 in the paper's scenario B.
         seed: Seed for drawing demonstrations and shifts; the draws also depend on the step.
-        dtype: Precision of training: float32 or bfloat16; the last layers, and evaluation, always use
+        precision: Precision of training: float32 or bfloat16; the last layers, and evaluation, always use
             float32. So does a CPU without bfloat16 instructions.
         optimizer_lr: Learning rate of AdamW.
         optimizer_weight_decay: Weight decay of AdamW.
@@ -93,7 +93,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     upsampled_tasks: str | None = None
     upsampled_fraction: float = 0.5
     seed: int = 0
-    dtype: str = "float32"
+    precision: str = "float32"
     optimizer_lr: float = 3e-4
     optimizer_weight_decay: float = 0.0
     scheduler_warmup_steps: int = 0
@@ -109,9 +109,9 @@ class TaskConditionedConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.dtype == "bfloat16" and self.device == "cpu" and not has_bfloat16():
+        if self.precision == "bfloat16" and self.device == "cpu" and not has_bfloat16():
             logger.warning("This CPU has no bfloat16 instructions: training computes in float32.")
-            self.dtype = "float32"
+            self.precision = "float32"
         try:
             self.check()
         except ValueError as error:
@@ -125,7 +125,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         Raises:
             ValueError: An option is invalid; the message says what is valid.
         """
-        self.check_choices(gripper_closed=("low", "high"), dtype=("float32", "bfloat16"))
+        self.check_choices(gripper_closed=("low", "high"), precision=("float32", "bfloat16"))
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
             raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
         self.check_ranges(

@@ -360,7 +360,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     def _autocast(self, device: torch.device) -> contextlib.AbstractContextManager:
         """Returns a context in which training uses the configured precision."""
-        if self.config.dtype == "float32":
+        if self.config.precision == "float32":
             return contextlib.nullcontext()
         return torch.autocast(device.type, torch.bfloat16)
 

@@ -50,7 +50,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     p_color_jitter: float = 0.7
     frames_after_release: int | None = 2
     p_paraphrase: float = 0.5
-    dtype: str = "bfloat16"
+    precision: str = "bfloat16"
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.2
     scheduler_warmup_steps: int = 200

@@ -487,7 +487,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             bank.tasks,
             self._sentences(bank.tasks),
             self.config.seed,
-            in_bfloat16=self.config.dtype == "bfloat16",
+            in_bfloat16=self.config.precision == "bfloat16",
         )
 
     def _recorded_locations(self, episodes: Sequence[int], rows: Sequence[int]) -> TrainingLocations:
