@@ -37,10 +37,6 @@ EXPERIMENT = "random_objects/deltaco_match"
 # fast, idle cores. 25 minutes are enough for the full recipe.
 BUDGETS: MappingProxyType[Minutes, tuple[int, int]] = MappingProxyType({8: (3, 800), 25: (16, 8000)})
 
-# A scene, and tasks whose demonstrations show two novel objects in it: the gray half donut and the yellow
-# lampshade. With either demonstration, either sentence is a task.
-SCENE_TASK, SCENE_SEED, DEMONSTRATED_TASKS = 25, 1002, (25, 29)
-
 _CALIBRATION_SIZE, _CALIBRATION_REPEATS = 1024, 20
 
 
@@ -82,7 +78,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     scene = run.out / "scene.json"
     if not scene.is_file():
         with _timed(times, "videos"):
-            write_json(scene, [view._asdict() for view in record_scene(last_checkpoint(run.folder))])
+            write_json(scene, [view._asdict() for view in record_showcase(last_checkpoint(run.folder))])
     record, spent = _record(run, recipe.evaluation), read_json(times)
     total = np.sum(list(spent.values()), axis=0).tolist()
     rate, low, high = (100 * number for number in success_interval(record.episodes))
@@ -140,19 +136,14 @@ def _timed(path: Path, name: str) -> Iterator[None]:
         write_json(path, {**times, name: (spent + times.get(name, [0, 0])).tolist()})
 
 
-def record_scene(checkpoint: Path) -> list[EpisodeView]:
-    """Runs a policy in one scene, with each of two demonstrations and each of two sentences.
-
-    Args:
-        checkpoint: Folder of the policy, which has demonstrations of the test tasks.
-    """
+def record_showcase(checkpoint: Path) -> list[EpisodeView]:
+    """Runs a policy in one scene, with each of two demonstrations and each of two sentences."""
     # Only here, since LeRobot takes seconds to import.
     from lerobot_deltaco.evaluation.video import load_conditioned
-    from lerobot_deltaco.pages.player import Choice, Player, cross_inputs
+    from lerobot_deltaco.pages.player import SHOWCASE, Player
 
     player = Player(load_conditioned(checkpoint))
-    choices = cross_inputs([Choice(SCENE_TASK, SCENE_SEED, task, 0, "") for task in DEMONSTRATED_TASKS])
-    return [player.run(choice) for choice in choices]
+    return [player.run(choice) for choice in SHOWCASE]
 
 
 def _record(run: Run, plan: EvaluationPlan) -> EvaluationRecord:

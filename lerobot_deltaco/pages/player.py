@@ -64,6 +64,10 @@ def cross_inputs(demonstrations: Sequence[Choice]) -> list[Choice]:
     ]
 
 
+# A scene with two novel objects, the gray half donut and the yellow lampshade
+SHOWCASE = cross_inputs([Choice(25, 1002, task, 0, "") for task in (25, 29)])
+
+
 class Player:
     """A policy, its demonstrations, and a simulator.
 

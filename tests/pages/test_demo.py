@@ -14,6 +14,7 @@ from lerobot_deltaco.experiments import run as experiments
 from lerobot_deltaco.experiments.recipes import ExperimentError
 from lerobot_deltaco.pages import demo
 from lerobot_deltaco.pages.html import EpisodeView
+from lerobot_deltaco.pages.player import SHOWCASE
 
 
 class FakeDemoCommands(FakeCommands):
@@ -35,7 +36,7 @@ def commands(monkeypatch):
     fake = FakeDemoCommands()
     monkeypatch.setattr(experiments, "call", fake)
 
-    def record_scene(checkpoint):
+    def record_showcase(checkpoint):
         picture, video = "data:image/jpeg", "data:video/mp4"
         return [
             EpisodeView(sentence, name, [picture] * 2, n == 0, "", ["It put ..."], picture, video)
@@ -43,7 +44,7 @@ def commands(monkeypatch):
             for n, sentence in enumerate(("green bin", "red bin"))
         ]
 
-    monkeypatch.setattr(demo, "record_scene", record_scene)
+    monkeypatch.setattr(demo, "record_showcase", record_showcase)
     return fake
 
 
@@ -77,10 +78,9 @@ def test_finished_steps_are_skipped(tmp_path, commands):
     assert json.loads(times.read_text())["evaluate"] > first
 
 
-def test_the_scene_holds_what_the_demonstrations_show():
-    env = PickPlaceEnv(demo.SCENE_TASK)
-    seed = records.EvaluationPlan(seed=demo.SCENE_SEED).scene_seed(demo.SCENE_TASK, 0)
-    _, info = env.reset(seed=seed)
-    env.close()
-    for task_id in demo.DEMONSTRATED_TASKS:
-        assert len(set(info["objects"]) & set(get_task(task_id).targets)) == 1
+def test_the_scene_of_the_videos_holds_what_the_demonstrations_show():
+    for choice in SHOWCASE:
+        env = PickPlaceEnv(choice.task_id)
+        _, info = env.reset(seed=choice.scene_seed)
+        env.close()
+        assert len(set(info["objects"]) & set(get_task(choice.demo_task).targets)) == 1
