@@ -95,6 +95,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
             ("Random choice", 100 * CHANCE, "one of three objects, one of two bins"),
         ],
         n_episodes=len(record.episodes),
+        n_tasks=len(recipe.evaluation.task_ids),
         n_training_episodes=recipe.data.n_episodes,
         training_steps=steps,
         views=[EpisodeView(**row) for row in read_json(scene)],

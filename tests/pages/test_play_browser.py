@@ -123,7 +123,7 @@ def test_the_verdict_is_about_the_typed_sentence_and_the_address_keeps_it(page):
     run_sentence(page, "put the blue goblet into the red one")  # at once
     page.focus("#seed input")
     page.keyboard.press("Tab")  # changes nothing
-    assert "Unknown words: “wavey”" in run_sentence(page, "wavey to me")
+    assert "Read “wavey” as “wave”" in run_sentence(page, "wavey at me")
     assert "task_id=26&seed=7&demo_task=4&" in page.url
     page.fill("#sentence textarea", "")
     page.click("#run")
