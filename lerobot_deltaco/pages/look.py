@@ -115,7 +115,7 @@ def _dataset_episodes(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes:
             distances = (localization.locations[0].cpu() - recorded).norm(dim=1)
             rights = tuple((distances < TOLERANCE).tolist())
             pick, place = (50 * distances).tolist()
-            headline = f"Pick {pick:.0f} %, place {place:.0f} % of the image's side from the recorded"
+            headline = f"Pick off by {pick:.1f} %, place by {place:.1f} % of the image's side"
         ends = None
         if bank is not None:
             ends = np.stack([_image(dataset, row, camera) for row in data.spans[partner]])

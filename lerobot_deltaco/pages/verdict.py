@@ -99,11 +99,11 @@ def asked_for(layout: Layout, sentence: str, demonstrated: Task | None) -> tuple
         task, word = _sentences().get(_key(sentence), (None, None))
     if word is None:
         return "Only the benchmark's own sentences are judged: is this what you meant?"
-    tasks = [each for each in (task, demonstrated) if each is not None]
+    tasks = [known for known in (task, demonstrated) if known is not None]
     if not tasks:
         return "Not judged: the sentence names no object, and there is no demonstration."
     objects = {
-        n for n, item in enumerate(layout.objects) if all(each.describes(item.label) for each in tasks)
+        n for n, item in enumerate(layout.objects) if all(known.describes(item.label) for known in tasks)
     }
     containers = {n for n, item in enumerate(layout.containers) if item.satisfies(word)}
     if not objects:
