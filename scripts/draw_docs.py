@@ -25,12 +25,19 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.sim.camera import Camera
 from gym_deltaco.sim.fixtures import TABLE_BOXES, TRAY_BOXES, table_mesh, tray_mesh
-from gym_deltaco.sim.simulation import Simulation, camera_matrices
+from gym_deltaco.sim.simulation import Simulation
 from gym_deltaco.sim.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, SHAPES, TASK_SETS, get_task
 from lerobot_deltaco.evaluation.records import EvaluationPlan
-from lerobot_deltaco.evaluation.video import benchmark_env, load_conditioned, record_episode
-from lerobot_deltaco.pages.pictures import demonstration_ends, draw_found
+from lerobot_deltaco.evaluation.video import (
+    benchmark_env,
+    find_demonstration,
+    image_locations,
+    load_conditioned,
+    record_episode,
+)
+from lerobot_deltaco.pages.pictures import demonstration_ends, draw_localization
+from lerobot_deltaco.pages.player import SHOWCASE
 
 CHECKPOINT = Path("checkpoints/pick_place")
 # Tasks of all kinds with various containers: six names, three colors, three shapes
@@ -42,10 +49,7 @@ CLOSE_UP = Camera(
 )
 ACCENT = "#c45400"
 
-# A scene of which each demonstration shows another object
-POLICY_TASK, POLICY_TRIAL, DEMONSTRATED_TASKS = 25, 2, (25, 29)
-SENTENCES = ("Put it in green bin.", "Put it in red bin.")
-FOUND_TASK, FOUND_SIZE = 128, 448
+LOCATED_TASK, LOCATED_SIZE = 128, 448
 EPISODE_SIZE, END_SIZE, GAP, HEADER = 224, 108, 8, 30  # px
 N_STEPS, FRAME_MS, LAST_FRAME_MS = 16, 160, 1800
 
@@ -169,9 +173,7 @@ def _reset(env: PickPlaceEnv, task_id: int, number: int) -> dict[str, Any]:
 
 def _pixel(point: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Projects a point of the world, (3,), m, into the benchmark's camera. Returns (x, y), px."""
-    view, projection = (np.reshape(matrix, (4, 4)).T for matrix in camera_matrices(CAMERA))
-    x, y, _, w = projection @ view @ [*point, 1.0]
-    return np.array([1 + x / w, 1 - y / w]) * size / 2
+    return (image_locations(point[None])[0] + 1) * size / 2
 
 
 def _grid(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
@@ -190,23 +192,22 @@ def draw_policy(out: Path) -> None:
     """Draws four episodes of one scene: a row for each demonstration, a column for each sentence."""
     loaded, font = load_conditioned(CHECKPOINT), ImageFont.load_default(size=16)
     env = benchmark_env(loaded.policy.config, EPISODE_SIZE)
-    seed = EvaluationPlan().scene_seed(POLICY_TASK, POLICY_TRIAL)
     left = END_SIZE + 3 * GAP
     canvas = Image.new("RGB", (left + 2 * (EPISODE_SIZE + GAP), HEADER + 2 * (EPISODE_SIZE + GAP)), "white")
     draw = ImageDraw.Draw(canvas)
     draw.text((GAP + END_SIZE / 2, HEADER / 2), "demonstration", "black", font, "mm")
     episodes = []
-    for row, task_id in enumerate(DEMONSTRATED_TASKS):
-        y = HEADER + row * (EPISODE_SIZE + GAP)
-        demonstration = loaded.policy.demonstrations.of_task(get_task(task_id).instruction)[0]
+    for number, choice in enumerate(SHOWCASE):
+        (row, column), sentence = divmod(number, 2), choice.instruction
+        x, y = left + column * (EPISODE_SIZE + GAP), HEADER + row * (EPISODE_SIZE + GAP)
+        demonstration = find_demonstration(loaded.policy, get_task(choice.demo_task), env.scene_config)
         for n, end in enumerate(demonstration_ends(demonstration)):
             image = Image.fromarray(end).resize((END_SIZE, END_SIZE), Image.Resampling.BICUBIC)
             canvas.paste(image, (GAP, y + n * (END_SIZE + GAP)))
-        for column, sentence in enumerate(SENTENCES):
-            x = left + column * (EPISODE_SIZE + GAP)
+        if row == 0:
             draw.text((x + EPISODE_SIZE / 2, HEADER / 2), f"“{sentence}”", "black", font, "mm")
-            recording = record_episode(loaded, env, POLICY_TASK, seed, sentence, [demonstration])
-            episodes.append((x, y, recording.frames))
+        recording = record_episode(loaded, env, choice.task_id, choice.scene_seed, sentence, [demonstration])
+        episodes.append((x, y, recording.frames))
     frames = []
     for step in range(N_STEPS + 1):
         frame = canvas.copy()
@@ -222,11 +223,15 @@ def draw_policy(out: Path) -> None:
 def draw_locations(out: Path) -> None:
     """Draws where the policy looks in one scene."""
     loaded = load_conditioned(CHECKPOINT)
-    demonstration = loaded.policy.demonstrations.of_task(get_task(FOUND_TASK).instruction)[0]
-    env, seed = benchmark_env(loaded.policy.config, FOUND_SIZE), EvaluationPlan().scene_seed(FOUND_TASK, 0)
-    recording = record_episode(loaded, env, FOUND_TASK, seed, demonstration.task, [demonstration])
-    assert recording.found is not None
-    picture = draw_found(recording.frames[0], demonstration_ends(demonstration), recording.found)
+    env, seed = (
+        benchmark_env(loaded.policy.config, LOCATED_SIZE),
+        EvaluationPlan().scene_seed(LOCATED_TASK, 0),
+    )
+    demonstration = find_demonstration(loaded.policy, get_task(LOCATED_TASK), env.scene_config)
+    recording = record_episode(loaded, env, LOCATED_TASK, seed, demonstration.task, [demonstration])
+    assert recording.localization is not None
+    ends = demonstration_ends(demonstration)
+    picture = draw_localization(recording.frames[0], ends, recording.localization)
     picture.quantize(256).save(out / "found.png", optimize=True)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +15,8 @@ from gym_deltaco.control import control_of
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.layout import Layout
 from gym_deltaco.scene_config import SceneConfig
+from gym_deltaco.sim.simulation import camera_matrices
+from gym_deltaco.sim.workspace import CAMERA
 from gym_deltaco.tasks import Task
 from lerobot_deltaco.data.demonstrations import Demonstration, kept_frames
 from lerobot_deltaco.data.images import resize_images
@@ -23,7 +25,6 @@ from lerobot_deltaco.evaluation.episodes import Episode
 from lerobot_deltaco.evaluation.evaluate import run_episodes
 from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
 from lerobot_deltaco.lerobot_env import check_policy_fits
-from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
 
@@ -33,19 +34,19 @@ class Recording(NamedTuple):
 
     Attributes:
         frames: Rendered images before the first step and after each, (render_size, render_size, 3).
-        observed: First image that the policy received, (H, W, 3).
-        found: Locations that the policy found in it; None for policies that find none.
-        info: Info of the environment after the last step.
+        localization: Locations in the first image, by the policy; None for policies that find none.
         layout: Objects and containers of the scene.
-        placed: Pairs of an object and a container in which it has come to rest.
+        positions: Centers of the objects before the first step and after the last, (2, objects, 3), m.
+        placements: Pairs of an object and a container in which it came to rest.
+        grasped_object: Number of the object that the gripper held last; -1 for none.
     """
 
     frames: list[NDArray[np.uint8]]
-    observed: NDArray[np.uint8]
-    found: PickPlace | None
-    info: dict[str, Any]
+    localization: PickPlace | None
     layout: Layout
-    placed: frozenset[tuple[int, int]]
+    positions: NDArray[np.float64]
+    placements: frozenset[tuple[int, int]]
+    grasped_object: int
 
 
 def record_episode(
@@ -67,25 +68,34 @@ def record_episode(
         demonstrations: Demonstrations that the policy receives; empty for none.
     """
     frames: list[NDArray[np.uint8]] = []
-    first: dict[str, Any] = {}
-    placed: set[tuple[int, int]] = set()
+    positions: list[list[NDArray[np.float64]]] = []
+    placements: set[tuple[int, int]] = set()
 
-    def record(envs: Sequence[PickPlaceEnv], observations: Sequence[Any]) -> None:
-        env = envs[0]
-        if not first:
-            observed = first_camera(observations[0], loaded.policy.config)
-            first.update(observed=observed, layout=env.scene.layout)
-        image = env.render()
+    def record(*_: Any) -> None:
+        image, numbers = env.render(), range(len(env.scene.bodies))
         assert image is not None
         frames.append(image)
-        placed.update((n, env.scene.container_of(n)) for n in range(len(env.scene.bodies)))
+        positions.append([env.scene.object_pose(n).position for n in numbers])
+        placements.update((n, env.scene.container_of(n)) for n in numbers)
 
     episode = Episode(task_id, 0, seed, instruction, task_id if demonstrations else -1)
     with torch.inference_mode():
         (info,) = run_episodes(loaded, [env], [episode], [demonstrations], record)
-    in_containers = frozenset(pair for pair in placed if pair[1] >= 0)
-    found = getattr(loaded.policy, "localization", None)
-    return Recording(frames, first["observed"], found, info, first["layout"], in_containers)
+    return Recording(
+        frames,
+        getattr(loaded.policy, "localization", None),
+        env.scene.layout,
+        np.array([positions[0], positions[-1]]),
+        frozenset(pair for pair in placements if pair[1] >= 0),
+        info["grasped_object"],
+    )
+
+
+def image_locations(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Projects points of the world, (n, 3), m, into the benchmark's camera: (n, 2) in -1..1."""
+    view, projection = (np.reshape(matrix, (4, 4)).T for matrix in camera_matrices(CAMERA))
+    x, y, _, w = projection @ view @ np.column_stack([points, np.ones(len(points))]).T
+    return np.column_stack([x, -y]) / w[:, None]
 
 
 def find_demonstration(
@@ -119,12 +129,6 @@ def find_demonstration(
     )
 
 
-def first_camera(observation: Mapping[str, Any], config: TaskConditionedConfig) -> NDArray[np.uint8]:
-    """Returns the image of a policy's first camera in an observation of the environment, (H, W, 3)."""
-    pixels = observation["pixels"]
-    return pixels[config.cameras[0].rpartition(".")[-1]] if isinstance(pixels, Mapping) else pixels
-
-
 def benchmark_env(config: Any, render_size: int) -> PickPlaceEnv:
     """Makes an environment with the image size and the control that a policy was trained on.
 
@@ -146,8 +150,8 @@ def load_conditioned(checkpoint: str | Path) -> LoadedPolicy:
     """Loads a policy that takes a demonstration or an instruction.
 
     Args:
-        checkpoint: Folder of a policy or of a training run, of which the last checkpoint is loaded; or id of
-            a repository on the Hugging Face Hub.
+        checkpoint: Folder of a policy; folder of a training run, whose last checkpoint is loaded; or id of a
+            repository on the Hugging Face Hub.
 
     Raises:
         ValueError: There is no checkpoint, or its policy is of another kind.

@@ -25,7 +25,6 @@ from torch import Tensor
 from torch.utils.data import default_collate
 from tqdm import tqdm
 
-from gym_deltaco.atomic_files import write_text
 from lerobot_deltaco.arguments import CheckArguments
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.data.frames import memory_for_frames
@@ -34,7 +33,7 @@ from lerobot_deltaco.data.images import as_uint8, resize_images
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
-from lerobot_deltaco.pages.html import picture_uri, render
+from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.policies.base.configuration import dimension_names
 from lerobot_deltaco.policies.deltaco_match import matching as feature_matching
@@ -128,8 +127,8 @@ def check(arguments: CheckArguments) -> str:
         task for task, grasp in zip(tasks, start.grasps, strict=False) if isinstance(grasp, Grasp)
     )
     counts = [(task, n, found[task]) for task, n in Counter(tasks).items()]
-    page = arguments.out / "index.html"
-    content = render(
+    page = write_page(
+        arguments.out,
         "check.html",
         source=arguments.dataset,
         refusal=start.refusal,
@@ -141,7 +140,6 @@ def check(arguments: CheckArguments) -> str:
         n_episodes=meta.total_episodes,
         has_locations=start.locations is not None,
     )
-    write_text(page, content)
     lines = [
         *(f"{name + ':':15} {text}" for name, text in facts),
         *(f"task:           {n} episodes, {n_found} with a grasp: {task}" for task, n, n_found in counts),

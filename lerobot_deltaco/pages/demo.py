@@ -16,18 +16,18 @@ from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 
-from gym_deltaco.atomic_files import read_json, write_json, write_text
-from gym_deltaco.tasks import get_task
+from gym_deltaco.atomic_files import read_json, write_json
 from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord
 from lerobot_deltaco.experiments import run as experiments
 from lerobot_deltaco.experiments.recipes import read_recipe
 from lerobot_deltaco.experiments.run import Run, last_checkpoint, last_step, read_run_records
-from lerobot_deltaco.pages.html import data_uri, picture_uri, render
+from lerobot_deltaco.pages.html import EpisodeView, write_page
+from lerobot_deltaco.reports.leaderboard import CHANCE, PAPER
 from lerobot_deltaco.reports.metrics import followed, success_interval
 
 Minutes = Literal[8, 25]
@@ -36,17 +36,6 @@ EXPERIMENT = "random_objects/deltaco_match"
 # Episodes of each of the 630 training tasks, and training steps, by the minutes that they take at most on two
 # fast, idle cores. 25 minutes are enough for the full recipe.
 BUDGETS: MappingProxyType[Minutes, tuple[int, int]] = MappingProxyType({8: (3, 800), 25: (16, 8000)})
-
-# Success rates to compare with, on the novel tasks of scenario A, in %.
-CHANCE = 16.7  # one of three objects, one of two containers
-PAPER = 25.8  # DeL-TaCo, in the authors' simulation, trained on the 198 tasks
-LONGER = 84.6  # the recipe of this demo in full: the shipped policy, in the protocol's scenes
-
-# One scene and two tasks of novel objects in it. With either demonstration, either sentence is a task.
-SCENE_TASK, SCENE_TRIAL = 25, 2
-DEMONSTRATION_TASKS = MappingProxyType({"the gray ring": (25, 1), "the yellow lampshade": (29, 2)})
-SENTENCES = ("Put it in green bin.", "Put it in red bin.")  # containers 0 and 1 of the scene
-VIDEO_SIZE = 256  # px
 
 _CALIBRATION_SIZE, _CALIBRATION_REPEATS = 1024, 20
 
@@ -89,37 +78,36 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     scene = run.out / "scene.json"
     if not scene.is_file():
         with _timed(times, "videos"):
-            seed = recipe.evaluation.scene_seed(SCENE_TASK, SCENE_TRIAL)
-            write_json(scene, record_scene(last_checkpoint(run.folder), seed))
+            write_json(scene, [view._asdict() for view in record_showcase(last_checkpoint(run.folder))])
     record, spent = _record(run, recipe.evaluation), read_json(times)
     total = np.sum(list(spent.values()), axis=0).tolist()
     rate, low, high = (100 * number for number in success_interval(record.episodes))
-    page = render(
+    paper = 100 * PAPER.rate["scenario_a/deltaco"]
+    page = write_page(
+        out,
         "demo.html",
         rate=rate,
         low=low,
         high=high,
         bars=[
-            ("This policy", rate, f"{low:.1f} to {high:.1f}"),
-            ("The paper's", PAPER, "its own simulation, 198 training tasks"),
-            ("Random choices", CHANCE, "one of three objects, one of two containers"),
-            ("Trained for longer", LONGER, "the shipped policy: 8,000 steps on 10,080 episodes"),
+            ("This policy", rate, f"95 % interval over tasks: {low:.1f} to {high:.1f}"),
+            ("DeL-TaCo", paper, "as published: other simulation, 198 training tasks"),
+            ("Random choice", 100 * CHANCE, "one of three objects, one of two bins"),
         ],
         n_episodes=len(record.episodes),
+        n_tasks=len(recipe.evaluation.task_ids),
         n_training_episodes=recipe.data.n_episodes,
         training_steps=steps,
-        sentences=SENTENCES,
-        demonstrations=read_json(scene),
+        views=[EpisodeView(**row) for row in read_json(scene)],
         followed=[
-            (kind, row)
+            (kind, *row)
             for kind, plan in swapped.items()
-            for row in followed([_record(run, plan)]).to_dict("records")
+            for row in followed([_record(run, plan)]).itertuples(index=False)
         ],
         times=spent,
         total=total,
         checkpoint=last_checkpoint(run.folder),
     )
-    write_text(out / "index.html", page)
     line = {
         "date": date.today().isoformat(),
         "commit": _commit(),
@@ -134,7 +122,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     }
     table = out / "records.csv"
     pd.DataFrame([line]).to_csv(table, mode="a", header=not table.exists(), index=False, float_format="%.1f")
-    return out / "index.html"
+    return page
 
 
 @contextmanager
@@ -149,44 +137,14 @@ def _timed(path: Path, name: str) -> Iterator[None]:
         write_json(path, {**times, name: (spent + times.get(name, [0, 0])).tolist()})
 
 
-def record_scene(checkpoint: Path, seed: int) -> list[dict[str, Any]]:
-    """Records episodes of a policy in one scene: with each demonstration, and each sentence.
-
-    Args:
-        checkpoint: Folder of the policy, which keeps demonstrations of the test tasks.
-        seed: Seed of the scene.
-
-    Returns:
-        Of each demonstration, its name, its first and last image, and its episodes: the sentence, a video,
-        the first image with the maps of where the policy looks, and whether it succeeded. Files are data
-        URIs.
-    """
+def record_showcase(checkpoint: Path) -> list[EpisodeView]:
+    """Runs a policy in one scene, with each of two demonstrations and each of two sentences."""
     # Only here, since LeRobot takes seconds to import.
-    from PIL import Image
+    from lerobot_deltaco.evaluation.video import load_conditioned
+    from lerobot_deltaco.pages.player import SHOWCASE, Player
 
-    from lerobot_deltaco.evaluation.video import benchmark_env, load_conditioned, record_episode
-    from lerobot_deltaco.pages.pictures import demonstration_ends, draw_found, encode_video
-
-    loaded = load_conditioned(checkpoint)
-    env = benchmark_env(loaded.policy.config, VIDEO_SIZE)
-    rows = []
-    for name, (task_id, index) in DEMONSTRATION_TASKS.items():
-        given = loaded.policy.demonstrations.of_task(get_task(task_id).instruction)[:1]
-        ends, episodes = demonstration_ends(given[0]), []
-        for container, sentence in enumerate(SENTENCES):
-            recording = record_episode(loaded, env, SCENE_TASK, seed, sentence, given)
-            assert recording.found is not None
-            episodes.append(
-                {
-                    "sentence": sentence,
-                    "video": data_uri("video/mp4", encode_video(recording.frames)),
-                    "maps": picture_uri(draw_found(recording.frames[0], ends, recording.found)),
-                    "success": bool(recording.info["object_containers"][index] == container),
-                }
-            )
-        images = [picture_uri(Image.fromarray(end)) for end in ends]
-        rows.append({"name": name, "images": images, "episodes": episodes})
-    return rows
+    player = Player(load_conditioned(checkpoint))
+    return [player.run(choice) for choice in SHOWCASE]
 
 
 def _record(run: Run, plan: EvaluationPlan) -> EvaluationRecord:

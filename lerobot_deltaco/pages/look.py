@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,40 +11,28 @@ from lerobot.utils.constants import ACTION
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from gym_deltaco.atomic_files import write_text
-from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import get_task, select_tasks
+from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.arguments import LookArguments
 from lerobot_deltaco.data.grasps import find_keyframes
 from lerobot_deltaco.data.images import as_uint8
 from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, read_demonstrations, read_robot_data
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
-from lerobot_deltaco.evaluation.video import (
-    benchmark_env,
-    find_demonstration,
-    load_conditioned,
-    record_episode,
-)
-from lerobot_deltaco.pages.html import data_uri, picture_uri, render
-from lerobot_deltaco.pages.pictures import (
-    MIN_SIDE,
-    PICK_COLOR,
-    PLACE_COLOR,
-    demonstration_ends,
-    draw_found,
-    encode_video,
-)
+from lerobot_deltaco.evaluation.video import load_conditioned
+from lerobot_deltaco.pages.html import EpisodeView, picture_uri, write_page
+from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
+from lerobot_deltaco.pages.player import Player
+from lerobot_deltaco.pages.verdict import TOLERANCE, describe_words
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, PickPlace
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
-# A location is right within this distance from the recorded one: a tenth of the image's side. In the
-# benchmark, the centers of objects are at least 0.26 apart.
-TOLERANCE = 0.2
 _BENCHMARK_TASKS, _BENCHMARK_SEED = "scenario_a_test", 1000  # the first trial of the evaluation protocol
+
+# An episode, and whether it is right in each respect that the page counts; empty if that is unknown
+Judged = tuple[EpisodeView, tuple[bool, ...]]
 
 
 def look(arguments: LookArguments) -> str:
@@ -56,7 +44,7 @@ def look(arguments: LookArguments) -> str:
     Raises:
         ValueError: The policy finds no locations, or does not fit the dataset.
     """
-    checkpoint, dataset, episodes = arguments.checkpoint, arguments.dataset, arguments.episodes
+    checkpoint, dataset = arguments.checkpoint, arguments.dataset
     loaded = load_conditioned(checkpoint)
     if not isinstance(loaded.policy, DeltacoMatchPolicy):
         raise ValueError(
@@ -64,138 +52,97 @@ def look(arguments: LookArguments) -> str:
             "locations. `deltaco look` needs one of the type deltaco_match."
         )
     if dataset is None:
-        results = ["Successful episodes"]
-        views = _benchmark_views(loaded, episodes)
+        names = ["Successful episodes"]
+        episodes = _benchmark_episodes(loaded, arguments.episodes)
     else:
-        results = [f"Episodes with the right {what} location" for what in ("pick", "place")]
-        views = _dataset_views(loaded, open_folder_or_hub(dataset), episodes)
-    shown = list(tqdm(views, desc="Looking", unit="episode", total=episodes))
-    rates = []
-    for n, text in enumerate(results):
-        known = [view["right"][n] for view in shown if view["right"][n] is not None]
-        rates += [(text, sum(known), len(known))] if known else []
-    page = arguments.out / "index.html"
-    content = render(
+        names = [f"Episodes with the right {what} location" for what in ("pick", "place")]
+        episodes = _dataset_episodes(loaded, open_folder_or_hub(dataset), arguments.episodes)
+    judged = list(tqdm(episodes, desc="Looking", unit="episode", total=arguments.episodes))
+    known = np.array([rights for _, rights in judged if rights])
+    rates = [(name, int(known[:, n].sum()), len(known)) for n, name in enumerate(names) if len(known)]
+    page = write_page(
+        arguments.out,
         "look.html",
         checkpoint=checkpoint,
         source=dataset or "scenes of the benchmark",
-        views=shown,
+        views=[view for view, _ in judged],
         rates=rates,
         tolerance=None if dataset is None else TOLERANCE,
         pick_color=f"rgb{PICK_COLOR}",
         place_color=f"rgb{PLACE_COLOR}",
     )
-    write_text(page, content)
-    return "\n".join([*(f"{text}: {n_right} of {n}" for text, n_right, n in rates), f"See {page}."])
+    return "\n".join([*(f"{name}: {n_right} of {n}" for name, n_right, n in rates), f"See {page}."])
 
 
-def _benchmark_views(loaded: LoadedPolicy, n_episodes: int) -> Iterator[dict[str, Any]]:
-    """Runs episodes of the benchmark's test tasks, and yields each as the page shows it."""
-    policy, env = loaded.policy, benchmark_env(loaded.policy.config, MIN_SIDE)
-    task_ids = select_tasks(_BENCHMARK_TASKS)
+def _benchmark_episodes(loaded: LoadedPolicy, n_episodes: int) -> Iterator[Judged]:
+    """Runs episodes of the benchmark's test tasks."""
+    player, task_ids = Player(loaded), select_tasks(_BENCHMARK_TASKS)
     for index in _spread(len(task_ids), n_episodes):
-        task = get_task(task_ids[index])
-        shown = (
-            [find_demonstration(policy, task, env.scene_config)] if policy.config.uses_demonstrations else []
-        )
-        seed = episode_seed(0, "evaluation", task.index, 0, _BENCHMARK_SEED)
-        recording = record_episode(loaded, env, task.index, seed, task.instruction, shown)
-        assert recording.found is not None
-        ends = demonstration_ends(shown[0]) if shown else None
-        picture = picture_uri(draw_found(recording.frames[0], ends, recording.found))
-        video = data_uri("video/mp4", encode_video(recording.frames))
-        is_success = bool(recording.info["is_success"])
-        text = f"Task {task.index}: {'success' if is_success else 'failure'}"
-        text += _how_sure(policy, task.instruction, recording.found)
-        yield {
-            "title": task.instruction,
-            "picture": picture,
-            "text": text,
-            "right": (is_success,),
-            "video": video,
-        }
-    env.close()
+        view = player.run(player.default_choice(task_ids[index], _BENCHMARK_SEED))
+        yield view, (view.is_right is True,)
 
 
-def _dataset_views(
-    loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int
-) -> Iterator[dict[str, Any]]:
-    """Finds the locations in first images of episodes, with other episodes as demonstrations."""
-    policy, config, meta = loaded.policy, loaded.policy.config, dataset.meta
+def _dataset_episodes(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int) -> Iterator[Judged]:
+    """Localizes in the first images of episodes, with other episodes as demonstrations."""
+    policy, config = loaded.policy, loaded.policy.config
+    camera = config.cameras[0]
     _check_features(config, dataset)
-    tasks = [names[0] for names in meta.episodes["tasks"]]
-    episodes, form = DatasetEpisodes(dataset), config.demonstration_format
-    data = read_robot_data(episodes, form)
+    tasks = [names[0] for names in dataset.meta.episodes["tasks"]]
+    form = config.demonstration_format
+    data = read_robot_data(DatasetEpisodes(dataset), form)
     assert data is not None
     assert form.gripper is not None
     opening = form.gripper.opening(data.actions)
     keyframes = find_keyframes(data.states, opening, data.spans, form.gripper.usual_range)
-    chosen = _spread(len(tasks), n_episodes)
-    partners = {episode: _partner(tasks, episode) for episode in chosen}
+    numbers = _spread(len(tasks), n_episodes)
+    partners = {episode: _partner(tasks, episode) for episode in numbers}
     bank = None
     if config.uses_demonstrations:
         needed = sorted(set(partners.values()))
         bank = read_demonstrations(DatasetEpisodes(dataset, needed), form)
-    for episode in chosen:
-        shown = [] if bank is None else [bank.of_episode(partners[episode])]
+    for episode in numbers:
+        task, partner = tasks[episode], partners[episode]
         item = dataset[data.spans[episode][0]]
         observation = {name: item[name] for name in config.input_features}
         observation |= {name: as_uint8(item[name]).float() / 255 for name in config.cameras}
         policy.reset()
-        policy.set_tasks([tasks[episode]], [shown])
+        policy.set_tasks([task], [[] if bank is None else [bank.of_episode(partner)]])
         with torch.inference_mode():
-            policy.select_action(loaded.preprocessor({**observation, "task": tasks[episode]}))
-        found: PickPlace = policy.localization
-        recorded, right, text = None, (None, None), "no grasp is recorded"
+            policy.select_action(loaded.preprocessor({**observation, "task": task}))
+        localization = policy.localization
+        where = f"Episode {episode}"
+        if bank is not None:
+            where += ", demonstrated by " + ("itself" if partner == episode else f"episode {partner}")
+        rights, headline, recorded = (), "No grasp found", None
         if bool(keyframes.has_grasp[episode]):
             states = keyframes.states[episode].to(config.device)
             recorded = policy.robot_states.to_image(states).clamp(-1, 1).cpu()
-            distances = (found.locations[0].cpu() - recorded).norm(dim=1)
-            right = tuple((distances < TOLERANCE).tolist())
+            distances = (localization.locations[0].cpu() - recorded).norm(dim=1)
+            rights = tuple((distances < TOLERANCE).tolist())
             pick, place = (50 * distances).tolist()
-            text = (
-                f"pick and place locations {pick:.0f} and {place:.0f} % of the image's side from the recorded"
-            )
-        if bank is not None:
-            own = partners[episode] == episode
-            text += ", demonstrated by " + ("itself" if own else f"episode {partners[episode]}")
-        text += _how_sure(policy, tasks[episode], found)
+            headline = f"Pick off by {pick:.1f} %, place by {place:.1f} % of the image's side"
         ends = None
-        if shown:
-            ends = np.stack(
-                [_image(dataset, row, config.cameras[0]) for row in data.spans[partners[episode]]]
-            )
-        picture = draw_found(
-            _image(dataset, data.spans[episode][0], config.cameras[0]), ends, found, 0, recorded
+        if bank is not None:
+            ends = np.stack([_image(dataset, row, camera) for row in data.spans[partner]])
+        scene = _image(dataset, data.spans[episode][0], camera)
+        picture = picture_uri(draw_localization(scene, ends, localization, recorded))
+        sure = (
+            f"{100 * localization.confidence.item():.0f} % sure of the object. {describe_words(policy, task)}"
         )
-        yield {
-            "title": tasks[episode],
-            "picture": picture_uri(picture),
-            "text": f"Episode {episode}: {text}",
-            "right": right,  # whether the pick and the place location are right; None if that is not known
-            "video": None,
-        }
+        is_right = all(rights) if rights else None
+        yield EpisodeView(task, "", [], is_right, headline, [f"{where}.", sure], picture, None), rights
 
 
 def _image(dataset: LeRobotDataset, row: int, camera: str) -> NDArray[np.uint8]:
-    """Returns an image at the camera's own resolution, (H, W, 3)."""
+    """Returns an image at the camera's full resolution, (H, W, 3)."""
     return as_uint8(dataset[row][camera]).permute(1, 2, 0).numpy()
-
-
-def _how_sure(policy: DeltacoMatchPolicy, instruction: str, found: PickPlace) -> str:
-    """Returns how sure a policy is of what to pick, and which words count, as the end of a sentence."""
-    words = [
-        word if word == meant else f"{word}, understood as {meant}"
-        for word, meant in policy.feature_matching.understood(instruction)
-    ]
-    return f"; {100 * found.confidence[0]:.0f} % sure; words for the object: {', '.join(words) or 'none'}"
 
 
 def _check_features(config: TaskConditionedConfig, dataset: LeRobotDataset) -> None:
     """Checks that a dataset has the policy's observations.
 
     Raises:
-        ValueError: It does not.
+        ValueError: A feature is missing or has another shape.
     """
     features = dataset.meta.features
     missing = [name for name in (*(config.input_features or {}), ACTION) if name not in features]
@@ -219,6 +166,6 @@ def _partner(tasks: Sequence[str], episode: int) -> int:
     return same[(same.index(episode) + 1) % len(same)]
 
 
-def _spread(n: int, n_chosen: int) -> list[int]:
-    """Returns at most `n_chosen` of the numbers below n, evenly spread."""
-    return np.linspace(0, n - 1, min(n, n_chosen)).round().astype(int).tolist()
+def _spread(n: int, n_selected: int) -> list[int]:
+    """Returns at most `n_selected` of the numbers below n, evenly spread."""
+    return np.linspace(0, n - 1, min(n, n_selected)).round().astype(int).tolist()

@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lerobot_deltaco.data.demonstrations import Demonstration
+from lerobot_deltaco.pages.html import data_uri
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
 
 # No object and no container of the benchmark has these colors. They differ in lightness, so that they can be
@@ -25,22 +26,20 @@ _HELD_SECONDS = 1.0  # for which the last frame of a video stays
 Color = tuple[int, int, int]
 
 
-def draw_found(
+def draw_localization(
     scene: NDArray[np.uint8],
     demonstration_ends: NDArray[np.uint8] | None,
-    found: PickPlace,
-    sample: int = 0,
+    localization: PickPlace,
     recorded: Tensor | None = None,
 ) -> Image.Image:
-    """Draws where a policy looked: the demonstration, and to its right the scene at full resolution.
+    """Draws where a policy looked: the demonstration, and to its right the scene.
 
     A magenta ring marks the pick location, a cyan square the place location.
 
     Args:
         scene: First image of the episode, (H, W, 3).
         demonstration_ends: First and last image of the demonstration, (2, h, w, 3); None without one.
-        found: What the policy found.
-        sample: Index of the episode in the batch of `found`.
+        localization: The policy's locations in a batch of one episode.
         recorded: Pick and place locations in the dataset, (2, 2) in -1..1, which get white crosses.
 
     Returns:
@@ -51,12 +50,12 @@ def draw_found(
     if scale > 1:
         size = (round(picture.width * scale), round(picture.height * scale))
         picture = picture.resize(size, Image.Resampling.BICUBIC)
-    logits = found.maps[sample].float().cpu()
+    logits = localization.maps[0].float().cpu()
     picture = _overlay(picture, logits.flatten(1).softmax(dim=1).view_as(logits), (PICK_COLOR, PLACE_COLOR))
     if recorded is not None:
         for location in recorded.tolist():
             _draw_cross(picture, location)
-    pick, place = found.locations[sample].tolist()
+    pick, place = localization.locations[0].tolist()
     draw_mark(picture, pick, PICK_COLOR, "pick")
     draw_mark(picture, place, PLACE_COLOR, "place")
     if demonstration_ends is None:
@@ -68,8 +67,8 @@ def draw_found(
     image.paste(picture, (width + gap, 0))
     for n, (end, color) in enumerate(zip(demonstration_ends, (PICK_COLOR, PLACE_COLOR), strict=True)):
         panel = Image.fromarray(end).resize((width, height), Image.Resampling.BICUBIC)
-        if found.attention is not None and found.by_demonstration[n]:
-            panel = _overlay(panel, found.attention[sample, n : n + 1].float().cpu(), (color,))
+        if localization.attention is not None and localization.by_demonstration[n]:
+            panel = _overlay(panel, localization.attention[0, n : n + 1].float().cpu(), (color,))
         image.paste(panel, (0, n * (height + gap)))
     return image
 
@@ -114,6 +113,11 @@ def _draw_cross(picture: Image.Image, location: Sequence[float]) -> None:
 def demonstration_ends(demonstration: Demonstration) -> NDArray[np.uint8]:
     """Returns the first and the last image of a demonstration, (2, H, W, 3)."""
     return demonstration.frames[[0, -1]].permute(0, 2, 3, 1).cpu().numpy()
+
+
+def video_uri(frames: Sequence[NDArray[np.uint8]]) -> str:
+    """Returns a video of images (H, W, 3) as a data URI."""
+    return data_uri("video/mp4", encode_video(frames))
 
 
 def encode_video(frames: Sequence[NDArray[np.uint8]], fps: int = VIDEO_FPS) -> bytes:

@@ -2,17 +2,19 @@ import json
 import re
 from pathlib import Path
 
-import gymnasium
 import pandas as pd
 import pytest
 from example_records import make_record
 from test_experiments import FakeCommands
 
+from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.evaluation import records
 from lerobot_deltaco.experiments import run as experiments
 from lerobot_deltaco.experiments.recipes import ExperimentError
 from lerobot_deltaco.pages import demo
+from lerobot_deltaco.pages.html import EpisodeView
+from lerobot_deltaco.pages.player import SHOWCASE
 
 
 class FakeDemoCommands(FakeCommands):
@@ -34,14 +36,15 @@ def commands(monkeypatch):
     fake = FakeDemoCommands()
     monkeypatch.setattr(experiments, "call", fake)
 
-    def record_scene(checkpoint, seed):
-        files = {"video": "data:video/mp4", "maps": "data:image/jpeg"}
-        sentences = enumerate(demo.SENTENCES)
-        episodes = [{"sentence": sentence, "success": n == 0, **files} for n, sentence in sentences]
-        shown = {"images": ["data:image/jpeg"] * 2, "episodes": episodes}
-        return [{"name": name, **shown} for name in demo.DEMONSTRATION_TASKS]
+    def record_showcase(checkpoint):
+        picture, video = "data:image/jpeg", "data:video/mp4"
+        return [
+            EpisodeView(sentence, name, [picture] * 2, n == 0, "", ["It put ..."], picture, video)
+            for name in ("the first", "the second")
+            for n, sentence in enumerate(("green bin", "red bin"))
+        ]
 
-    monkeypatch.setattr(demo, "record_scene", record_scene)
+    monkeypatch.setattr(demo, "record_showcase", record_showcase)
     return fake
 
 
@@ -49,13 +52,13 @@ def test_the_page_shows_the_result(tmp_path, commands):
     page = demo.run_demo(8, tmp_path).read_text()
     assert page.count("<video src=") == 4
     assert page.count('src="data:image/jpeg') == 4 + 4
-    assert re.findall(r'class="(yes|no)">', page) == ["yes", "no", "yes", "no"]
-    for number in (25.0, demo.PAPER, demo.CHANCE, demo.LONGER):
-        assert f"{number:.1f} %" in page
+    assert re.findall("[✓✗]", page) == ["✓", "✗"] * 2
+    for number in ("25.0", "25.8", "16.7"):
+        assert f"{number} % (" in page
     for name in ("demonstration", "instruction"):
         assert page.count(f"<td>{name}</td>") == 2
     assert not re.search(r'(src|href)="(?!data:)', page)
-    assert "evaluation on the 102 novel tasks" in page
+    assert "evaluation on the test tasks" in page
     (line,) = pd.read_csv(tmp_path / "records.csv").to_dict("records")
     assert line["success_rate"] == 25
     assert line["calibration_gflops"] > 0
@@ -75,9 +78,9 @@ def test_finished_steps_are_skipped(tmp_path, commands):
     assert json.loads(times.read_text())["evaluate"] > first
 
 
-def test_the_scene_holds_what_the_demonstrations_show():
-    seed = records.EvaluationPlan().scene_seed(demo.SCENE_TASK, demo.SCENE_TRIAL)
-    env = gymnasium.make("gym_deltaco:gym_deltaco/PickPlace-v0", task_id=demo.SCENE_TASK)
-    _, info = env.reset(seed=seed)
-    for task_id, index in demo.DEMONSTRATION_TASKS.values():
-        assert info["objects"][index] in get_task(task_id).targets
+def test_the_scene_of_the_videos_holds_what_the_demonstrations_show():
+    for choice in SHOWCASE:
+        env = PickPlaceEnv(choice.task_id)
+        _, info = env.reset(seed=choice.scene_seed)
+        env.close()
+        assert len(set(info["objects"]) & set(get_task(choice.demo_task).targets)) == 1

@@ -20,15 +20,16 @@ from lerobot_deltaco.evaluation.video import (
     load_conditioned,
     record_episode,
 )
-from lerobot_deltaco.pages import look as room
-from lerobot_deltaco.pages.html import render
+from lerobot_deltaco.pages import look as look_module
+from lerobot_deltaco.pages.html import EpisodeView, render
 from lerobot_deltaco.pages.look import look
-from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_found, encode_video
+from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_localization, encode_video
+from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
 
 
 def found_at(pick, place, by_demonstration=(True, True), size=24):
-    """Found locations with maps that peak there, at (column, row) of size x size."""
+    """PickPlace locations with maps that peak there, at (column, row) of size x size."""
     maps = torch.full((1, 2, size, size), -20.0)
     for n, (column, row) in enumerate((pick, place)):
         maps[0, n, row, column] = 20
@@ -40,7 +41,7 @@ def found_at(pick, place, by_demonstration=(True, True), size=24):
 def test_maps_are_drawn_at_the_scenes_own_resolution():
     scene, ends = np.full((480, 640, 3), 128, np.uint8), np.full((2, 48, 48, 3), 128, np.uint8)
     found = found_at((6, 18), (18, 6), (True, False))
-    image = np.asarray(draw_found(scene, None, found)).astype(int)
+    image = np.asarray(draw_localization(scene, None, found)).astype(int)
     assert image.shape == (480, 640, 3)
     for color, (x, y), (other_x, other_y) in (
         (PICK_COLOR, (173, 370), (600, 400)),
@@ -50,7 +51,7 @@ def test_maps_are_drawn_at_the_scenes_own_resolution():
         assert distances[0] < distances[1] - 25
     assert (image[240, 320] == 128).all()
     # Attention is drawn where the demonstration tells the location.
-    image = np.asarray(draw_found(scene, ends, found))
+    image = np.asarray(draw_localization(scene, ends, found))
     assert not (image[:200, :200] == 128).all()
     assert (image[-200:, :200] == 128).all()
 
@@ -72,9 +73,10 @@ def test_an_episode_is_recorded(tmp_path):
     demonstration = loaded.policy.demonstrations.of_task(TASKS[4].instruction)[0]
     recording = record_episode(loaded, env, 4, 7, "Put it in the red bin.", [demonstration])
     assert [frame.shape for frame in recording.frames] == [(64, 64, 3)] * 5
-    assert recording.found.locations.shape == (1, 2, 2)
-    observation, info = env.reset(seed=7)
-    assert (recording.observed == observation["pixels"]).all()
+    assert recording.localization.locations.shape == (1, 2, 2)
+    _, info = env.reset(seed=7)
+    assert (recording.frames[0] == env.render()).all()
+    assert (recording.positions[0] == [env.scene.object_pose(n).position for n in range(3)]).all()
     assert [item.label.index for item in recording.layout.objects] == info["objects"].tolist()
 
 
@@ -110,7 +112,9 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     write_robot_dataset(tmp_path / "data", [4, 4, 9])
     folder = save_tiny_policy(tmp_path / "policy")
     drawn = []
-    monkeypatch.setattr(room, "draw_found", lambda *args: drawn.append(args) or draw_found(*args))
+    monkeypatch.setattr(
+        look_module, "draw_localization", lambda *args: drawn.append(args) or draw_localization(*args)
+    )
     report = look(LookArguments(str(folder), str(tmp_path / "data"), 3, tmp_path / "out"))
     text = (tmp_path / "out/index.html").read_text()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["index.html"]
@@ -119,25 +123,24 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     assert [text.count(f"by {who}") for who in ("episode 1", "episode 0", "itself")] == [1, 1, 1]
     assert [args[0].shape for args in drawn] == [(96, 96, 3)] * 3
     assert [args[1].shape for args in drawn] == [(2, 96, 96, 3)] * 3
-    right = torch.stack([(args[2].locations[0] - args[4]).norm(dim=1) < room.TOLERANCE for args in drawn])
+    right = torch.stack([(args[2].locations[0] - args[3]).norm(dim=1) < TOLERANCE for args in drawn])
     for what, number in zip(("pick", "place"), right.sum(dim=0).tolist(), strict=True):
         assert f"Episodes with the right {what} location: <b>{number} of 3</b>" in text
         assert f"Episodes with the right {what} location: {number} of 3\n" in report
 
 
-def test_an_episode_is_marked_as_right_if_both_of_its_locations_are():
-    view = {"title": "", "picture": "", "text": "", "video": None}
-    cases = {(True, True): "✓", (True, False): "✗", (False, True): "✗", (None, None): "–", (False,): "✗"}
-    views = [{**view, "right": right} for right in cases]
+def test_an_episode_is_marked_as_right_wrong_or_unknown():
+    views = [EpisodeView("", "", [], is_right, "", [], "", None) for is_right in (True, False, None)]
     page = dict.fromkeys(("checkpoint", "source", "pick_color", "place_color"), "")
     text = render("look.html", views=views, rates=[], tolerance=0.2, **page)
-    assert re.findall("[✓✗–]", text) == list(cases.values())
+    assert re.findall('note (\\w*)"><p><b>(.?)', text) == [("good", "✓"), ("bad", "✗"), ("", " ")]
 
 
 def test_without_a_dataset_episodes_of_the_benchmark_are_run(tmp_path):
     look(LookArguments(str(save_tiny_policy(tmp_path / "policy")), episodes=2, out=tmp_path / "out"))
     text = (tmp_path / "out/index.html").read_text()
     assert text.count("data:image/jpeg;base64") == text.count("data:video/mp4;base64") == 2
+    assert text.count("Understood as: ") == 2
     assert "of 2</b>" in text
 
 

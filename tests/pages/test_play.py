@@ -7,83 +7,22 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
-from small_policies import DEMONSTRATED, save_tiny_policy
+import torch
+from small_policies import DEMONSTRATED, load_tiny_policy
 
+from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.layout import Layout, PlacedContainer
-from gym_deltaco.phrases import paraphrase
-from gym_deltaco.sim.workspace import Quadrant
-from gym_deltaco.tasks import COLOR_SHAPE_TASKS, OBJECTS, TASKS, get_task
-from lerobot_deltaco.pages.verdict import judge, parse_instruction
-
-# The parser
-
-ALL_TASKS = (*TASKS, *COLOR_SHAPE_TASKS)
-
-
-def described(task):
-    """Properties of the object that a task's sentences give. That of a name is always given."""
-    if task.kind == "name":
-        label = OBJECTS[task.row]
-        return [("name", label.name), ("color", label.color), ("shape", label.shape)]
-    return [(kind, getattr(task, kind)) for kind in task.kind.split("_")]
-
-
-def is_understood(task, sentence):
-    """Whether a sentence is understood as its task; None if the parser says that it cannot tell."""
-    found = parse_instruction(sentence)
-    if found.unclear or found.unknown or len(found.containers) > 1:
-        return None
-    may = described(task)
-    must = may[:1] if task.kind == "name" else may
-    return set(must) <= found.described <= set(may) and found.containers == {task.container}
-
-
-def test_every_template_is_understood():
-    assert all(is_understood(task, task.instruction) for task in ALL_TASKS)
-
-
-@pytest.mark.parametrize("split", ["train", "held_out"])
-def test_the_sentences_of_the_grammar_are_understood_and_none_as_another_task(split):
-    found = []
-    for task in ALL_TASKS:
-        rng = np.random.default_rng((task.index, 7))
-        found += [is_understood(task, paraphrase(task, split, rng)) for _ in range(5)]
-    assert False not in found
-    assert np.mean([each is True for each in found]) > 0.99
-
-
-def test_other_sentences_with_the_same_words_are_understood():
-    for sentence, object_name, containers in [
-        ("Put it in the green bin.", None, "green"),
-        ("into the left one, the red bowl please", "bongo drum bowl", "left"),
-        ("put the red bowl to the right", "bongo drum bowl", "right"),
-        ("grab the pepsi and put it in the box that's red", "pepsi bottle", "red"),
-        ("red bowl, red bin", "bongo drum bowl", "red"),
-        ("move the grey BOTLTE to the left-hand bin", "glass half gallon", "left"),
-        ("take the conic bin to the front", "conic bin", "front"),
-        ("take the conic bin to the box that is nearest to me", "conic bin", "front"),
-        ("the yellow ring, green box", "two layered lampshade", "green"),
-        ("bathtub", "bathtub", ""),
-    ]:
-        found = parse_instruction(sentence)
-        names = [label.name for label in OBJECTS if found.fits(label)] if found.described else [None]
-        assert (names, " ".join(found.containers), found.unclear) == ([object_name], containers, ())
-
-
-def test_words_that_are_not_understood_are_named():
-    for sentence, unclear, unknown in (
-        ("the back and white cup in the far bin", ("back",), ()),
-        ("put the jar into the bin nearest to the robot", ("nearest", "robot"), ()),
-        ("put the jar into the bin closest to you", ("closest", "you"), ()),
-        ("the blue mug in the shiny red bin", (), ("mug", "shiny")),
-    ):
-        found = parse_instruction(sentence)
-        assert (found.unclear, found.unknown) == (unclear, unknown)
-
+from gym_deltaco.sim.workspace import CONTAINER_FLOOR, Quadrant
+from gym_deltaco.tasks import OBJECTS, TASKS, get_task
+from lerobot_deltaco.evaluation.video import Recording, image_locations
+from lerobot_deltaco.pages.player import BOTH, DEMONSTRATION, INSTRUCTION, Choice, Player
+from lerobot_deltaco.pages.verdict import describe_outcome, describe_words, judge
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
 
 # The verdict
 
-NAMES = ["t cup", "short handle cup", "bathtub"]  # blue, blue and gray
+NAMES, BINS = ["t cup", "short handle cup", "bathtub"], ["green", "red"]  # blue, blue and gray
+POSITIONS = np.array([[0.48, 0.2, -0.35], [0.56, 0.2, -0.35], [0.5, 0.36, -0.35]])
 
 
 def layout():
@@ -93,81 +32,128 @@ def layout():
     return Layout(tuple(SimpleNamespace(label=label) for label in labels), containers, 0, 0)
 
 
-def outcome(name, bin_, sentence="", demonstrated=""):
-    """The verdict if an object was put into a bin, or only grasped."""
+def recording(name, bin_, pick=None, place="green", end=POSITIONS):
+    """An episode in which an object was put into a bin, or only grasped, after the policy located another."""
     number = -1 if name is None else NAMES.index(name)
-    placed = frozenset() if bin_ is None else frozenset([(number, ("green", "red").index(bin_))])
-    return judge(layout(), placed, number, sentence, demonstrated)
+    placements = frozenset() if bin_ is None else frozenset([(number, BINS.index(bin_))])
+    localization = None
+    if pick is not None:
+        centers = [[*item.quadrant.container_center, CONTAINER_FLOOR] for item in layout().containers]
+        points = np.array([POSITIONS[NAMES.index(pick)], centers[BINS.index(place)]])
+        locations = torch.tensor(image_locations(points))[None] + 0.05
+        localization = PickPlace(
+            locations, torch.zeros(1), torch.zeros(1, 2, 4, 4), None, (False, False), torch.ones(1)
+        )
+    return Recording([], localization, layout(), np.array([POSITIONS, end]), placements, number)
+
+
+def test_locations_are_those_of_the_image():
+    env = PickPlaceEnv(4)
+    for seed in range(5):
+        env.reset(seed=seed)
+        image = env.scene.render(256)
+        for channel, item in zip((1, 0), env.scene.layout.containers, strict=True):
+            center = np.array([[*item.quadrant.container_center, CONTAINER_FLOOR]])
+            x, y = ((image_locations(center)[0] + 1) * 128).astype(int)
+            assert image[y, x].argmax() == channel
+    env.close()
 
 
 T_CUP, BATHTUB = (
-    f"Put {color} colored, {shape} shaped {name} in left bin."
-    for color, shape, name in (("blue", "cup", "t cup"), ("gray", "bowl", "bathtub"))
+    next(task for task in TASKS if f" {name} in left" in task.instruction) for name in (NAMES[::2])
 )
+BLUE, GRAY = (f"Put {color} colored object in front bin." for color in ("blue", "gray"))
 
 
 @pytest.mark.parametrize(
     ("sentence", "demonstrated", "name", "bin_", "expected"),
     [
-        ("the t cup into the front bin", "", "t cup", "red", "Success"),
-        ("the t cup into the front bin", "", "t cup", "green", "Wrong bin"),
-        ("the t cup into the front bin", "", "bathtub", "green", "Wrong object and bin"),
-        ("the t cup into the front bin", "", "bathtub", None, "Wrong object"),
-        ("the t cup into the front bin", "", None, None, "Not done"),
-        # Several objects or bins may fit; a demonstration then says which.
-        ("a blue cup to the left", "", "short handle cup", "green", "Success"),
-        ("a blue cup to the left", T_CUP, "short handle cup", "green", "Wrong object"),
-        ("Put it in the red bin.", BATHTUB, "bathtub", "red", "Success"),
-        ("Put it in the red bin.", BATHTUB, "t cup", "red", "Wrong object"),
-        ("the t cup, red bin", BATHTUB, "t cup", "red", "Success"),
+        (T_CUP.instruction, None, "t cup", "red", "Success"),  # both bins are on the left
+        (T_CUP.instruction, None, "bathtub", "red", "Wrong object"),
+        (BLUE, None, "short handle cup", "red", "Success"),
+        (BLUE, None, "short handle cup", "green", "Wrong bin"),
+        (BLUE, None, "bathtub", "green", "Wrong object and bin"),
+        (BLUE, None, "bathtub", None, "Wrong object"),
+        (BLUE, None, None, None, "Not done"),
+        # Of several objects that fit, the demonstration shows one.
+        (BLUE, T_CUP, "short handle cup", "red", "Wrong object"),
+        ("put it in the RED bin", BATHTUB, "bathtub", "red", "Success"),
+        ("Put it in red bin.", BATHTUB, "t cup", "red", "Wrong object"),
         ("", BATHTUB, "bathtub", "green", "Success"),
-        # Words that the parser does not know do no harm if only one object can be meant.
-        ("the shiny bathtub, red bin", "", "bathtub", "red", "Success"),
-        ("the blue mug to the left", T_CUP, "t cup", "green", "Success"),
-        ("the blue mug to the left", "", "t cup", "green", "Not judged"),
-        ("the mug to the left", T_CUP, "t cup", "green", "Not judged"),
-        # Nothing is judged that was not understood, or that is not there.
-        ("the t cup in the bin nearest to you", "", "t cup", "red", "Not judged"),
-        ("the red bin, the green bin", BATHTUB, "bathtub", "red", "Not judged"),
-        ("wave at me", BATHTUB, "t cup", "red", "Not judged"),
-        ("the canoe, red bin", "", "t cup", "red", "Not judged"),
-        ("the t cup, right bin", "", "t cup", "red", "Not judged"),
+        # Nothing is judged that contradicts itself or is not there.
+        (GRAY, T_CUP, "t cup", "red", "Not judged"),
+        ("Put it in the red bin.", None, "t cup", "red", "Not judged"),
+        ("Put it in the right bin.", T_CUP, "t cup", "red", "Not judged"),
+        (TASKS[0].instruction, None, "t cup", "green", "Not judged"),
     ],
 )
-def test_the_verdict_is_about_what_was_asked_for(sentence, demonstrated, name, bin_, expected):
-    verdict = outcome(name, bin_, sentence, demonstrated)
+def test_the_benchmarks_sentences_are_judged_by_what_they_ask_for(
+    sentence, demonstrated, name, bin_, expected
+):
+    verdict = judge(recording(name, bin_), sentence, demonstrated)
     assert verdict.headline == expected
     assert verdict.is_success is {"Success": True, "Not judged": None}.get(expected, False)
 
 
-def test_the_verdict_says_what_was_moved_and_what_was_asked_for():
-    verdict = outcome("t cup", "red", "put the gray flsak to the front bin, quickly", BATHTUB)
-    assert verdict.moved == "It put the blue t cup into the red bin (front left)."
-    assert "Understood as: the gray glass half gallon in the front bin." in verdict.asked
-    assert "Unknown words: “quickly”." in verdict.asked
-    asked = outcome("t cup", "red", "the t cup, red bin", BATHTUB).asked
-    assert "The demonstration shows another object: the gray bathtub" in asked
-    assert outcome("bathtub", None).moved == "It grasped the gray bathtub, but put it into no bin."
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "don't put it in the red bin",
+        "the blue cup where the gray one is",
+        "stack the cup on the bathtub",
+        "put both in the red bin",
+        "left",
+    ],
+)
+def test_no_success_is_claimed_for_free_sentences(sentence):
+    for bin_, headline in (("red", "Did what it understood"), ("green", "Did not do what it understood")):
+        verdict = judge(recording("t cup", bin_, "t cup", "red"), sentence, T_CUP, "Words.")
+        assert verdict.is_success is None
+        assert verdict.headline == headline
+        put, understood, reason = verdict.lines
+        assert put.startswith(f"It put the blue t cup into the {bin_} bin")
+        assert (
+            understood == "Understood as: the blue t cup (100 % sure) into the red bin (front left). Words."
+        )
+        assert reason.startswith("Only the benchmark's own sentences are judged")
+
+
+def test_the_outcome_says_what_was_moved_and_what_left_the_tray():
+    assert describe_outcome(recording("bathtub", None)) == (
+        "It grasped the gray bathtub, but put it into no bin."
+    )
+    end = POSITIONS + [[0, 0, -1], [0, -0.3, 0], [0, 0, 0]]
+    assert describe_outcome(recording(None, None, end=end)) == (
+        "It grasped nothing. The blue t cup fell off the table. The blue short handle cup left the tray."
+    )
+
+
+def test_words_are_shown_as_the_policy_reads_them():
+    policy = SimpleNamespace(
+        feature_matching=SimpleNamespace(understood=lambda _: [("blue", "blue"), ("goblett", "goblet")]),
+        config=SimpleNamespace(known_words=["blue", "goblet", "bin"]),
+    )
+    assert describe_words(policy, "Blue goblett, shiny bin!") == (
+        "Words for the object: “blue”, “goblett”. Read “goblett” as “goblet”. Unknown words: “shiny”."
+    )
+
+
+# The page's functions
 
 
 @pytest.fixture(scope="module")
-def play():
-    pytest.importorskip("gradio", reason="the extra `play` is not installed")  # which takes 3 s to import
-    return importlib.import_module("lerobot_deltaco.pages.play")
-
-
-@pytest.fixture(scope="module")
-def player(play, tmp_path_factory):
-    return play.Player(save_tiny_policy(tmp_path_factory.mktemp("play") / "policy"))
+def player(tmp_path_factory):
+    return Player(load_tiny_policy(tmp_path_factory.mktemp("play")))
 
 
 def test_a_run_has_a_video_a_picture_and_a_verdict(player):
-    run = player.run(player.default_choice(4, 1000))
-    assert run.video.startswith("data:video/mp4;base64,")
-    assert run.picture.startswith("data:image/jpeg;base64,")
-    assert "Understood as: the black and white smushed dumbbell in the green bin." in run.verdict.asked
-    assert re.fullmatch(r"The policy was \d+% sure of the object.*\.", run.confidence)
-    assert run.footnote.startswith("The scene's task 4, ")
+    view = player.run(player.default_choice(4, 1000))
+    assert view.video.startswith("data:video/mp4;base64,")
+    assert all(picture.startswith("data:image/jpeg;base64,") for picture in (view.picture, *view.ends))
+    assert view.demonstration == "The demonstration shows the black and white smushed dumbbell."
+    assert view.is_right is not None
+    assert re.match(r"It (put|grasped) ", view.lines[0])
+    assert re.match(r"Understood as: .* \(\d+ % sure\) .*", view.lines[1])
 
 
 def test_every_task_has_a_demonstration(player):
@@ -175,48 +161,53 @@ def test_every_task_has_a_demonstration(player):
     assert 0 not in DEMONSTRATED
     for task_id in (0, 4):
         choice = player.default_choice(task_id, 1)
-        shown = player.demonstration(choice)
-        assert shown.task == get_task(task_id).instruction
-        assert player.demonstration(choice) is shown
-        assert (player.demonstration(choice._replace(recorded=5)).frames != shown.frames).any()
+        demonstration = player.demonstration(choice)
+        assert demonstration.task == get_task(task_id).instruction
+        assert player.demonstration(choice) is demonstration
+        assert (player.demonstration(choice._replace(demo_number=5)).frames != demonstration.frames).any()
 
 
-def test_either_input_can_be_left_out_if_the_policy_has_learned_it(play, player):
-    assert player.uses == (play.BOTH, play.DEMONSTRATION, play.INSTRUCTION)
-    choice = player.default_choice(26, 3)._replace(sentence="Put it in the red bin.")
-    alone = player.run(choice._replace(use=play.DEMONSTRATION)).verdict.asked
-    assert alone == "The demonstration shows the blue t cup in the green bin."
-    assert "demonstration" not in player.run(choice._replace(use=play.INSTRUCTION)).verdict.asked
+def test_either_input_can_be_left_out_if_the_policy_has_learned_it(player):
+    assert player.inputs == (BOTH, DEMONSTRATION, INSTRUCTION)
+    choice = player.default_choice(26, 3)._replace(instruction="Put it in the red bin.")
+    alone = player.run(choice._replace(inputs=DEMONSTRATION))
+    assert (alone.instruction, len(alone.ends)) == ("", 2)
+    alone = player.run(choice._replace(inputs=INSTRUCTION))
+    assert (alone.demonstration, alone.ends) == ("", [])
+    assert alone.lines[-1] == "Not judged: the sentence names no object, and there is no demonstration."
     with pytest.raises(ValueError, match="Type an instruction first"):
-        player.run(choice._replace(sentence=" "))
+        player.run(choice._replace(instruction=" "))
 
 
 def test_the_comparison_crosses_two_demonstrations_with_two_sentences(player):
     four = player.comparison(player.default_choice(4, 1000))
     assert len({(choice.task_id, choice.seed) for choice in four}) == 1
-    pairs = {((choice.demonstrated, choice.recorded), choice.sentence) for choice in four}
+    pairs = {((choice.demo_task, choice.demo_number), choice.instruction) for choice in four}
     assert len(pairs) == 4
     assert [len({pair[n] for pair in pairs}) for n in range(2)] == [2, 2]
     _, layout = player.show_scene(four[0])
     there = {item.label.index for item in layout.objects}
-    assert all(there & set(get_task(choice.demonstrated).targets) for choice in four)
-    # A demonstration of another object than the scene's own is kept.
-    other = get_task(four[2].demonstrated)
-    again = player.comparison(four[0]._replace(demonstrated=other.index, recorded=3))
-    assert {(choice.demonstrated, choice.recorded) for choice in again[:2]} == {(other.index, 3)}
+    assert all(there & set(get_task(choice.demo_task).targets) for choice in four)
+    # A demonstration of another object than the scene's target is kept.
+    other = get_task(four[2].demo_task)
+    again = player.comparison(four[0]._replace(demo_task=other.index, demo_number=3))
+    assert {(choice.demo_task, choice.demo_number) for choice in again[:2]} == {(other.index, 3)}
 
 
-def test_the_address_holds_the_choice(play, player):
-    choice = play.Choice(26, 7, 4, 12, "Put it & wave.", play.INSTRUCTION)
+def test_the_address_holds_the_choice(player):
+    choice = Choice(26, 7, 4, 12, "Put it & wave.", INSTRUCTION)
     assert player.parse_choice(dict(parse_qsl(choice.query.removeprefix("?")))) == choice
-    for query in ({}, {"task_id": "x", "seed": "-1", "demonstrated": "999", "recorded": "?", "use": "all"}):
-        assert player.parse_choice(query).demonstrated < len(TASKS)
+    for query in (
+        {},
+        {"task_id": "x", "seed": "-1", "demo_task": "999", "demo_number": "?", "inputs": "all"},
+    ):
+        assert player.parse_choice(query).demo_task < len(TASKS)
 
 
-def test_the_suggested_sentences_can_be_judged_in_their_scene(play, player):
+def test_there_are_sentences_to_try_in_every_scene(player):
+    pytest.importorskip("gradio", reason="the extra `play` is not installed")  # which takes 3 s to import
+    play = importlib.import_module("lerobot_deltaco.pages.play")
     for task_id in range(0, 300, 17):
         choice = player.default_choice(task_id, task_id)
         _, layout = player.show_scene(choice)
-        for sentence in play.suggest_sentences(choice, layout):
-            verdict = judge(layout, frozenset(), -1, sentence, get_task(task_id).instruction)
-            assert verdict.headline == "Not done", sentence
+        assert len(set(play.suggest_sentences(choice, layout))) == 5
