@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from gym_deltaco import ENV_ID
 from gym_deltaco.control import control_of
 from gym_deltaco.env import Observation, PickPlaceEnv
+from gym_deltaco.paraphrases import choose_instructions
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
-from lerobot_deltaco.data.paraphrases import choose_instructions
 from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
 
 logger = logging.getLogger(__name__)
@@ -45,8 +45,7 @@ class DeltacoEnv(EnvConfig):
 
     Args:
         task: Tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_a_validation,
-            scenario_b_test, scenario_b_train, all, ...), or indices and ranges, such as 4,50-73. The paper's
-            tasks are 0 to 299, those by color and shape 1000 to 1479.
+            scenario_b_test, scenario_b_train, all, ...), or indices and ranges, such as 4,50-73.
         fps: Frames per second of the videos of episodes; 0 for that of the control, 24 or 30.
         scene: Settings of the scenes, such as --env.scene.ambiguity=object or --env.scene.control=joints.
         render_size: Height and width of videos, px. LeRobot records up to 10 episodes of every task, and a
@@ -71,10 +70,10 @@ class DeltacoEnv(EnvConfig):
     def __post_init__(self) -> None:
         try:
             task_ids = select_tasks(self.task)
-            if any(get_task(task_id).kind == "foreign" for task_id in task_ids):
+            if any(get_task(task_id).object.index is not None for task_id in task_ids):
                 raise ValueError(
-                    "Only a demonstration says which foreign object is meant, and LeRobot's evaluation looks "
-                    "for it by the sentence. Evaluate foreign objects with `deltaco evaluate`."
+                    "Only a demonstration shows which object these tasks ask for, and LeRobot's evaluation "
+                    "looks for it by the sentence. Evaluate them with `deltaco evaluate`."
                 )
             self.scene = self.scene.for_tasks(self.task)
             self.scene.check_tasks(task_ids)

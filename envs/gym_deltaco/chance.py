@@ -14,14 +14,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gym_deltaco.layout import sample_layout
+from gym_deltaco.objects.labels import SCENARIO_A_TEST, ObjectLabel
 from gym_deltaco.objects.object_sets import select_objects
 from gym_deltaco.scene_config import DEFAULT_SCENE, SceneConfig
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel, get_task, select_tasks
+from gym_deltaco.tasks import get_task, select_tasks
 
-_TEST_OBJECTS = frozenset(SCENARIOS["a"].test_rows) & frozenset(range(len(OBJECTS))) | {
-    label.index for label in select_objects("foreign")
-}
+_TEST_OBJECTS = {label.index for label in (*SCENARIO_A_TEST, *select_objects("out_of_distribution"))}
 
 
 def _n_shared(label: ObjectLabel, labels: Sequence[ObjectLabel]) -> int:

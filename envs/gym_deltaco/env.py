@@ -45,7 +45,7 @@ Observation = dict[str, Any]
 class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     """A WidowX 250 puts one of three objects into one of two containers, as an instruction says.
 
-    The task is one of the 300 of `gym_deltaco.tasks`. Every reset draws a new scene.
+    The tasks are those of `gym_deltaco.tasks`. Every reset draws a new scene.
 
     ## Observation
 
@@ -87,7 +87,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
       step, joints move evenly towards their targets, at 3 rad/s at most (a WidowX 250 can do about that), and
       the gripper takes at least 0.4 s to open or close.
     - An episode has 240 steps (8 s) by default.
-    - The gripper can be turned in any direction. Only the hand and the fingers collide with things.
+    - The gripper can be turned in any direction. Only the hand and the fingers collide.
 
     ## Reward and success
 
@@ -103,7 +103,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     | key                   | meaning                                                                      |
     |-----------------------|------------------------------------------------------------------------------|
     | `is_success`          | whether the task has succeeded in this episode                               |
-    | `task_id`             | index of the task, 0..299, or 1000..1479 for tasks by color and shape        |
+    | `task_id`             | index of the task                                                            |
     | `objects`             | (3,) int64: indices of the objects in the scene; 0..31 are the paper's       |
     | `object_containers`   | (3,) int64: container in which each object lies, 0 green, 1 red              |
     | `container_quadrants` | (2, 2) int64: i (0 right, 1 left) and j (0 back, 1 front) of both containers |
@@ -114,8 +114,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     | `right_container`     | whether an object lies in the target container, and none in the other one    |
 
     Args:
-        task_id: Index of the task, 0..299, or 1000..1479 for tasks by color and shape.
-            `reset(options={"task_id": ...})` changes it from then on.
+        task_id: Index of the task. `reset(options={"task_id": ...})` changes it from then on.
         scene: Settings of the scenes: ambiguity scheme, objects, image size, episode length, ...
         render_mode: "rgb_array" or None.
         render_size: Height and width of the images that `render` returns, 8..4096 px.
@@ -197,8 +196,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
         Args:
             seed: Seed of `np_random`; None continues its stream.
-            options: "task_id": index of the task of this and the following episodes, 0..299, or 1000..1479
-                for tasks by color and shape. Other keys are ignored.
+            options: "task_id": index of the task of this and the following episodes. Other keys are ignored.
 
         Returns:
             The first observation and info.

@@ -90,7 +90,7 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EX
 
     Args:
         env: The environment, without wrappers.
-        task_id: Index of the task, 0..299, or 1000..1479 for tasks by color and shape.
+        task_id: Index of the task.
         seed: Seed of the scene, the drop point and the noise.
         noise: Standard deviation of the noise on the first three numbers of the actions; with joint control,
             that on joints in units of 0.04 rad.

@@ -7,11 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.objects.object_sets import find_label, find_model, select_objects
+from gym_deltaco.objects.labels import ObjectLabel, find_label
+from gym_deltaco.objects.models import find_model
+from gym_deltaco.objects.object_sets import select_objects
 from gym_deltaco.objects.objects import ObjectModel
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.sim.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
-from gym_deltaco.tasks import CONTAINER_COLORS, ContainerColor, ContainerWord, ObjectLabel, Task
+from gym_deltaco.tasks import CONTAINER_COLORS, ContainerColor, ContainerWord, Task
 
 N_OBJECTS = 3
 MIN_OBJECT_DISTANCE = 0.065  # m

@@ -23,10 +23,10 @@ from gymnasium.utils import seeding
 
 from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.layout import sample_layout
+from gym_deltaco.paraphrases import GRAMMAR
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
-from lerobot_deltaco.data.paraphrases import GRAMMAR
 
 SCHEMA = pa.schema(
     {

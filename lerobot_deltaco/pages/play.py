@@ -15,7 +15,7 @@ from PIL import Image
 
 from gym_deltaco.layout import Layout
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import N_ROWS, TASKS, ContainerWord, get_task, select_tasks
+from gym_deltaco.tasks import TASKS, ContainerWord, get_task, select_tasks
 from lerobot_deltaco.arguments import PlayArguments
 from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.evaluation.video import (
@@ -211,9 +211,10 @@ class Player:
         if len(fitting) != 1:  # the chosen demonstration does not single out an object here
             fitting = [labels[layout.target_object]]
             first = choice._replace(demonstrated=choice.task_id, recorded=0)
-        other = next(label.index for label in labels if label not in fitting)
-        column = get_task(first.demonstrated).column
-        second = choice._replace(demonstrated=N_ROWS * column + other, recorded=0)
+        other = next(label.name for label in labels if label not in fitting)
+        bin_word = get_task(first.demonstrated).container
+        demonstrated = next(t.index for t in TASKS if (t.object.name, t.container) == (other, bin_word))
+        second = choice._replace(demonstrated=demonstrated, recorded=0)
         return [
             each._replace(sentence=f"Put it in the {color} bin.", use=BOTH)
             for each, color in itertools.product((first, second), ("green", "red"))

@@ -23,9 +23,8 @@ ALL_TASKS = (*TASKS, *COLOR_SHAPE_TASKS)
 def described(task):
     """Properties of the object that a task's sentences give. That of a name is always given."""
     if task.kind == "name":
-        label = OBJECTS[task.row]
-        return [("name", label.name), ("color", label.color), ("shape", label.shape)]
-    return [(kind, getattr(task, kind)) for kind in task.kind.split("_")]
+        return [(name, getattr(task.object, name)) for name in ("name", "color", "shape")]
+    return [(name, getattr(task.object, name)) for name in task.kind.split("_")]
 
 
 def is_understood(task, sentence):

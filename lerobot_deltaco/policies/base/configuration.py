@@ -15,7 +15,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from gym_deltaco.env import ACTION_NAMES
-from lerobot_deltaco.data.paraphrases import GRAMMAR
+from gym_deltaco.paraphrases import GRAMMAR
 from lerobot_deltaco.policies.base.optimization import CosineSchedulerConfig, FusedAdamWConfig
 
 logger = logging.getLogger(__name__)

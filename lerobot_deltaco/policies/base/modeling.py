@@ -19,7 +19,8 @@ from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
+from gym_deltaco.paraphrases import GRAMMAR, read_paraphrases
+from gym_deltaco.tasks import find_task, get_task
 from lerobot_deltaco.data.demonstrations import (
     Demonstration,
     DemonstrationBank,
@@ -27,7 +28,6 @@ from lerobot_deltaco.data.demonstrations import (
     read_demonstrations,
     read_robot_data,
 )
-from lerobot_deltaco.data.paraphrases import GRAMMAR, read_paraphrases
 from lerobot_deltaco.data.reading import (
     check_episode_numbers,
     compare_robots,
@@ -472,8 +472,7 @@ def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadat
     """Reads the sentences for training, by task string."""
     if config.paraphrases is None:
         return None
-    known = {task.instruction: task.index for task in (*TASKS, *COLOR_SHAPE_TASKS)}
-    needed = [known[text] for text in meta.tasks.index if text in known]
+    needed = [task.index for text in meta.tasks.index if (task := find_task(text)) is not None]
     sentences = read_paraphrases(config.paraphrases, "train", needed)
     by_task = {get_task(task_id).instruction: own for task_id, own in sentences.items()}
     return Paraphrases(by_task, config.p_paraphrase, is_complete=config.paraphrases != GRAMMAR)
