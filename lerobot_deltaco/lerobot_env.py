@@ -1,4 +1,8 @@
-"""`--env.type=deltaco`: the benchmark as an environment of LeRobot."""
+"""`--env.type=deltaco`: the benchmark as an environment of LeRobot.
+
+Every command of LeRobot imports this module. It imports the benchmark's settings and tasks; the simulator is
+imported where environments are made.
+"""
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
@@ -7,28 +11,19 @@ import logging
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
-from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs import EnvConfig
-from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.utils.constants import ACTION, OBS_STATE
-from numpy.typing import NDArray
 
 from gym_deltaco import ENV_ID
 from gym_deltaco.control import control_of
-from gym_deltaco.env import Observation, PickPlaceEnv
-from gym_deltaco.paraphrases import choose_instructions
 from gym_deltaco.scene_config import SceneConfig
-from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
-from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +50,7 @@ class DeltacoEnv(EnvConfig):
         paraphrases_split: Split of the file's sentences: all; held_out, the last one of each task; or train,
             those that are not held out for any task.
         instruction: A sentence that replaces the instruction of every task.
-        demonstrations: Whether observations contain a demonstration of the task, as `EvaluationEnv` has it.
+        demonstrations: Whether observations contain a demonstration of the task, as `ProtocolEnv` has it.
     """
 
     task: str = "scenario_a_test"
@@ -109,6 +104,8 @@ class DeltacoEnv(EnvConfig):
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of the environment; the task is set later."""
+        from gym_deltaco.paraphrases import choose_instructions
+
         return {
             "scene": self.scene,
             "render_mode": "rgb_array",
@@ -129,71 +126,17 @@ class DeltacoEnv(EnvConfig):
         Returns:
             {kind of task: {index of the task: vector environment}}.
         """
+        from lerobot_deltaco.evaluation.protocol_env import make_protocol_env
+
         arguments = self.gym_kwargs
         groups: dict[str, dict[int, VectorEnv]] = defaultdict(dict)
         for task_id in select_tasks(self.task):
-            make = partial(_make_env, task_id=task_id, **arguments)
+            make = partial(make_protocol_env, task_id=task_id, **arguments)
             # With LeRobot's wrapper and this autoreset, its metric counts no step of a further episode.
             env = SyncVectorEnv([make] * n_envs, autoreset_mode=AutoresetMode.NEXT_STEP)
             env.metadata = {**env.metadata, "render_fps": self.fps}
             groups[get_task(task_id).kind][task_id] = env
         return dict(groups)
-
-
-class EvaluationEnv(PickPlaceEnv):
-    """The environment with the scenes of the evaluation protocol.
-
-    The seed of a reset is mapped to one that also depends on the task, and that no training scene has.
-
-    Args:
-        demonstrations: Whether every observation also has the key `demonstration`: the first and the last
-            image of the protocol's demonstration of the task, (2, 3, H, W) uint8.
-        arguments: Arguments of `PickPlaceEnv`.
-    """
-
-    def __init__(self, *, demonstrations: bool = False, **arguments: Any) -> None:
-        super().__init__(**arguments)
-        self._has_demonstrations = demonstrations
-        if demonstrations:
-            size = self.scene_config.image_size
-            assert isinstance(self.observation_space, Dict)
-            self.observation_space.spaces["demonstration"] = Box(0, 255, (2, 3, size, size), np.uint8)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Draws and builds a new scene. See `PickPlaceEnv.reset`."""
-        if seed is not None:
-            task_id = (options or {}).get("task_id", self.task.index)
-            seed = episode_seed(0, "evaluation", task_id, 0, seed)
-        return super().reset(seed=seed, options=options)
-
-    def _observation(self) -> Observation:
-        observation = super()._observation()
-        if self._has_demonstrations:
-            observation["demonstration"] = _demonstration_ends(self.task.index, self.scene_config).copy()
-        return observation
-
-
-@cache
-def _demonstration_ends(task_id: int, scene: SceneConfig) -> NDArray[np.uint8]:
-    return expert_demonstration(task_id, 0, scene).frames[[0, -1]].numpy()
-
-
-class _FrozenAfterEpisodeEnd(FreezeAfterEpisodeEnd):
-    """LeRobot's wrapper, but a reset with a seed also begins a new episode."""
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Draws a new scene, unless Gymnasium resets an episode that has ended."""
-        if seed is not None:
-            self._frozen = None
-        return super().reset(seed=seed, options=options)
-
-
-def _make_env(**arguments: Any) -> gym.Env:
-    return _FrozenAfterEpisodeEnd(EvaluationEnv(**arguments))
 
 
 def check_policy_fits(

@@ -97,7 +97,8 @@ class Result:
         """Evaluation seed, followed by a slash and the scene split, if there is one."""
         plans = [record.plan for record in self.last]
         names = {
-            f"{plan.seed}" if plan.scene_split is None else f"{plan.seed}/{plan.scene_split}" for plan in plans
+            f"{plan.seed}" if plan.scene_split is None else f"{plan.seed}/{plan.scene_split}"
+            for plan in plans
         }
         return ", ".join(sorted(names))
 

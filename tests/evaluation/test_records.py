@@ -31,7 +31,13 @@ def lists(episodes):
 
 def test_read_is_the_inverse_of_write(tmp_path):
     scene = SceneConfig(ambiguity="object", adversarial_probability=0.25, image_size=64)
-    plan = {"scene": scene, "scene_split": 3, "seed": 7, "counterfactual": "instruction", "n_demonstrations": 2}
+    plan = {
+        "scene": scene,
+        "scene_split": 3,
+        "seed": 7,
+        "counterfactual": "instruction",
+        "n_demonstrations": 2,
+    }
     written = [
         make_record(),
         make_record("a/b", 3, 5, plan=plan, columns={"instruction": "put it there"}, weights="0123"),
