@@ -163,19 +163,19 @@ def check_policy_fits(
             f"The policy was trained with the control {trained_for!r}, but that of the environment is "
             f"{scene.control!r}. Set `scene.control` to {trained_for}."
         )
-    there = [rename_map.get(name, name) for name in control.camera_keys]
-    known = [camera for camera in there if camera in cameras]
+    available = [rename_map.get(name, name) for name in control.camera_keys]
+    shared = [camera for camera in available if camera in cameras]
     # Vision-language-action models (which have this option) leave out cameras that are not there, and keep
     # the image size of the model that they were fine-tuned from, whatever the dataset's was.
     can_lack_cameras = hasattr(policy, "empty_cameras")
-    if not known or (len(known) < len(cameras) and not can_lack_cameras):
+    if not shared or (len(shared) < len(cameras) and not can_lack_cameras):
         example = json.dumps({control.camera_keys[0]: cameras[0]}) if cameras else "{}"
         raise ValueError(
             f"The policy was trained on images of {', '.join(cameras) or 'no camera'}, but the benchmark's "
-            f"environment has {', '.join(there)} alone. Evaluate it where it was trained for, or, if it is "
-            f"the same camera, rename it: --rename_map='{example}'."
+            f"environment has {', '.join(available)} alone. Evaluate it where it was trained for, or, if it "
+            f"is the same camera, rename it: --rename_map='{example}'."
         )
-    trained_on = policy.image_features[known[0]].shape[-1]
+    trained_on = policy.image_features[shared[0]].shape[-1]
     if trained_on != scene.image_size and not can_lack_cameras:
         raise ValueError(
             f"The policy was trained on images of {trained_on} pixels, but those of the environment have "

@@ -57,7 +57,7 @@ def chance_levels(
     Returns:
         Expected rate by name of the rule, 0..1. Objects with the same score are equally likely.
     """
-    found: dict[str, list[float]] = {name: [] for name in RULES}
+    rates: dict[str, list[float]] = {name: [] for name in RULES}
     for task_id in task_ids:
         for trial in range(first_trial, first_trial + n_trials):
             rng = np.random.default_rng(episode_seed(0, "evaluation", task_id, 0, trial))
@@ -66,8 +66,8 @@ def chance_levels(
             for name, rule in RULES.items():
                 scores = [rule(label, labels) for label in labels]
                 best = [number for number, score in enumerate(scores) if score == max(scores)]
-                found[name].append((layout.target_object in best) / len(best))
-    return {name: float(np.mean(rates)) for name, rates in found.items()}
+                rates[name].append((layout.target_object in best) / len(best))
+    return {name: float(np.mean(of_rule)) for name, of_rule in rates.items()}
 
 
 def main() -> None:

@@ -43,7 +43,7 @@ Observation = dict[str, Any]
 
 
 class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
-    """A WidowX 250 puts one of three objects into one of two containers, as an instruction says.
+    """A WidowX 250 puts one of three objects into one of two containers, following an instruction.
 
     The tasks are those of `gym_deltaco.tasks`. Every reset draws a new scene.
 
@@ -120,7 +120,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         render_size: Height and width of the images that `render` returns, 8..4096 px.
         instructions: Sentences of each task. The `task_description` of an episode is then one of its task's
             sentences, drawn by the episode's seed; the scene stays the same. By default, it is the
-            benchmark's template.
+            template.
 
     Raises:
         ValueError: An argument is invalid; the message says what is valid.

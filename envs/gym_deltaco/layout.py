@@ -111,17 +111,17 @@ def _sample_distractors(
     ]
     similar = [label.index for label in others if label.color == target.color or label.shape == target.shape]
     shared_draw = rng.random() if scene.adversarial_draw == "scene" else None
-    chosen: list[int] = []
-    while len(chosen) < N_OBJECTS - 1:
-        left = [index for index in similar if index not in chosen]
+    distractors: list[int] = []
+    while len(distractors) < N_OBJECTS - 1:
+        candidates = [index for index in similar if index not in distractors]
         # Each distractor has its own draw, unless the scene has one for both.
         if (
-            not left
+            not candidates
             or (rng.random() if shared_draw is None else shared_draw) >= scene.adversarial_probability
         ):
-            left = [label.index for label in others if label.index not in chosen]
-        chosen.append(int(rng.choice(left)))
-    return chosen[0], chosen[1]
+            candidates = [label.index for label in others if label.index not in distractors]
+        distractors.append(int(rng.choice(candidates)))
+    return distractors[0], distractors[1]
 
 
 def _sample_quadrants(

@@ -21,9 +21,9 @@ from gym_deltaco.tasks import Task
 PhraseSplit = Literal["train", "held_out"]
 
 _FILE = Path(__file__).with_name("phrases.yaml")
-_P_NO_ARTICLE, _P_TYPO = 0.3, 0.1
+_P_NO_ARTICLE, _P_TYPO = 0.3, 0.1  # probabilities that a sentence lacks its articles, or has an error
 _MIN_TYPO_LENGTH = 5  # letters, of a word that is misspelled
-_P_HELD_OUT = 0.4  # of each part of a held-out sentence
+_P_HELD_OUT = 0.4  # probability that a part of a held-out sentence is a held-out phrase
 _ENDS = ("", "", ".", "!")
 
 

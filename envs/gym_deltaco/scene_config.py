@@ -81,7 +81,7 @@ class SceneConfig:
         return self.interface.episode_length if self.episode_length is None else self.episode_length
 
     def for_tasks(self, tasks: str) -> SceneConfig:
-        """Returns the settings with the objects that a selection of tasks needs, unless others are set."""
+        """Returns the settings with the default objects of a selection of tasks, unless others are set."""
         return replace(self, objects=default_objects(tasks)) if self.objects == "all" else self
 
     def check_tasks(self, task_ids: Iterable[int]) -> None:

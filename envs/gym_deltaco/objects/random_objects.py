@@ -84,12 +84,12 @@ def _cut_at_waists(rows: Sequence[Row]) -> list[Sequence[Row]]:
 
 def _convex(rows: Sequence[Row]) -> list[Row]:
     """Removes rings that lie within the convex hull of their neighbors."""
-    kept: list[Row] = []
+    convex: list[Row] = []
     for row in rows:
-        while len(kept) > 1 and not _stands_out(kept[-2], kept[-1], row):
-            kept.pop()
-        kept.append(row)
-    return kept
+        while len(convex) > 1 and not _stands_out(convex[-2], convex[-1], row):
+            convex.pop()
+        convex.append(row)
+    return convex
 
 
 def _stands_out(below: Row, row: Row, above: Row) -> bool:
