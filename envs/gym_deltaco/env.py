@@ -68,26 +68,22 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     ## Time
 
-    A step is 10 physics steps of 1/240 s, or 75 when the gripper opens or closes. The frame rate of 24 Hz
-    (`render_fps`, and the timestamps of datasets, 1/24 s apart) is therefore nominal. The arm is also faster
-    than a real one: averaged over a step of the expert, joints turn at up to 16 rad/s (in 99 % of the steps
-    at less than 12.5 rad/s), those of a real WidowX 250 at about 3 rad/s.
-
-    An episode is truncated after `scene.episode_length` steps; it never terminates.
+    A step is 10 physics steps of 1/240 s, or 75 when the gripper opens or closes, so that the frame rate of
+    24 Hz (`render_fps`, and the timestamps of datasets) is nominal. The arm is faster than a real one: the
+    expert's joints turn at up to 16 rad/s, those of a WidowX 250 at about 3 rad/s. An episode is truncated
+    after `scene.episode_length` steps; it never terminates.
 
     ## Joint control
 
-    With `scene.control="joints"`, the same tasks and scenes are controlled as a robot is:
+    With `scene.control="joints"`, the arm is controlled as LeRobot's robots are:
 
-    - `pixels` is a dictionary of two images, `front` and `wrist`, of a camera that is mounted on the hand.
+    - `pixels` is a dictionary of two images: `front`, and `wrist` of a camera on the hand.
     - `agent_pos` (7,) are the measured angles of the joints (rad) and the measured opening of the gripper
-      (0 closed, 1 open). An action (7,) are their targets, clipped to the joints' limits. Their names are
-      `waist.pos`, ..., `gripper.pos`.
-    - A step is always 8 physics steps of 1/240 s: the rate of 30 Hz, timestamps and speeds are real. In a
-      step, joints move evenly towards their targets, at 3 rad/s at most (a WidowX 250 can do about that), and
-      the gripper takes at least 0.4 s to open or close.
+      (0 closed, 1 open); an action (7,) are their targets, clipped to the joints' limits.
+    - A step is 8 physics steps of 1/240 s (30 Hz, real time). Joints turn at 3 rad/s at most, and the gripper
+      takes at least 0.4 s to open or close.
     - An episode has 240 steps (8 s) by default.
-    - The gripper can be turned in any direction. Only the hand and the fingers collide.
+    - The gripper can point in any direction. Only the hand and the fingers collide.
 
     ## Reward and success
 
