@@ -1,4 +1,8 @@
-"""`--env.type=deltaco`: the benchmark as an environment of LeRobot."""
+"""`--env.type=deltaco`: the benchmark as an environment of LeRobot.
+
+Every command of LeRobot imports this module. It imports the benchmark's settings and tasks; the simulator is
+imported where environments are made.
+"""
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
@@ -7,28 +11,19 @@ import logging
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
-from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs import EnvConfig
-from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.utils.constants import ACTION, OBS_STATE
-from numpy.typing import NDArray
 
 from gym_deltaco import ENV_ID
 from gym_deltaco.control import control_of
-from gym_deltaco.env import Observation, PickPlaceEnv
 from gym_deltaco.scene_config import SceneConfig
-from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
-from lerobot_deltaco.data.paraphrases import choose_instructions
-from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
 
 logger = logging.getLogger(__name__)
 
@@ -45,8 +40,7 @@ class DeltacoEnv(EnvConfig):
 
     Args:
         task: Tasks to run: a task set (scenario_a_test, scenario_a_train, scenario_a_validation,
-            scenario_b_test, scenario_b_train, all, ...), or indices and ranges, such as 4,50-73. The paper's
-            tasks are 0 to 299, those by color and shape 1000 to 1479.
+            scenario_b_test, scenario_b_train, all, ...), or indices and ranges, such as 4,50-73.
         fps: Frames per second of the videos of episodes; 0 for that of the control, 24 or 30.
         scene: Settings of the scenes, such as --env.scene.ambiguity=object or --env.scene.control=joints.
         render_size: Height and width of videos, px. LeRobot records up to 10 episodes of every task, and a
@@ -56,7 +50,7 @@ class DeltacoEnv(EnvConfig):
         paraphrases_split: Split of the file's sentences: all; held_out, the last one of each task; or train,
             those that are not held out for any task.
         instruction: A sentence that replaces the instruction of every task.
-        demonstrations: Whether observations contain a demonstration of the task, as `EvaluationEnv` has it.
+        demonstrations: Whether observations contain a demonstration of the task, as `ProtocolEnv` has it.
     """
 
     task: str = "scenario_a_test"
@@ -71,10 +65,10 @@ class DeltacoEnv(EnvConfig):
     def __post_init__(self) -> None:
         try:
             task_ids = select_tasks(self.task)
-            if any(get_task(task_id).kind == "foreign" for task_id in task_ids):
+            if any(get_task(task_id).object.index is not None for task_id in task_ids):
                 raise ValueError(
-                    "Only a demonstration says which foreign object is meant, and LeRobot's evaluation looks "
-                    "for it by the sentence. Evaluate foreign objects with `deltaco evaluate`."
+                    "Only a demonstration shows which object these tasks ask for, and LeRobot's evaluation "
+                    "looks for it by the sentence. Evaluate them with `deltaco evaluate`."
                 )
             self.scene = self.scene.for_tasks(self.task)
             self.scene.check_tasks(task_ids)
@@ -110,6 +104,8 @@ class DeltacoEnv(EnvConfig):
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of the environment; the task is set later."""
+        from gym_deltaco.paraphrases import choose_instructions
+
         return {
             "scene": self.scene,
             "render_mode": "rgb_array",
@@ -130,71 +126,17 @@ class DeltacoEnv(EnvConfig):
         Returns:
             {kind of task: {index of the task: vector environment}}.
         """
+        from lerobot_deltaco.evaluation.protocol_env import make_protocol_env
+
         arguments = self.gym_kwargs
         groups: dict[str, dict[int, VectorEnv]] = defaultdict(dict)
         for task_id in select_tasks(self.task):
-            make = partial(_make_env, task_id=task_id, **arguments)
+            make = partial(make_protocol_env, task_id=task_id, **arguments)
             # With LeRobot's wrapper and this autoreset, its metric counts no step of a further episode.
             env = SyncVectorEnv([make] * n_envs, autoreset_mode=AutoresetMode.NEXT_STEP)
             env.metadata = {**env.metadata, "render_fps": self.fps}
             groups[get_task(task_id).kind][task_id] = env
         return dict(groups)
-
-
-class EvaluationEnv(PickPlaceEnv):
-    """The environment with the scenes of the evaluation protocol.
-
-    The seed of a reset is mapped to one that also depends on the task, and that no training scene has.
-
-    Args:
-        demonstrations: Whether every observation also has the key `demonstration`: the first and the last
-            image of the protocol's demonstration of the task, (2, 3, H, W) uint8.
-        arguments: Arguments of `PickPlaceEnv`.
-    """
-
-    def __init__(self, *, demonstrations: bool = False, **arguments: Any) -> None:
-        super().__init__(**arguments)
-        self._has_demonstrations = demonstrations
-        if demonstrations:
-            size = self.scene_config.image_size
-            assert isinstance(self.observation_space, Dict)
-            self.observation_space.spaces["demonstration"] = Box(0, 255, (2, 3, size, size), np.uint8)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Draws and builds a new scene. See `PickPlaceEnv.reset`."""
-        if seed is not None:
-            task_id = (options or {}).get("task_id", self.task.index)
-            seed = episode_seed(0, "evaluation", task_id, 0, seed)
-        return super().reset(seed=seed, options=options)
-
-    def _observation(self) -> Observation:
-        observation = super()._observation()
-        if self._has_demonstrations:
-            observation["demonstration"] = _demonstration_ends(self.task.index, self.scene_config).copy()
-        return observation
-
-
-@cache
-def _demonstration_ends(task_id: int, scene: SceneConfig) -> NDArray[np.uint8]:
-    return expert_demonstration(task_id, 0, scene).frames[[0, -1]].numpy()
-
-
-class _FrozenAfterEpisodeEnd(FreezeAfterEpisodeEnd):
-    """LeRobot's wrapper, but a reset with a seed also begins a new episode."""
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Draws a new scene, unless Gymnasium resets an episode that has ended."""
-        if seed is not None:
-            self._frozen = None
-        return super().reset(seed=seed, options=options)
-
-
-def _make_env(**arguments: Any) -> gym.Env:
-    return _FrozenAfterEpisodeEnd(EvaluationEnv(**arguments))
 
 
 def check_policy_fits(
@@ -221,19 +163,19 @@ def check_policy_fits(
             f"The policy was trained with the control {trained_for!r}, but that of the environment is "
             f"{scene.control!r}. Set `scene.control` to {trained_for}."
         )
-    there = [rename_map.get(name, name) for name in control.camera_keys]
-    known = [camera for camera in there if camera in cameras]
+    available = [rename_map.get(name, name) for name in control.camera_keys]
+    shared = [camera for camera in available if camera in cameras]
     # Vision-language-action models (which have this option) leave out cameras that are not there, and keep
     # the image size of the model that they were fine-tuned from, whatever the dataset's was.
     can_lack_cameras = hasattr(policy, "empty_cameras")
-    if not known or (len(known) < len(cameras) and not can_lack_cameras):
+    if not shared or (len(shared) < len(cameras) and not can_lack_cameras):
         example = json.dumps({control.camera_keys[0]: cameras[0]}) if cameras else "{}"
         raise ValueError(
             f"The policy was trained on images of {', '.join(cameras) or 'no camera'}, but the benchmark's "
-            f"environment has {', '.join(there)} alone. Evaluate it where it was trained for, or, if it is "
-            f"the same camera, rename it: --rename_map='{example}'."
+            f"environment has {', '.join(available)} alone. Evaluate it where it was trained for, or, if it "
+            f"is the same camera, rename it: --rename_map='{example}'."
         )
-    trained_on = policy.image_features[known[0]].shape[-1]
+    trained_on = policy.image_features[shared[0]].shape[-1]
     if trained_on != scene.image_size and not can_lack_cameras:
         raise ValueError(
             f"The policy was trained on images of {trained_on} pixels, but those of the environment have "

@@ -20,6 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.layout import twin_word
+from gym_deltaco.objects.labels import OBJECTS, SHAPES
 from gym_deltaco.objects.objects import ObjectModel, object_model
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
@@ -27,7 +28,7 @@ from gym_deltaco.sim.camera import Camera
 from gym_deltaco.sim.fixtures import TABLE_BOXES, TRAY_BOXES, table_mesh, tray_mesh
 from gym_deltaco.sim.simulation import Simulation
 from gym_deltaco.sim.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
-from gym_deltaco.tasks import OBJECTS, SCENARIOS, SHAPES, TASK_SETS, get_task
+from gym_deltaco.tasks import SCENARIOS, TASK_SETS, get_task
 from lerobot_deltaco.evaluation.records import EvaluationPlan
 from lerobot_deltaco.evaluation.video import (
     benchmark_env,
@@ -246,7 +247,8 @@ def main(out: Path = Path("docs/images")) -> None:
     with mpl.rc_context({"axes.titlesize": 9, "axes.labelsize": 9, "savefig.dpi": 100}):
         draw_objects(out)
         draw_scenes(out / "scenes.png", SCENE_TASKS, SceneConfig())
-        draw_scenes(out / "foreign_objects.png", TASK_SETS["foreign"][:12], SceneConfig(objects="foreign"))
+        name = "out_of_distribution"
+        draw_scenes(out / f"{name}.png", TASK_SETS[name][:12], SceneConfig(objects=name))
         draw_ambiguity(out)
         draw_joint_control(out)
     draw_policy(out)

@@ -43,7 +43,7 @@ def leaderboard_tables() -> dict[str, pd.DataFrame]:
     """
     sections: dict[str, list[tuple[float, dict[str, object]]]] = {}
     for row in pd.read_csv(ROOT / "results/leaderboard.csv").itertuples():
-        tasks = "foreign" if row.section == "foreign" else "scenario_a_test"
+        tasks = "out_of_distribution" if row.section == "foreign" else "scenario_a_test"
         result = _find(row.records, row.experiment, {"tasks": tasks, "ambiguity": "container"})
         kinds = result.episodes["task_id"].map(lambda task_id: get_task(task_id).kind)
         by_kind = (

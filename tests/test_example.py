@@ -17,8 +17,8 @@ from lerobot_deltaco.collection.collect import CollectionPlan, collect
 from lerobot_deltaco.data.images import as_uint8
 from lerobot_deltaco.evaluation.checkpoints import find_checkpoints, load_policy
 from lerobot_deltaco.evaluation.evaluate import evaluate, evaluate_checkpoints
+from lerobot_deltaco.evaluation.protocol_env import ProtocolEnv
 from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records
-from lerobot_deltaco.lerobot_env import EvaluationEnv
 
 TASKS = "24,35"
 
@@ -79,8 +79,8 @@ def test_another_tasks_demonstration_can_be_given(checkpoint):
 
 
 def test_an_observation_has_the_demonstration_on_request():
-    assert set(EvaluationEnv(task_id=24).observation_space) == {"pixels", "agent_pos"}
-    env = EvaluationEnv(task_id=24, demonstrations=True)
+    assert set(ProtocolEnv(task_id=24).observation_space) == {"pixels", "agent_pos"}
+    env = ProtocolEnv(task_id=24, demonstrations=True)
     check_env(env, skip_render_check=True)
     first, other = (env.reset(options={"task_id": task_id})[0] for task_id in (24, 35))
     assert (first["demonstration"] != other["demonstration"]).any()

@@ -83,11 +83,10 @@ NO_SIMULATOR = """
 import sys
 sys.modules["pybullet"] = None
 import gymnasium, gym_deltaco
-from gym_deltaco import chance, env, expert, layout, tasks
+from gym_deltaco import chance, env, expert, layout, paraphrases, tasks
 from gym_deltaco.objects import object_sets
 from gym_deltaco.sim import simulation
 from lerobot_deltaco.collection import collect
-from lerobot_deltaco.data import paraphrases
 from lerobot_deltaco.evaluation import records
 from lerobot_deltaco.reports import report
 assert not {"torch", "lerobot", "transformers", "huggingface_hub"} & set(sys.modules)

@@ -38,10 +38,10 @@ def parse_json(text: str | bytes, source: object) -> Any:
 
     Args:
         text: The text, in UTF-8.
-        source: Where it is from, for the error.
+        source: Origin of the text, for the error message.
 
     Raises:
-        ValueError: It is not JSON, or nested too deeply.
+        ValueError: The text is not JSON, or nested too deeply.
     """
     try:
         return json.loads(text)
@@ -53,7 +53,7 @@ def read_json(path: Path) -> Any:
     """Returns the content of a JSON file.
 
     Raises:
-        OSError: It cannot be read.
-        ValueError: It is damaged.
+        OSError: The file cannot be read.
+        ValueError: The file is not JSON.
     """
     return parse_json(path.read_bytes(), path)

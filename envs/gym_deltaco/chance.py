@@ -14,14 +14,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gym_deltaco.layout import sample_layout
+from gym_deltaco.objects.labels import SCENARIO_A_TEST, ObjectLabel
 from gym_deltaco.objects.object_sets import select_objects
 from gym_deltaco.scene_config import DEFAULT_SCENE, SceneConfig
 from gym_deltaco.seeding import episode_seed
-from gym_deltaco.tasks import OBJECTS, SCENARIOS, ObjectLabel, get_task, select_tasks
+from gym_deltaco.tasks import get_task, select_tasks
 
-_TEST_OBJECTS = frozenset(SCENARIOS["a"].test_rows) & frozenset(range(len(OBJECTS))) | {
-    label.index for label in select_objects("foreign")
-}
+_TEST_OBJECTS = {label.index for label in (*SCENARIO_A_TEST, *select_objects("out_of_distribution"))}
 
 
 def _n_shared(label: ObjectLabel, labels: Sequence[ObjectLabel]) -> int:
@@ -58,7 +57,7 @@ def chance_levels(
     Returns:
         Expected rate by name of the rule, 0..1. Objects with the same score are equally likely.
     """
-    found: dict[str, list[float]] = {name: [] for name in RULES}
+    rates: dict[str, list[float]] = {name: [] for name in RULES}
     for task_id in task_ids:
         for trial in range(first_trial, first_trial + n_trials):
             rng = np.random.default_rng(episode_seed(0, "evaluation", task_id, 0, trial))
@@ -67,8 +66,8 @@ def chance_levels(
             for name, rule in RULES.items():
                 scores = [rule(label, labels) for label in labels]
                 best = [number for number, score in enumerate(scores) if score == max(scores)]
-                found[name].append((layout.target_object in best) / len(best))
-    return {name: float(np.mean(rates)) for name, rates in found.items()}
+                rates[name].append((layout.target_object in best) / len(best))
+    return {name: float(np.mean(of_rule)) for name, of_rule in rates.items()}
 
 
 def main() -> None:

@@ -48,6 +48,10 @@ CONTROLS = {
 
 
 def control_of(cameras: Iterable[str]) -> str | None:
-    """Returns the control whose cameras are all among some, by their names in datasets; None for neither."""
-    known = set(cameras)
-    return next((name for name, control in CONTROLS.items() if set(control.camera_keys) <= known), None)
+    """Returns the control whose cameras are in a dataset; None if those of neither are.
+
+    Args:
+        cameras: Names of the dataset's images, such as "observation.images.front".
+    """
+    names = set(cameras)
+    return next((name for name, control in CONTROLS.items() if names.issuperset(control.camera_keys)), None)

@@ -43,9 +43,9 @@ Observation = dict[str, Any]
 
 
 class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
-    """A WidowX 250 puts one of three objects into one of two containers, as an instruction says.
+    """A WidowX 250 puts one of three objects into one of two containers, following an instruction.
 
-    The task is one of the 300 of `gym_deltaco.tasks`. Every reset draws a new scene.
+    The tasks are those of `gym_deltaco.tasks`. Every reset draws a new scene.
 
     ## Observation
 
@@ -68,26 +68,22 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     ## Time
 
-    A step is 10 physics steps of 1/240 s, or 75 when the gripper opens or closes. The frame rate of 24 Hz
-    (`render_fps`, and the timestamps of datasets, 1/24 s apart) is therefore nominal. The arm is also faster
-    than a real one: averaged over a step of the expert, joints turn at up to 16 rad/s (in 99 % of the steps
-    at less than 12.5 rad/s), those of a real WidowX 250 at about 3 rad/s.
-
-    An episode is truncated after `scene.episode_length` steps; it never terminates.
+    A step is 10 physics steps of 1/240 s, or 75 when the gripper opens or closes, so that the frame rate of
+    24 Hz (`render_fps`, and the timestamps of datasets) is nominal. The arm is faster than a real one: the
+    expert's joints turn at up to 16 rad/s, those of a WidowX 250 at about 3 rad/s. An episode is truncated
+    after `scene.episode_length` steps; it never terminates.
 
     ## Joint control
 
-    With `scene.control="joints"`, the same tasks and scenes are controlled as a robot is:
+    With `scene.control="joints"`, the arm is controlled as LeRobot's robots are:
 
-    - `pixels` is a dictionary of two images, `front` and `wrist`, of a camera that is mounted on the hand.
+    - `pixels` is a dictionary of two images: `front`, and `wrist` of a camera on the hand.
     - `agent_pos` (7,) are the measured angles of the joints (rad) and the measured opening of the gripper
-      (0 closed, 1 open). An action (7,) are their targets, clipped to the joints' limits. Their names are
-      `waist.pos`, ..., `gripper.pos`.
-    - A step is always 8 physics steps of 1/240 s: the rate of 30 Hz, timestamps and speeds are real. In a
-      step, joints move evenly towards their targets, at 3 rad/s at most (a WidowX 250 can do about that), and
-      the gripper takes at least 0.4 s to open or close.
+      (0 closed, 1 open); an action (7,) are their targets, clipped to the joints' limits.
+    - A step is 8 physics steps of 1/240 s (30 Hz, real time). Joints turn at 3 rad/s at most, and the gripper
+      takes at least 0.4 s to open or close.
     - An episode has 240 steps (8 s) by default.
-    - The gripper can be turned in any direction. Only the hand and the fingers collide with things.
+    - The gripper can point in any direction. Only the hand and the fingers collide.
 
     ## Reward and success
 
@@ -103,7 +99,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     | key                   | meaning                                                                      |
     |-----------------------|------------------------------------------------------------------------------|
     | `is_success`          | whether the task has succeeded in this episode                               |
-    | `task_id`             | index of the task, 0..299, or 1000..1479 for tasks by color and shape        |
+    | `task_id`             | index of the task                                                            |
     | `objects`             | (3,) int64: indices of the objects in the scene; 0..31 are the paper's       |
     | `object_containers`   | (3,) int64: container in which each object lies, 0 green, 1 red              |
     | `container_quadrants` | (2, 2) int64: i (0 right, 1 left) and j (0 back, 1 front) of both containers |
@@ -114,14 +110,13 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
     | `right_container`     | whether an object lies in the target container, and none in the other one    |
 
     Args:
-        task_id: Index of the task, 0..299, or 1000..1479 for tasks by color and shape.
-            `reset(options={"task_id": ...})` changes it from then on.
+        task_id: Index of the task. `reset(options={"task_id": ...})` changes it from then on.
         scene: Settings of the scenes: ambiguity scheme, objects, image size, episode length, ...
         render_mode: "rgb_array" or None.
         render_size: Height and width of the images that `render` returns, 8..4096 px.
         instructions: Sentences of each task. The `task_description` of an episode is then one of its task's
             sentences, drawn by the episode's seed; the scene stays the same. By default, it is the
-            benchmark's template.
+            template.
 
     Raises:
         ValueError: An argument is invalid; the message says what is valid.
@@ -197,8 +192,7 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
 
         Args:
             seed: Seed of `np_random`; None continues its stream.
-            options: "task_id": index of the task of this and the following episodes, 0..299, or 1000..1479
-                for tasks by color and shape. Other keys are ignored.
+            options: "task_id": index of the task of this and the following episodes. Other keys are ignored.
 
         Returns:
             The first observation and info.

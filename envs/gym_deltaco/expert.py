@@ -45,9 +45,9 @@ _MAX_ATTEMPTS = 20  # at a demonstration
 # Heights, distances and errors in m. Heights of the gripper are those of the end effector; the fingertips are
 # 0.05 m lower.
 _HOVER_Z = -0.215  # height of the gripper at which its fingertips pass above every object
-_ALIGNED = np.array([0.013, 0.012])  # largest error in x and y at which the gripper starts to descend
-_STRADDLING = np.array([0.02, 0.03])  # largest error in x and y once the gripper is down
-_AROUND = np.array([0.02, 0.014, 0.015])  # largest error in x, y and z at which it closes
+_DESCEND_TOLERANCE = np.array([0.013, 0.012])  # largest error in x and y at which the descent begins
+_STRADDLE_TOLERANCE = np.array([0.02, 0.03])  # largest error in x and y once the gripper is down
+_GRASP_TOLERANCE = np.array([0.02, 0.014, 0.015])  # largest error in x, y and z at which it closes
 _PAD_HEIGHT = 0.010  # center of the finger pads above the fingertips
 _TIP_CLEARANCE = 0.004  # fingertips above the tray
 _PALM_CLEARANCE = 0.012  # end effector above the object's top
@@ -55,22 +55,22 @@ _CARRY_CLEARANCE = 0.085  # lowest point of a carried object above the tray
 _LIFTED_CLEARANCE = 0.06  # lowest point of an object above the tray from which on it is carried
 _CARRY_SPEED = 0.8  # largest norm of the action while carrying; at full diagonal speed, the object would slip
 _DROP_FRACTION = 0.3  # of the container's half extents, within which the drop point is drawn
-_OVER_CONTAINER = np.array([0.035, 0.022])  # largest error in x and y at which the object is lowered
+_LOWER_TOLERANCE = np.array([0.035, 0.022])  # largest error in x and y at which the object is lowered
 _RELEASE_CLEARANCE = 0.012  # lowest point of the object above the container's floor at the release
 _RELEASE_TOLERANCE = 0.025  # largest error in z at the release
 _RETREAT = 0.05  # motion of the gripper upwards after the release
 
-# With joint control. Ranges are those from which the values of an episode are drawn.
+# With joint control. The values of an episode are drawn from these ranges.
 _SPEED = (0.16, 0.42)  # m/s, of the end effector
 _ACCELERATION = (0.8, 1.6)  # m/s²
 _GRIPPER_SPEED = (1.3, 2.5)  # openings/s
-_CAREFUL = {Stage.DESCEND: 0.6, Stage.LOWER: 0.6, Stage.CARRY: 0.85}  # fraction of the speed
+_SPEED_FACTORS = {Stage.DESCEND: 0.6, Stage.LOWER: 0.6, Stage.CARRY: 0.85}  # fraction of the speed
 _FIRST_PAUSE, _LAST_PAUSE = (0, 12), (5, 20)  # steps before the first motion, and after the success
 _N_PAUSES = 0.8  # mean number of other pauses
 _PAUSE_START, _PAUSE = (12, 120), (8, 36)  # steps
 _GRIPPER_WAIT = 2  # steps after the gripper's command has reached its end
-# Largest distance from the tray's middle in x at which the open gripper's fingers are between its walls
-_BETWEEN_WALLS = TRAY_HALF_EXTENTS[0] - TRAY_WALL_THICKNESS - FINGER_OPEN - FINGER_THICKNESS - 0.002
+# m, largest distance from the tray's middle in x at which the open fingers are between its walls
+_MAX_X_OFFSET = TRAY_HALF_EXTENTS[0] - TRAY_WALL_THICKNESS - FINGER_OPEN - FINGER_THICKNESS - 0.002
 _JOINT_NOISE = 0.04  # rad, for a noise of 1
 _NOISE_DECAY = 0.9  # of the noise on the joints, in a step
 
@@ -90,7 +90,7 @@ def expert_episode(env: PickPlaceEnv, task_id: int, seed: int, noise: float = EX
 
     Args:
         env: The environment, without wrappers.
-        task_id: Index of the task, 0..299, or 1000..1479 for tasks by color and shape.
+        task_id: Index of the task.
         seed: Seed of the scene, the drop point and the noise.
         noise: Standard deviation of the noise on the first three numbers of the actions; with joint control,
             that on joints in units of 0.04 rad.
@@ -201,10 +201,10 @@ class Expert:
         )
         grasp = np.array([*item[:2], max(tip_z + FINGERTIP_OFFSET, top + _PALM_CLEARANCE)])
         error = np.abs(grasp - gripper)
-        if (error < _AROUND).all() and self._scene.arm.is_open:
+        if (error < _GRASP_TOLERANCE).all() and self._scene.arm.is_open:
             return Stage.GRASP, grasp, CLOSED
-        is_low = gripper[2] < grasp[2] + _AROUND[2]
-        if (error[:2] < (_STRADDLING if is_low else _ALIGNED)).all():
+        is_low = gripper[2] < grasp[2] + _GRASP_TOLERANCE[2]
+        if (error[:2] < (_STRADDLE_TOLERANCE if is_low else _DESCEND_TOLERANCE)).all():
             return Stage.DESCEND, grasp, OPEN
         return Stage.REACH, np.array([*item[:2], _HOVER_Z]), OPEN
 
@@ -212,7 +212,7 @@ class Expert:
         bottom, _ = self._scene.object_span(self._target)
         carry_z = gripper[2] + TRAY_FLOOR + _CARRY_CLEARANCE - bottom
         release_z = gripper[2] + CONTAINER_FLOOR + _RELEASE_CLEARANCE - bottom
-        if (np.abs(self._drop_xy - gripper[:2]) < _OVER_CONTAINER).all():
+        if (np.abs(self._drop_xy - gripper[:2]) < _LOWER_TOLERANCE).all():
             if gripper[2] - release_z < _RELEASE_TOLERANCE:
                 return Stage.RELEASE, gripper, OPEN
             return Stage.LOWER, np.array([*self._drop_xy, release_z]), CLOSED
@@ -222,7 +222,7 @@ class Expert:
 
 
 class JointExpert(Expert):
-    """The expert with joint control: smooth, at its own speed in each episode, with pauses as people make.
+    """The expert with joint control: smooth motion at a speed drawn for the episode, with pauses.
 
     The end effector accelerates and brakes evenly towards the goal of each stage, and stands still while the
     gripper closes or opens. The joints' targets have correlated noise, whose standard deviation is `noise` in
@@ -273,7 +273,7 @@ class JointExpert(Expert):
             return
         self.stage, goal, command = self._plan(self._scene.arm.position)
         self._goal = np.clip(goal, POSITION_LOW, POSITION_HIGH)
-        self._goal[0] = TRAY_CENTER[0] + np.clip(goal[0] - TRAY_CENTER[0], -_BETWEEN_WALLS, _BETWEEN_WALLS)
+        self._goal[0] = TRAY_CENTER[0] + np.clip(goal[0] - TRAY_CENTER[0], -_MAX_X_OFFSET, _MAX_X_OFFSET)
         if command != self._command:
             self._command, self._wait = command, _GRIPPER_WAIT
 
@@ -282,7 +282,7 @@ class JointExpert(Expert):
         offset = goal - self._position
         distance = float(np.linalg.norm(offset))
         speed = min(
-            self._speed * _CAREFUL.get(self.stage, 1.0),
+            self._speed * _SPEED_FACTORS.get(self.stage, 1.0),
             np.sqrt(2 * self._acceleration * distance),
             0.5 * distance / self._step_time,
         )

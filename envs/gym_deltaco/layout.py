@@ -7,11 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_deltaco.objects.object_sets import find_label, find_model, select_objects
+from gym_deltaco.objects.labels import ObjectLabel, find_label
+from gym_deltaco.objects.models import find_model
+from gym_deltaco.objects.object_sets import select_objects
 from gym_deltaco.objects.objects import ObjectModel
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.sim.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
-from gym_deltaco.tasks import CONTAINER_COLORS, ContainerColor, ContainerWord, ObjectLabel, Task
+from gym_deltaco.tasks import CONTAINER_COLORS, ContainerColor, ContainerWord, Task
 
 N_OBJECTS = 3
 MIN_OBJECT_DISTANCE = 0.065  # m
@@ -109,17 +111,17 @@ def _sample_distractors(
     ]
     similar = [label.index for label in others if label.color == target.color or label.shape == target.shape]
     shared_draw = rng.random() if scene.adversarial_draw == "scene" else None
-    chosen: list[int] = []
-    while len(chosen) < N_OBJECTS - 1:
-        left = [index for index in similar if index not in chosen]
+    distractors: list[int] = []
+    while len(distractors) < N_OBJECTS - 1:
+        candidates = [index for index in similar if index not in distractors]
         # Each distractor has its own draw, unless the scene has one for both.
         if (
-            not left
+            not candidates
             or (rng.random() if shared_draw is None else shared_draw) >= scene.adversarial_probability
         ):
-            left = [label.index for label in others if label.index not in chosen]
-        chosen.append(int(rng.choice(left)))
-    return chosen[0], chosen[1]
+            candidates = [label.index for label in others if label.index not in distractors]
+        distractors.append(int(rng.choice(candidates)))
+    return distractors[0], distractors[1]
 
 
 def _sample_quadrants(

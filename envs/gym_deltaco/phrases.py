@@ -1,7 +1,8 @@
 """Paraphrases: the tasks in people's words, from a grammar.
 
-`phrases.yaml` lists phrases for what an instruction says. A sentence draws one for each part, sometimes
-without articles, and sometimes with a typing error.
+`phrases.yaml` lists phrases for each part of an instruction. A sentence draws one for each part, sometimes
+without articles, and sometimes with a typing error. Kinds of tasks that it does not list keep their phrase
+for the object.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from gym_deltaco.tasks import OBJECTS, Task
+from gym_deltaco.tasks import Task
 
 PhraseSplit = Literal["train", "held_out"]
 
 _FILE = Path(__file__).with_name("phrases.yaml")
-_P_NO_ARTICLE, _P_TYPO = 0.3, 0.1
+_P_NO_ARTICLE, _P_TYPO = 0.3, 0.1  # probabilities that a sentence lacks its articles, or has an error
 _MIN_TYPO_LENGTH = 5  # letters, of a word that is misspelled
-_P_HELD_OUT = 0.4  # of each part of a held-out sentence
+_P_HELD_OUT = 0.4  # probability that a part of a held-out sentence is a held-out phrase
 _ENDS = ("", "", ".", "!")
 
 
@@ -52,15 +53,15 @@ def _draw_sentence(task: Task, split: PhraseSplit, rng: np.random.Generator) -> 
         return choice[int(rng.integers(len(choice)))]
 
     parts: dict[str, str] = {part: draw(phrases[part]) for part in ("verb", "take", "in", "noun")}
-    label = OBJECTS[task.row] if task.kind == "name" else None
-    color = label.color if label is not None else task.color
-    shape = label.shape if label is not None else task.shape
-    words = {
-        "color": draw(phrases["color"][color]) if task.kind != "shape" else "",
-        "shape": draw(phrases["shape"][shape]) if task.kind != "color" else "",
-        "name": label.name if label is not None else "",
-    }
-    parts["object"] = draw(phrases["object"][task.kind]).format(**words)
+    if task.kind in phrases["object"]:
+        words = {
+            name: draw(phrases[name][value])
+            for name, value in (("color", task.object.color), ("shape", task.object.shape))
+            if value is not None
+        }
+        parts["object"] = draw(phrases["object"][task.kind]).format(name=task.object.name, **words)
+    else:
+        parts["object"] = f"the {task.object.phrase}"
     parts["container"] = draw(phrases["container"][task.container]).format(**parts)
     sentence = draw(phrases["patterns"]).format(**parts)
     if rng.random() < _P_NO_ARTICLE:
@@ -74,7 +75,7 @@ def _draw_sentence(task: Task, split: PhraseSplit, rng: np.random.Generator) -> 
 
 def _misspell(sentence: str, rng: np.random.Generator) -> str:
     """Returns a sentence with two letters of a word swapped, or one left out or doubled."""
-    words = [found for found in re.finditer(r"[a-z]+", sentence) if len(found[0]) >= _MIN_TYPO_LENGTH]
+    words = [match for match in re.finditer(r"[a-z]+", sentence) if len(match[0]) >= _MIN_TYPO_LENGTH]
     if not words:
         return sentence
     word = words[int(rng.integers(len(words)))]

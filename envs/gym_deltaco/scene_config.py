@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from gym_deltaco.control import CONTROLS, Control
-from gym_deltaco.objects.object_sets import default_objects, select_objects
-from gym_deltaco.tasks import get_task
+from gym_deltaco.objects.object_sets import select_objects
+from gym_deltaco.tasks import default_objects, get_task
 
 AMBIGUITIES = ("container", "object")
 ADVERSARIAL_DRAWS = ("each", "scene")
@@ -24,8 +24,9 @@ class SceneConfig:
             does not tell which of the two containers is meant. "object" (ii): the target has an identical
             twin, and only a demonstration tells which of the two is meant.
         objects: Set of objects from which scenes are drawn: "all", the paper's 32; "scenario_a_train", the 24
-            training objects of scenario A; "random:N", these 24 and N - 24 random objects; or "foreign",
-            meshes that come with PyBullet. For a task set that needs others than "all", it is these.
+            training objects of scenario A; "random:N", these 24 and N - 24 random objects; or
+            "out_of_distribution", meshes that come with PyBullet. A task set that needs other objects than
+            "all" brings them.
         adversarial_probability: Probability that a distractor shares the target's color or shape, 0..1. It is
             0.6 in the paper's data; with 0, distractors are uniform. Unused with ambiguity "object".
         adversarial_draw: Scope of a draw with that probability: "each" distractor; or the whole "scene", as
@@ -80,7 +81,7 @@ class SceneConfig:
         return self.interface.episode_length if self.episode_length is None else self.episode_length
 
     def for_tasks(self, tasks: str) -> SceneConfig:
-        """Returns the settings with the objects that a selection of tasks needs, unless others are set."""
+        """Returns the settings with the default objects of a selection of tasks, unless others are set."""
         return replace(self, objects=default_objects(tasks)) if self.objects == "all" else self
 
     def check_tasks(self, task_ids: Iterable[int]) -> None:
@@ -93,10 +94,10 @@ class SceneConfig:
             ValueError: A task does not exist, or no object fits it.
         """
         labels = select_objects(self.objects)
-        for task in {task.row: task for task in map(get_task, task_ids)}.values():
+        for task in {task.object: task for task in map(get_task, task_ids)}.values():
             if not any(task.describes(label) for label in labels):
                 raise ValueError(
-                    f"Task {task.index} asks for a {task.object_phrase}, of which the objects "
+                    f"Task {task.index} asks for a {task.object.phrase}, of which the objects "
                     f"{self.objects!r} have none. Choose other tasks, or other `objects`."
                 )
 

@@ -16,7 +16,7 @@ def episode_seed(seed: int, split: Split, task_id: int, episode: int, attempt: i
     Args:
         seed: Seed of the dataset or evaluation, at least 0.
         split: "train", "validation" or "evaluation".
-        task_id: Index of the task, 0..299, or 1000..1479 for tasks by color and shape.
+        task_id: Index of the task.
         episode: Number of the episode or trial of this task, from 0.
         attempt: Number of failed attempts at this episode.
 

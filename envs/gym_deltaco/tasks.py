@@ -1,163 +1,91 @@
-"""The 300 tasks and their splits, as data.
+"""Tasks as data: an object specification and a container.
 
-Rows of the task table are objects: 32 names (rows 0..31), 8 colors (32..39) and 10 shapes (40..49). Columns
-are containers: green, red, front, back, left, right. The index of a task is `50 * column + row` (paper,
-appendix A).
-
-Beyond the paper's table, 80 rows (50..129) ask for an object by color and shape, `50 + 10 * color + shape`,
-since random objects have no names. The index of such a task is `1000 + 80 * column + row - 50`. Rows 500 to
-999 ask for a "thing", which only a demonstration shows: a mesh of `gym_deltaco.objects.foreign_objects` with
-that number. The index of such a task is `2000 + 1000 * column + row`.
+`add_tasks` gives each kind of task its indices; nothing else depends on them. docs/benchmark.md shows how to
+add a kind.
 """
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import cycle
 from numbers import Integral
-from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-TaskKind = Literal["name", "color", "shape", "color_shape", "foreign"]
+from gym_deltaco.objects.labels import (
+    COLOR_SHAPE_PAIRS,
+    COLORS,
+    FIRST_MESH_INDEX,
+    MESHES,
+    OBJECTS,
+    SHAPES,
+    ObjectLabel,
+)
+from gym_deltaco.objects.object_sets import FOLDS, OBJECT_SETS
+
 ContainerColor = Literal["green", "red"]
 ContainerWord = Literal["green", "red", "front", "back", "left", "right"]
 
-COLORS = ("black and white", "brown", "blue", "gray", "white", "red", "orange", "yellow")
-SHAPES = (
-    "vase",
-    "chalice",
-    "freeform",
-    "bottle",
-    "canoe",
-    "cup",
-    "bowl",
-    "trapezoidal prism",
-    "cylinder",
-    "round hole",
-)
 CONTAINER_COLORS: tuple[ContainerColor, ...] = ("green", "red")
 CONTAINER_WORDS: tuple[ContainerWord, ...] = ("green", "red", "front", "back", "left", "right")
 
 
 @dataclass(frozen=True)
-class ObjectLabel:
-    """Name, shape and color of an object.
-
-    Its geometry is in `gym_deltaco.objects.objects`, `random_objects` or `foreign_objects`.
+class ObjectSpec:
+    """The object that a task asks for. A kind with a rule of its own overrides `describes`.
 
     Attributes:
-        index: 0..31 for the paper's objects, in the order of its table (0..23 are scenario A's training
-            objects); 32..10007 for random objects; 20500..20999 for foreign ones.
-        name: Name of the object, such as "conic cup". No instruction uses that of a random or foreign object.
-        shape: One of `SHAPES`; of a foreign object, its name, so that it shares it with no other.
-        color: One of `COLORS`; of a foreign object, its name.
+        kind: Kind of the task, such as "color", by which reports group results.
+        phrase: Object in the words of the instruction, such as "blue colored object".
+        name: Name that the object must have; None for any.
+        color: Color that the object must have; None for any.
+        shape: Shape that the object must have; None for any.
+        index: Index of the object, if only a demonstration shows which one is meant; None otherwise.
     """
 
-    index: int
-    name: str
-    shape: str
-    color: str
+    kind: str
+    phrase: str
+    name: str | None = None
+    color: str | None = None
+    shape: str | None = None
+    index: int | None = None
 
-
-OBJECTS = tuple(
-    ObjectLabel(index, name, shape, color)
-    for index, (name, shape, color) in enumerate(
-        [
-            ("conic cup", "cup", "black and white"),
-            ("fountain vase", "vase", "brown"),
-            ("circular table", "chalice", "blue"),
-            ("hex deep bowl", "bowl", "brown"),
-            ("smushed dumbbell", "chalice", "black and white"),
-            ("square prism bin", "trapezoidal prism", "brown"),
-            ("narrow tray", "trapezoidal prism", "brown"),
-            ("colunnade top", "chalice", "gray"),
-            ("stalagcite chunk", "freeform", "white"),
-            ("bongo drum bowl", "bowl", "red"),
-            ("pacifier vase", "vase", "white"),
-            ("beehive funnel", "vase", "brown"),
-            ("crooked lid trash can", "cylinder", "gray"),
-            ("toilet bowl", "bowl", "white"),
-            ("pepsi bottle", "bottle", "red"),
-            ("tongue chair", "freeform", "red"),
-            ("modern canoe", "canoe", "orange"),
-            ("pear ringed vase", "vase", "orange"),
-            ("short handle cup", "cup", "blue"),
-            ("bullet vase", "vase", "brown"),
-            ("glass half gallon", "bottle", "gray"),
-            ("flat bottom sack vase", "vase", "brown"),
-            ("trapezoidal bin", "trapezoidal prism", "brown"),
-            ("vintage canoe", "canoe", "brown"),
-            ("bathtub", "bowl", "gray"),
-            ("flowery half donut", "round hole", "gray"),
-            ("t cup", "cup", "blue"),
-            ("cookie circular lidless tin", "bowl", "brown"),
-            ("box sofa", "trapezoidal prism", "brown"),
-            ("two layered lampshade", "round hole", "yellow"),
-            ("conic bin", "cup", "gray"),
-            ("jar", "cylinder", "blue"),
-        ]
-    )
-)
-
-N_ROWS = len(OBJECTS) + len(COLORS) + len(SHAPES)
-N_COLUMNS = len(CONTAINER_WORDS)
-N_TASKS = N_ROWS * N_COLUMNS
-_FIRST_COLOR_ROW = len(OBJECTS)
-_FIRST_SHAPE_ROW = _FIRST_COLOR_ROW + len(COLORS)
-_N_PAIRS = len(COLORS) * len(SHAPES)
-_PAIR_TASKS = range(1000, 1000 + N_COLUMNS * _N_PAIRS)
-_FOREIGN_TASKS = range(2000, 2000 + N_COLUMNS * 1000)
-MESHES = range(500, 1000)  # of PyBullet's 1,000 random ones; the benchmark never uses the others
-FIRST_FOREIGN_INDEX = 20_000  # index of the object that mesh 0 would be
-FOREIGN_FILE = Path(__file__).parent / "objects" / "foreign_objects.json"
+    def describes(self, label: ObjectLabel) -> bool:
+        """Returns whether an object fits the specification."""
+        return (
+            self.name in (None, label.name)
+            and self.color in (None, label.color)
+            and self.shape in (None, label.shape)
+            and self.index in (None, label.index)
+        )
 
 
 @dataclass(frozen=True)
 class Task:
-    """A task: put an object, given by name, color, shape, or both, or by a demonstration, into a container.
+    """A task: put an object into a container.
 
     Attributes:
-        index: 0..299, `50 * column + row`; 1000..1479 for tasks by color and shape; or
-            `2000 + 1000 * column + row` for foreign objects.
+        index: Index of the task, by which datasets and records refer to it.
+        object: Specification of the object.
+        container: Word by which the instruction describes the container.
     """
 
     index: int
+    object: ObjectSpec
+    container: ContainerWord
 
     @property
-    def row(self) -> int:
-        """Row of the task table: 0..31 names, 32..39 colors, 40..49 shapes, 50..129 both, 500..999 meshes."""
-        if self.index in _FOREIGN_TASKS:
-            return self.index % 1000
-        if self.index in _PAIR_TASKS:
-            return N_ROWS + (self.index - _PAIR_TASKS.start) % _N_PAIRS
-        return self.index % N_ROWS
+    def kind(self) -> str:
+        """Kind of the task, such as "color"."""
+        return self.object.kind
 
     @property
-    def column(self) -> int:
-        """Column of the task table, 0..5: an index into `CONTAINER_WORDS`."""
-        if self.index in _FOREIGN_TASKS:
-            return (self.index - _FOREIGN_TASKS.start) // 1000
-        if self.index in _PAIR_TASKS:
-            return (self.index - _PAIR_TASKS.start) // _N_PAIRS
-        return self.index // N_ROWS
-
-    @property
-    def kind(self) -> TaskKind:
-        """Property by which the instruction describes the object."""
-        if self.row < _FIRST_COLOR_ROW:
-            return "name"
-        if self.row >= N_ROWS:
-            return "foreign" if self.row in MESHES else "color_shape"
-        return "color" if self.row < _FIRST_SHAPE_ROW else "shape"
-
-    @property
-    def container(self) -> ContainerWord:
-        """Word by which the instruction describes the container."""
-        return CONTAINER_WORDS[self.column]
+    def instruction(self) -> str:
+        """Template sentence, such as "Put blue colored object in front bin."."""
+        return f"Put {self.object.phrase} in {self.container} bin."
 
     @property
     def is_position_task(self) -> bool:
@@ -166,71 +94,129 @@ class Task:
 
     @cached_property
     def targets(self) -> tuple[int, ...]:
-        """Indices of the paper's objects that the instruction describes."""
+        """Indices of the paper's objects that fit the task."""
         return tuple(label.index for label in OBJECTS if self.describes(label))
-
-    @property
-    def target_object(self) -> int | None:
-        """Index of the object that a demonstration has to move; None if the instruction describes it."""
-        return FIRST_FOREIGN_INDEX + self.row if self.kind == "foreign" else None
 
     def describes(self, label: ObjectLabel) -> bool:
         """Returns whether the task asks for an object, by its instruction or its demonstration."""
-        if self.target_object is not None:
-            return label.index == self.target_object
-        if self.kind == "name":
-            return label.index == self.row
-        if self.kind == "color":
-            return label.color == self.color
-        if self.kind == "shape":
-            return label.shape == self.shape
-        return (label.color, label.shape) == (self.color, self.shape)
-
-    @property
-    def color(self) -> str:
-        """Color of a task by color, or by color and shape."""
-        return COLORS[
-            self.row - _FIRST_COLOR_ROW if self.kind == "color" else (self.row - N_ROWS) // len(SHAPES)
-        ]
-
-    @property
-    def shape(self) -> str:
-        """Shape of a task by shape, or by color and shape."""
-        return SHAPES[
-            self.row - _FIRST_SHAPE_ROW if self.kind == "shape" else (self.row - N_ROWS) % len(SHAPES)
-        ]
-
-    @property
-    def object_phrase(self) -> str:
-        """Object in the words of the instruction, such as "blue colored object"."""
-        if self.kind == "foreign":
-            return "thing"
-        if self.kind == "name":
-            label = OBJECTS[self.row]
-            return f"{label.color} colored, {label.shape} shaped {label.name}"
-        if self.kind == "color":
-            return f"{self.color} colored object"
-        if self.kind == "shape":
-            return f"{self.shape} shaped object"
-        return f"{self.color} colored, {self.shape} shaped object"
-
-    @property
-    def instruction(self) -> str:
-        """Template sentence, such as "Put blue colored object in front bin."."""
-        return f"Put {self.object_phrase} in {self.container} bin."
+        return self.object.describes(label)
 
 
-TASKS = tuple(Task(index) for index in range(N_TASKS))
-COLOR_SHAPE_TASKS = tuple(Task(index) for index in _PAIR_TASKS)
+_TASKS: dict[int, Task] = {}
+_BY_INSTRUCTION: dict[str, Task] = {}
+ALL_TASKS: Mapping[int, Task] = MappingProxyType(_TASKS)
+"""Every task, by its index."""
+
+
+def add_tasks(first: int, objects: Sequence[ObjectSpec], stride: int | None = None) -> tuple[Task, ...]:
+    """Adds a task for each object and each of the six containers.
+
+    The task of object `row` and container `column` (an index into `CONTAINER_WORDS`) has the index
+    `first + stride * column + row`. Indices must never change, since datasets and records contain them.
+
+    Args:
+        first: Index of the first task.
+        objects: Specifications of the objects.
+        stride: Distance of the indices of an object's tasks; None for the number of objects.
+
+    Returns:
+        The tasks, container by container.
+
+    Raises:
+        ValueError: A task has an index or an instruction that another one has.
+    """
+    stride = len(objects) if stride is None else stride
+    tasks = tuple(
+        Task(first + stride * column + row, specification, container)
+        for column, container in enumerate(CONTAINER_WORDS)
+        for row, specification in enumerate(objects)
+    )
+    instructed = {task.instruction: task for task in tasks if task.object.index is None}
+    if taken := {task.index for task in tasks} & _TASKS.keys():
+        raise ValueError(
+            f"Other tasks have the indices {min(taken)} to {max(taken)}. Choose another `first`."
+        )
+    if repeated := instructed.keys() & _BY_INSTRUCTION.keys():
+        raise ValueError(f"Another task has the instruction {min(repeated)!r}. Choose another `phrase`.")
+    _TASKS.update((task.index, task) for task in tasks)
+    _BY_INSTRUCTION.update(instructed)
+    return tasks
+
+
+# The paper's table (appendix A): a row for each object specification, a column for each container
+_TABLE = (
+    *(
+        ObjectSpec(
+            "name",
+            f"{label.color} colored, {label.shape} shaped {label.name}",
+            label.name,
+            label.color,
+            label.shape,
+        )
+        for label in OBJECTS
+    ),
+    *(ObjectSpec("color", f"{color} colored object", color=color) for color in COLORS),
+    *(ObjectSpec("shape", f"{shape} shaped object", shape=shape) for shape in SHAPES),
+)
+TASKS = add_tasks(0, _TABLE)
+# Random objects have no names.
+COLOR_SHAPE_TASKS = add_tasks(
+    1000,
+    [
+        ObjectSpec("color_shape", f"{color} colored, {shape} shaped object", color=color, shape=shape)
+        for color in COLORS
+        for shape in SHAPES
+    ],
+)
+# Only a demonstration shows which object is meant: index 2000 + 1000 * column + mesh.
+MESH_TASKS = add_tasks(
+    2000 + MESHES.start,
+    [ObjectSpec("out_of_distribution", "thing", index=FIRST_MESH_INDEX + mesh) for mesh in MESHES],
+    stride=1000,
+)
+
+
+def get_task(index: int) -> Task:
+    """Returns the task of an index.
+
+    Raises:
+        ValueError: The index is not an integer, or no task has it.
+    """
+    if isinstance(index, Integral) and not isinstance(index, bool) and int(index) in _TASKS:
+        return _TASKS[int(index)]
+    raise ValueError(f"`task_id` must be an integer {_valid_indices()}. Got {index!r}.")
+
+
+def find_task(instruction: str) -> Task | None:
+    """Returns the task of a template sentence; None if no task has it, or it leaves open which object."""
+    return _BY_INSTRUCTION.get(instruction)
+
+
+def task_kinds() -> tuple[str, ...]:
+    """Returns the kinds of all tasks."""
+    return tuple(dict.fromkeys(task.kind for task in _TASKS.values()))
+
+
+def _valid_indices() -> str:
+    """Returns the ranges of valid indices in words."""
+    ranges: list[list[int]] = []
+    for index in sorted(_TASKS):
+        if ranges and index == ranges[-1][1] + 1:
+            ranges[-1][1] = index
+        else:
+            ranges.append([index, index])
+    return "from " + ", ".join(f"{low} to {high}" for low, high in ranges)
+
+
+# Scenarios
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A split of the rows of the task table; every row comes with all six containers.
+    """A split of the rows of the paper's table; every row comes with all six containers.
 
     Attributes:
-        name: "a" or "b" for the paper's scenarios; "a_validation" for choosing settings; "a_clean" for
-            training without test objects.
+        name: Name of the split.
         train_rows: Rows of the training tasks.
         test_rows: Rows of the test tasks.
     """
@@ -251,8 +237,8 @@ class Scenario:
 
 
 def _tasks_of_rows(rows: Iterable[int]) -> tuple[int, ...]:
-    rows = set(rows)
-    return tuple(task.index for task in TASKS if task.row in rows)
+    objects = {_TABLE[row] for row in rows}
+    return tuple(task.index for task in TASKS if task.object in objects)
 
 
 SCENARIOS = MappingProxyType(
@@ -296,104 +282,90 @@ Scenario A itself breaks the first rule: its test object 29 is the target of the
 
 # Scenario A without its yellow tasks, whose target is a test object. With the objects "scenario_a_train", no
 # training scene shows a test object.
-_YELLOW_ROW = _FIRST_COLOR_ROW + COLORS.index("yellow")
+_YELLOW_ROW = len(OBJECTS) + COLORS.index("yellow")
 CLEAN = Scenario(
     "a_clean",
     train_rows=tuple(row for row in SCENARIOS["a"].train_rows if row != _YELLOW_ROW),
     test_rows=SCENARIOS["a"].test_rows,
 )
 
-# Colors and shapes of random objects, which no test object of scenario A has
-_TEST_PAIRS = {(label.color, label.shape) for label in OBJECTS if label.index in SCENARIOS["a"].test_rows}
-COLOR_SHAPE_PAIRS = tuple(
-    (color, shape) for color in COLORS for shape in SHAPES if (color, shape) not in _TEST_PAIRS
+# Sets of tasks
+
+_RANDOM_TRAIN = (
+    *SCENARIOS["a"].train_tasks,
+    *(
+        task.index
+        for task in COLOR_SHAPE_TASKS
+        if (task.object.color, task.object.shape) in COLOR_SHAPE_PAIRS
+    ),
 )
-_COLOR_SHAPE_TASKS = tuple(
-    _PAIR_TASKS.start + _N_PAIRS * column + len(SHAPES) * COLORS.index(color) + SHAPES.index(shape)
-    for column in range(N_COLUMNS)
-    for color, shape in COLOR_SHAPE_PAIRS
-)
-
-
-def get_task(index: int) -> Task:
-    """Returns the task of an index.
-
-    Args:
-        index: 0..299 for the paper's tasks, 1000..1479 for tasks by color and shape, and
-            `2000 + 1000 * column + mesh` for foreign objects.
-
-    Raises:
-        ValueError: The index is not an integer, or out of range.
-    """
-    is_integer = isinstance(index, Integral) and not isinstance(index, bool)
-    is_foreign = is_integer and index in _FOREIGN_TASKS and index % 1000 in MESHES
-    if not is_integer or not (0 <= index < N_TASKS or index in _PAIR_TASKS or is_foreign):
-        raise ValueError(
-            f"`task_id` must be an integer from 0 to {N_TASKS - 1}, from {_PAIR_TASKS.start} to "
-            f"{_PAIR_TASKS.stop - 1} for tasks by color and shape, or from {_FOREIGN_TASKS.start} on, ending "
-            f"in {MESHES.start} to {MESHES.stop - 1}, for foreign objects. Got {index!r}."
-        )
-    return TASKS[int(index)] if index < N_TASKS else Task(int(index))
-
-
-# Scenario A's training objects in three folds of eight, for choosing settings on novel objects. Each fold has
-# three brown objects and five of other colors, two vases and six of other shapes.
-FOLDS = ((0, 1, 2, 5, 9, 10, 20, 23), (3, 4, 6, 8, 11, 12, 14, 17), (7, 13, 15, 16, 18, 19, 21, 22))
-
-
-def fold_pairs(fold: int) -> frozenset[tuple[str, str]]:
-    """Returns the pairs of color and shape of a fold's objects, which no training object of it has."""
-    return frozenset((OBJECTS[index].color, OBJECTS[index].shape) for index in FOLDS[fold])
 
 
 def _fold_train_tasks(fold: int) -> tuple[int, ...]:
-    """Returns the training tasks of a fold: those of `random_train` that do not need its objects."""
-    held_out = fold_pairs(fold)
-    kept = [
+    """Returns the training tasks of a fold: those of `random_train` that do not need its objects.
+
+    Tasks by color or by shape alone have other objects, too.
+    """
+    return tuple(
         task.index
-        for task in map(get_task, (*SCENARIOS["a"].train_tasks, *_COLOR_SHAPE_TASKS))
-        if task.row not in FOLDS[fold]
-        and not (task.kind == "color_shape" and (task.color, task.shape) in held_out)
-    ]
-    return tuple(kept)
+        for task in map(get_task, _RANDOM_TRAIN)
+        if None in (task.object.color, task.object.shape) or not set(task.targets) & set(FOLDS[fold])
+    )
 
 
 def _fold_validation_tasks(fold: int) -> tuple[int, ...]:
-    """Returns the tasks that ask for a fold's objects, by name, color or shape."""
+    """Returns the paper's tasks that ask for a fold's objects."""
     return tuple(task.index for task in TASKS if set(task.targets) & set(FOLDS[fold]))
 
 
-# Meshes that the expert manages: the first ones for the test, the next ones for choosing settings. Each is
-# the target of one task, so that none is more likely than the two distractors beside it.
-_MESHES_OF_EXPERT: tuple[int, ...] = tuple(json.loads(FOREIGN_FILE.read_text(encoding="utf-8")))
-FOREIGN_MESHES, FOREIGN_VALIDATION_MESHES = _MESHES_OF_EXPERT[:96], _MESHES_OF_EXPERT[96:192]
+def _mesh_tasks(objects: str) -> tuple[int, ...]:
+    """Returns a task for each mesh of a set, with one container after another.
 
-
-def _foreign_tasks(meshes: tuple[int, ...]) -> tuple[int, ...]:
-    """Returns one task for each mesh, the containers in turn."""
-    return tuple(
-        _FOREIGN_TASKS.start + 1000 * (number % N_COLUMNS) + mesh for number, mesh in enumerate(meshes)
-    )
+    With more than one task for each, a target would be more likely than the distractors beside it.
+    """
+    indices = {(task.object.index, task.container): task.index for task in MESH_TASKS}
+    containers = cycle(CONTAINER_WORDS)
+    return tuple(indices[label.index, next(containers)] for label in OBJECT_SETS[objects])
 
 
 TASK_SETS = MappingProxyType(
     {
-        "all": tuple(range(N_TASKS)),
+        "all": tuple(task.index for task in TASKS),
         **{f"scenario_{name}_train": scenario.train_tasks for name, scenario in SCENARIOS.items()},
         **{f"scenario_{name}_test": scenario.test_tasks for name, scenario in SCENARIOS.items()},
         "scenario_a_selection_train": VALIDATION.train_tasks,
         "scenario_a_validation": VALIDATION.test_tasks,
         "scenario_a_clean_train": CLEAN.train_tasks,
         # For the objects "random:N": scenario A's training tasks, and tasks by color and shape
-        "random_train": (*SCENARIOS["a"].train_tasks, *_COLOR_SHAPE_TASKS),
+        "random_train": _RANDOM_TRAIN,
         # For the objects "fold_K:N", and for "scenario_a_train"
         **{f"scenario_a_fold_{fold}_train": _fold_train_tasks(fold) for fold in range(len(FOLDS))},
         **{f"scenario_a_fold_{fold}_validation": _fold_validation_tasks(fold) for fold in range(len(FOLDS))},
-        # For the objects of the same names
-        "foreign": _foreign_tasks(FOREIGN_MESHES),
-        "foreign_validation": _foreign_tasks(FOREIGN_VALIDATION_MESHES),
+        "out_of_distribution": _mesh_tasks("out_of_distribution"),
+        "out_of_distribution_validation": _mesh_tasks("out_of_distribution_validation"),
     }
 )
+# Task sets that policies are not trained on: their episodes are demonstrations
+HELD_OUT = (
+    "scenario_a_test",
+    "scenario_a_validation",
+    "scenario_b_test",
+    "out_of_distribution",
+    "out_of_distribution_validation",
+)
+# Default objects of task sets that do not draw their scenes from all objects
+_OBJECTS_OF_TASK_SETS = MappingProxyType(
+    {
+        "scenario_a_clean_train": "scenario_a_train",
+        "out_of_distribution": "out_of_distribution",
+        "out_of_distribution_validation": "out_of_distribution_validation",
+    }
+)
+
+
+def default_objects(tasks: str) -> str:
+    """Returns the default set of objects for a selection of tasks, such as "scenario_a_test"."""
+    return _OBJECTS_OF_TASK_SETS.get(tasks.strip(), "all")
 
 
 def select_tasks(selection: str) -> tuple[int, ...]:
@@ -411,7 +383,7 @@ def select_tasks(selection: str) -> tuple[int, ...]:
             or the selection is empty.
     """
     valid = (
-        f"Valid are the task sets {', '.join(TASK_SETS)}, and indices and ranges from 0 to {N_TASKS - 1}, "
+        f"Valid are the task sets {', '.join(TASK_SETS)}, and indices and ranges {_valid_indices()}, "
         "separated by commas, such as '4,50-73'."
     )
     selected: list[int] = []

@@ -37,7 +37,7 @@ from gym_deltaco.expert import expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.sim.simulation import check_simulator
-from gym_deltaco.tasks import get_task, select_tasks
+from gym_deltaco.tasks import HELD_OUT, get_task, select_tasks
 from lerobot_deltaco.collection import writer as dataset_writer
 
 Split = Literal["train", "validation"]
@@ -47,14 +47,6 @@ DESCRIPTION_FILE = "meta/deltaco.json"
 MAX_ATTEMPTS = 100
 # Outside `observation.`, so that no policy takes them as an input.
 PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_container", "benchmark.seed")
-# Held-out tasks, whose episodes are for validation.
-HELD_OUT = (
-    "scenario_a_test",
-    "scenario_a_validation",
-    "scenario_b_test",
-    "foreign",
-    "foreign_validation",
-)
 
 
 class CollectionError(RuntimeError):
@@ -103,7 +95,7 @@ class CollectionPlan:
 
     @property
     def instructions(self) -> list[str]:
-        """Instructions, in the order of their index in the dataset; foreign objects share theirs."""
+        """Instructions, in the order of their index in the dataset, each once."""
         return list(dict.fromkeys(get_task(task_id).instruction for task_id in self.task_ids))
 
     @property

@@ -9,10 +9,10 @@ from typing import NamedTuple
 from gymnasium.utils import seeding
 
 from gym_deltaco.layout import sample_layout
+from gym_deltaco.paraphrases import choose_instructions
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import Task, get_task
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
-from lerobot_deltaco.data.paraphrases import choose_instructions
 from lerobot_deltaco.evaluation.expert_demonstrations import ExpertBank
 from lerobot_deltaco.evaluation.records import EvaluationPlan
 

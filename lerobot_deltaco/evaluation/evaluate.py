@@ -153,7 +153,7 @@ class Evaluation:
         if isinstance(self._bank, DemonstrationBank) and config.demo_episode is not None:
             return [self._bank.of_episode(config.demo_episode)]
         task = get_task(episode.demonstration_task)
-        known = self._bank.of_task(task.instruction, task.target_object)
+        known = self._bank.of_task(task.instruction, task.object.index)
         n_each = self.plan.n_demonstrations
         if len(known) < n_each:
             raise ValueError(

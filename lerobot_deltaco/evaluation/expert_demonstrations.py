@@ -63,7 +63,7 @@ class ExpertBank:
 
     def of_task(self, task: str, target_object: int | None = None) -> list[Demonstration]:
         """Returns the demonstrations of a task: one. See `DemonstrationBank.of_task`."""
-        (task_id,) = (each for each in self.rows[task] if get_task(each).target_object == target_object)
+        (task_id,) = (each for each in self.rows[task] if get_task(each).object.index == target_object)
         if task_id not in self._recorded:
             self._recorded[task_id] = expert_demonstration(task_id, 0, self._scene)
         return [self._recorded[task_id]]

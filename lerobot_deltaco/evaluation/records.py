@@ -23,10 +23,10 @@ from gymnasium.utils import seeding
 
 from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.layout import sample_layout
+from gym_deltaco.paraphrases import GRAMMAR
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
-from lerobot_deltaco.data.paraphrases import GRAMMAR
 
 SCHEMA = pa.schema(
     {
@@ -63,8 +63,8 @@ class EvaluationPlan:
         tasks: Tasks: a task set, or indices and ranges, such as 4,50-73.
         trials: Number of episodes of each task.
         seed: Seed of the scenes: trial i has the scene that `lerobot-eval` shows for its seed `seed` + i.
-        scene_set: Number of a set of scenes, to reproduce older records: with it, the scenes derive from the
-            seed, this number, the task and the trial.
+        scene_split: Number of a split of scenes, for records that are older than the protocol: the scenes
+            then derive from the seed, this number, the task and the trial.
         scene: Settings of the scenes.
         counterfactual: Input that is replaced by another task's: none, demonstration or instruction. That
             task asks for another object of the scene and for the other container, if there is such a task.
@@ -84,7 +84,7 @@ class EvaluationPlan:
     tasks: str = "scenario_a_test"
     trials: int = 4
     seed: int = 1000
-    scene_set: int | None = None
+    scene_split: int | None = None
     scene: SceneConfig = field(default_factory=SceneConfig)
     counterfactual: Counterfactual = "none"
     without: Counterfactual = "none"
@@ -97,7 +97,7 @@ class EvaluationPlan:
     def __post_init__(self) -> None:
         object.__setattr__(self, "scene", self.scene.for_tasks(self.tasks))
         self.scene.check_tasks(self.task_ids)
-        leasts = {"trials": 1, "seed": 0, "scene_set": 0, "n_demonstrations": 1, "joint_noise": 0}
+        leasts = {"trials": 1, "seed": 0, "scene_split": 0, "n_demonstrations": 1, "joint_noise": 0}
         for name, least in leasts.items():
             number = getattr(self, name)
             if number is not None and number < least:
@@ -119,9 +119,9 @@ class EvaluationPlan:
 
     def scene_seed(self, task_id: int, trial: int) -> int:
         """Returns the seed of an episode's reset."""
-        if self.scene_set is None:
+        if self.scene_split is None:
             return episode_seed(0, "evaluation", task_id, 0, self.seed + trial)
-        return episode_seed(self.seed, "evaluation", task_id, self.scene_set, trial)
+        return episode_seed(self.seed, "evaluation", task_id, self.scene_split, trial)
 
     @property
     def wording(self) -> str:

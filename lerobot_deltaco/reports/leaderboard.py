@@ -94,10 +94,11 @@ class Result:
 
     @property
     def scenes(self) -> str:
-        """Evaluation seed, behind a slash the number of the set of scenes, if there is one."""
+        """Evaluation seed, followed by a slash and the scene split, if there is one."""
         plans = [record.plan for record in self.last]
         names = {
-            f"{plan.seed}" if plan.scene_set is None else f"{plan.seed}/{plan.scene_set}" for plan in plans
+            f"{plan.seed}" if plan.scene_split is None else f"{plan.seed}/{plan.scene_split}"
+            for plan in plans
         }
         return ", ".join(sorted(names))
 

@@ -16,16 +16,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from gym_deltaco.objects.object_sets import find_label
+from gym_deltaco.objects.labels import find_label
 from gym_deltaco.sim.workspace import Quadrant, container_matches
-from gym_deltaco.tasks import COLOR_SHAPE_TASKS, CONTAINER_COLORS, TASKS, Task, get_task
+from gym_deltaco.tasks import CONTAINER_COLORS, Task, find_task, get_task
 from lerobot_deltaco.evaluation.records import EvaluationRecord, scene_columns
 
 N_DRAWS = 10_000
 N_BEST_SETS = 10  # evaluation sets that the paper averages
 _SEED = 0  # of the bootstrap, so that a report is a function of its records
 _FEW = 5  # successes, with fewer of which the bootstrap's interval is too narrow
-_TASK_OF_INSTRUCTION = {task.instruction: task for task in (*TASKS, *COLOR_SHAPE_TASKS)}
 
 
 class Estimate(NamedTuple):
@@ -131,9 +130,7 @@ def _task_of_instruction(row: Any, is_counterfactual: bool) -> Task | None:
     own = get_task(row.task_id)
     if row.instruction is None:
         return own
-    return _TASK_OF_INSTRUCTION.get(
-        row.instruction, None if is_counterfactual or not row.instruction else own
-    )
+    return find_task(row.instruction) or (None if is_counterfactual or not row.instruction else own)
 
 
 def _asked_for(row: Any, task: Task | None, is_demonstration: bool) -> dict[str, set[int]]:

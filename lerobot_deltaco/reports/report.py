@@ -12,7 +12,7 @@ import pandas as pd
 import tyro
 
 from gym_deltaco.atomic_files import write_text
-from gym_deltaco.tasks import get_task
+from gym_deltaco.tasks import get_task, task_kinds
 from lerobot_deltaco.evaluation.records import read_records
 from lerobot_deltaco.reports.leaderboard import CHANCE, Result, collect_results, settings_text
 from lerobot_deltaco.reports.metrics import (
@@ -30,7 +30,6 @@ RowsOf = Callable[[Result, Sequence[Result]], Iterator[dict[str, Any]]]
 _MAX_CALIBRATED = 4  # experiments in the figure
 PAGE, FIGURE, CALIBRATION = "report.md", "success.png", "calibration.png"
 _SURE = (0, 0.5, 0.7, 0.9, 0.97, 1)  # bounds of a policy's probability of what it picks
-KINDS = ("name", "color", "shape", "color_shape", "foreign")
 # Options of a policy that may differ between the training runs of an experiment.
 _OPTIONS_OF_A_RUN = {"seed", "device", "pretrained_path", "demo_root", "repo_id", "push_to_hub"}
 
@@ -133,7 +132,7 @@ def outcome_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]
     has_grasped = episodes["grasped_object"] >= 0
     has_placed = episodes["object_containers"].map(max) >= 0
     yield {
-        **episodes["success"].groupby(kinds).mean().reindex(KINDS),
+        **episodes["success"].groupby(kinds).mean().reindex(task_kinds()),
         "grasped_anything": has_grasped.mean(),
         "right_object_of_grasped": episodes["right_object"][has_grasped].mean(),
         "right_container_of_placed": episodes["right_container"][has_placed].mean(),

@@ -31,7 +31,13 @@ def lists(episodes):
 
 def test_read_is_the_inverse_of_write(tmp_path):
     scene = SceneConfig(ambiguity="object", adversarial_probability=0.25, image_size=64)
-    plan = {"scene": scene, "scene_set": 3, "seed": 7, "counterfactual": "instruction", "n_demonstrations": 2}
+    plan = {
+        "scene": scene,
+        "scene_split": 3,
+        "seed": 7,
+        "counterfactual": "instruction",
+        "n_demonstrations": 2,
+    }
     written = [
         make_record(),
         make_record("a/b", 3, 5, plan=plan, columns={"instruction": "put it there"}, weights="0123"),
@@ -111,7 +117,7 @@ def test_trial_i_has_the_scene_of_the_seed_plus_i():
     assert plan.scene_seed(4, 3) == EvaluationPlan(seed=1003).scene_seed(4, 0)
     seeds = {plan.scene_seed(task_id, trial) for task_id in range(300) for trial in range(4)}
     assert len(seeds) == 1200
-    sets = {replace(plan, scene_set=number).scene_seed(4, 0) for number in (0, 1, 8000)}
+    sets = {replace(plan, scene_split=number).scene_seed(4, 0) for number in (0, 1, 8000)}
     assert len(sets) == 3
 
 

@@ -22,8 +22,10 @@ def test_adversarial_distractors_give_the_target_away():
     assert uniform[rule] + 0.2 < adversarial[rule]
 
 
-def test_nothing_gives_a_foreign_target_or_a_twin_away():
-    levels = chance_levels(TASK_SETS["foreign"][:8], SceneConfig(objects="foreign"), n_trials=2)
+def test_nothing_gives_an_unseen_target_or_a_twin_away():
+    levels = chance_levels(
+        TASK_SETS["out_of_distribution"][:8], SceneConfig(objects="out_of_distribution"), n_trials=2
+    )
     assert list(levels.values()) == pytest.approx([1 / 3] * 4)
     levels = chance_levels([24, 74], SceneConfig(ambiguity="object"), n_trials=5)
     assert levels["most shared colors and shapes"] == 0.5

@@ -9,9 +9,10 @@ import pytest
 
 from gym_deltaco import layout as layout_module
 from gym_deltaco.layout import sample_layout, twin_word
-from gym_deltaco.objects.object_sets import default_objects, select_objects
+from gym_deltaco.objects.labels import OBJECTS
+from gym_deltaco.objects.object_sets import select_objects
 from gym_deltaco.scene_config import ADVERSARIAL_DRAWS, AMBIGUITIES, DEFAULT_SCENE, SceneConfig
-from gym_deltaco.tasks import OBJECTS, TASKS, get_task
+from gym_deltaco.tasks import TASKS, default_objects, get_task
 
 SIDES = ["front", "back", "left", "right"]
 # By quadrant (i, j): center of a container, m, and words for its position

@@ -94,9 +94,9 @@ def test_scenes_of_the_protocol_are_those_on_its_page():
     page = (Path(__file__).parents[2] / "docs/benchmark.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| `(\w{16})` \| `(\w{16})` \|$", page, re.MULTILINE)
     assert len(rows) == 12
-    protocol, foreign = EvaluationPlan(), EvaluationPlan("foreign", seed=9300)
+    protocol, unseen = EvaluationPlan(), EvaluationPlan("out_of_distribution", seed=9300)
     for number, layout, image in rows:
-        plan = protocol if int(number) in protocol.task_ids else foreign
+        plan = protocol if int(number) in protocol.task_ids else unseen
         with closing(PickPlaceEnv(int(number), plan.scene)) as env:
             observation, _ = env.reset(seed=plan.scene_seed(int(number), 0))
             assert layout_digest(env.scene.layout).startswith(layout)

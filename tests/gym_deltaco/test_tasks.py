@@ -1,9 +1,12 @@
 """The table of tasks, its splits, selections of tasks, and seeds of episodes, against the specification."""
 
 import itertools
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+from fresh_python import run_python
 
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import OBJECTS, SCENARIOS, TASK_SETS, TASKS, VALIDATION, get_task, select_tasks
@@ -31,8 +34,7 @@ def test_tasks_have_the_instructions_of_their_rows_and_columns():
     assert [task.instruction for task in TASKS] == expected
     for index, (column, row) in enumerate(itertools.product(range(6), range(50))):
         task = TASKS[index]
-        assert (task.index, task.column, task.row) == (index, column, row)
-        assert task.container == CONTAINERS[column]
+        assert (task.index, task.container) == (index, CONTAINERS[column])
         assert task.is_position_task == (column >= 2)
         assert task.kind == ("name" if row < 32 else "color" if row < 40 else "shape")
     assert (
@@ -43,12 +45,13 @@ def test_tasks_have_the_instructions_of_their_rows_and_columns():
 
 def test_targets_are_the_objects_that_the_instruction_describes():
     for task in TASKS:
-        if task.row < 32:
-            expected = (task.row,)
-        elif task.row < 40:
-            expected = tuple(n for n, (_, _, color) in enumerate(ROWS) if color == COLORS[task.row - 32])
+        row = task.index % 50
+        if row < 32:
+            expected = (row,)
+        elif row < 40:
+            expected = tuple(n for n, (_, _, color) in enumerate(ROWS) if color == COLORS[row - 32])
         else:
-            expected = tuple(n for n, (_, shape, _) in enumerate(ROWS) if shape == SHAPES[task.row - 40])
+            expected = tuple(n for n, (_, shape, _) in enumerate(ROWS) if shape == SHAPES[row - 40])
         assert task.targets == expected
         assert expected
     assert get_task(39).targets == (29,), "the only yellow object"
@@ -58,7 +61,7 @@ def test_tasks_by_color_and_shape():
     for column, (color, shape) in itertools.product(range(6), itertools.product(COLORS, SHAPES)):
         task = get_task(1000 + 80 * column + 10 * COLORS.index(color) + SHAPES.index(shape))
         assert task.instruction == f"Put {color} colored, {shape} shaped object in {CONTAINERS[column]} bin."
-        assert (task.kind, task.column) == ("color_shape", column)
+        assert (task.kind, task.container) == ("color_shape", CONTAINERS[column])
         assert task.targets == tuple(n for n, row in enumerate(ROWS) if row[1:] == (shape, color))
     tasks = [get_task(index) for index in TASK_SETS["random_train"]]
     assert tuple(task.index for task in tasks[:198]) == SCENARIOS["a"].train_tasks
@@ -140,8 +143,47 @@ def test_task_id_must_be_an_integer_in_range():
         assert get_task(index).index == index
         assert type(get_task(index).index) is int
     for index in (-1, 300, 999, 1480, 2499, 8500, 4.0, np.float32(4), True, np.bool_(1), "4", None, [4]):
-        with pytest.raises(ValueError, match=r"integer from 0 to 299, from 1000 to 1479 .*\. Got "):
+        with pytest.raises(ValueError, match=r"integer from 0 to 299, 1000 to 1479, .*\. Got "):
             get_task(index)
+
+
+# The example of docs/benchmark.md is a program of its own, since tasks cannot be removed.
+USE_OF_THE_NEW_KIND = """
+import gymnasium
+import numpy as np
+from gym_deltaco.expert import expert_episode
+from gym_deltaco.layout import sample_layout
+from gym_deltaco.paraphrases import read_paraphrases
+from gym_deltaco.scene_config import DEFAULT_SCENE
+from gym_deltaco.tasks import find_task, get_task, select_tasks, task_kinds
+from lerobot_deltaco.evaluation.records import EvaluationPlan
+
+tasks = select_tasks("10000-10011")
+assert tasks == tuple(task.index for task in OTHER_COLOR_TASKS)
+assert find_task("Put object that is not blue in left bin.") is get_task(10_009)
+assert task_kinds()[-1] == "other_color"
+for task in OTHER_COLOR_TASKS:
+    layout = sample_layout(task, DEFAULT_SCENE, np.random.default_rng(task.index))
+    fits = [item.label.color != task.object.color for item in layout.objects]
+    assert fits.count(True) == 1 and fits.index(True) == layout.target_object
+assert all(len(of_task) > 4 for of_task in read_paraphrases("grammar", "held_out", tasks).values())
+assert EvaluationPlan("10000-10011").task_ids == tasks
+env = gymnasium.make("gym_deltaco:gym_deltaco/PickPlace-v0", task_id=10_009).unwrapped
+*_, last = expert_episode(env, 10_009, 0)
+assert last.info["is_success"] and last.info["task_id"] == 10_009
+try:
+    add_tasks(10_011, [ObjectSpec("color", "red thing", color="red")])
+except ValueError as error:
+    print(error)
+"""
+
+
+def test_a_new_kind_of_task_needs_one_call():
+    page = (Path(__file__).parents[2] / "docs/benchmark.md").read_text(encoding="utf-8")
+    (example,) = (block for block in re.findall(r"(?ms)^```python\n(.*?)^```$", page) if "add_tasks" in block)
+    result = run_python(example + USE_OF_THE_NEW_KIND)
+    assert result.returncode == 0, result.stderr
+    assert "Other tasks have the indices 10011 to 10011. Choose another `first`." in result.stdout
 
 
 # Seeds

@@ -3,52 +3,36 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from functools import cache
 from types import MappingProxyType
 
-from gym_deltaco.objects.foreign_objects import foreign_label, foreign_model, is_foreign
-from gym_deltaco.objects.objects import ObjectModel, object_model
-from gym_deltaco.objects.random_objects import FIRST_INDEX, random_label, random_model
-from gym_deltaco.tasks import (
-    FIRST_FOREIGN_INDEX,
-    FOLDS,
-    FOREIGN_MESHES,
-    FOREIGN_VALIDATION_MESHES,
+from gym_deltaco.objects.labels import (
+    EXPERT_MESHES,
+    FIRST_RANDOM_INDEX,
     MESHES,
     OBJECTS,
-    SCENARIOS,
+    SCENARIO_A_TRAIN,
     ObjectLabel,
-    fold_pairs,
+    mesh_label,
+    random_label,
 )
-
-
-def _foreign_labels(meshes: Iterable[int]) -> tuple[ObjectLabel, ...]:
-    return tuple(foreign_label(FIRST_FOREIGN_INDEX + mesh) for mesh in meshes)
-
 
 OBJECT_SETS = MappingProxyType(
     {
         # Test objects are distractors in training scenes, as in the authors' code:
         # https://github.com/Alacarter/roboverse-deltaco, commit d6d407b.
         "all": OBJECTS,
-        # Without the 8 test objects of scenario A.
-        "scenario_a_train": tuple(label for label in OBJECTS if label.index in SCENARIOS["a"].train_rows),
-        "foreign": _foreign_labels(FOREIGN_MESHES),
-        "foreign_validation": _foreign_labels(FOREIGN_VALIDATION_MESHES),
-        # Also those that the expert does not manage
-        "foreign_unchecked": _foreign_labels(MESHES),
+        "scenario_a_train": SCENARIO_A_TRAIN,
+        "out_of_distribution": tuple(map(mesh_label, EXPERT_MESHES[:96])),
+        "out_of_distribution_validation": tuple(map(mesh_label, EXPERT_MESHES[96:192])),
+        # Including those that the expert cannot pick and place
+        "out_of_distribution_unchecked": tuple(map(mesh_label, MESHES)),
     }
 )
 MAX_OBJECTS = 10_000
-# Default objects of task sets that do not draw their scenes from all objects
-_OBJECTS_OF_TASK_SETS = MappingProxyType(
-    {
-        "scenario_a_clean_train": "scenario_a_train",
-        "foreign": "foreign",
-        "foreign_validation": "foreign_validation",
-    }
-)
+# Scenario A's training objects in three folds of eight, for choosing settings on novel objects. Each fold has
+# three brown objects and five of other colors, two vases and six of other shapes.
+FOLDS = ((0, 1, 2, 5, 9, 10, 20, 23), (3, 4, 6, 8, 11, 12, 14, 17), (7, 13, 15, 16, 18, 19, 21, 22))
 
 
 def select_objects(name: str) -> tuple[ObjectLabel, ...]:
@@ -75,42 +59,19 @@ def select_objects(name: str) -> tuple[ObjectLabel, ...]:
 
 @cache
 def _with_random_objects(name: str, n_objects: int, fold: int | None) -> tuple[ObjectLabel, ...]:
-    paper = OBJECT_SETS["scenario_a_train"]
-    n_random = n_objects - len(paper)
-    if not 0 <= n_random <= MAX_OBJECTS - len(paper):
+    n_paper = len(SCENARIO_A_TRAIN)
+    if not n_paper <= n_objects <= MAX_OBJECTS:
         raise ValueError(
-            f"`objects` must be random:N or fold_K:N with N from {len(paper)} to {MAX_OBJECTS}. Got {name!r}."
+            f"`objects` must be random:N or fold_K:N with N from {n_paper} to {MAX_OBJECTS}. Got {name!r}."
         )
-    labels = (*paper, *(random_label(FIRST_INDEX + number) for number in range(n_random)))
+    random_indices = range(FIRST_RANDOM_INDEX, FIRST_RANDOM_INDEX + n_objects - n_paper)
+    labels = (*SCENARIO_A_TRAIN, *map(random_label, random_indices))
     if fold is None:
         return labels
-    held_out = fold_pairs(fold)
+    held_out = {(OBJECTS[index].color, OBJECTS[index].shape) for index in FOLDS[fold]}
     return tuple(
         label
         for label in labels
         if label.index not in FOLDS[fold]
-        and not (label.index >= FIRST_INDEX and (label.color, label.shape) in held_out)
+        and not (label.index in random_indices and (label.color, label.shape) in held_out)
     )
-
-
-def find_label(index: int) -> ObjectLabel:
-    """Returns the label of an object: 0..31 the paper's, 32..10007 random, 20500..20999 foreign."""
-    if is_foreign(index):
-        return foreign_label(index)
-    return OBJECTS[index] if index < FIRST_INDEX else random_label(index)
-
-
-def find_model(index: int) -> ObjectModel:
-    """Returns the geometry of an object: 0..31 the paper's, 32..10007 random, 20500..20999 foreign.
-
-    Raises:
-        ImportError: The object is foreign, and PyBullet is not installed.
-    """
-    if is_foreign(index):
-        return foreign_model(index)
-    return object_model(index) if index < FIRST_INDEX else random_model(index)
-
-
-def default_objects(tasks: str) -> str:
-    """Returns the name of the default set of objects for a selection of tasks, such as "scenario_a_test"."""
-    return _OBJECTS_OF_TASK_SETS.get(tasks.strip(), "all")

@@ -1,7 +1,7 @@
 """Geometry of the 32 objects: visible meshes, collision parts and grasp heights.
 
 The authors' meshes are not public. These parametric solids resemble the objects in figures 4 to 6 of the
-paper in name, shape and color. Their labels are in `gym_deltaco.tasks.OBJECTS`.
+paper in name, shape and color. Their labels are in `gym_deltaco.objects.labels`.
 
 Recipes are in millimeters, with the table at z = 0 and the fingers closing along x. Models are in meters,
 with the origin in the center of the bounding box. The gripper opens to 74 mm and arrives with an error of
@@ -18,6 +18,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from gym_deltaco.objects.labels import OBJECTS, ObjectLabel
 from gym_deltaco.objects.solids import (
     CIRCLE,
     HALVED_SQUARE,
@@ -32,7 +33,6 @@ from gym_deltaco.objects.solids import (
     pointed_oval,
     polygon,
 )
-from gym_deltaco.tasks import OBJECTS, ObjectLabel
 
 
 @dataclass(frozen=True, eq=False)

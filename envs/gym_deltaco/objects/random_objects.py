@@ -15,14 +15,11 @@ from types import MappingProxyType
 
 import numpy as np
 
+from gym_deltaco.objects.labels import RANDOM_SEED, random_label
 from gym_deltaco.objects.objects import ObjectModel, Recipe, build_model
 from gym_deltaco.objects.random_forms import FAMILIES, Form, ring_height
 from gym_deltaco.objects.solids import Color, Loft, Paint, Row
 from gym_deltaco.sim.workspace import CAMERA
-from gym_deltaco.tasks import COLOR_SHAPE_PAIRS, OBJECTS, ObjectLabel
-
-FIRST_INDEX = len(OBJECTS)
-_SEED = 2210_04476  # seed of all random objects
 
 _PALM_DISTANCE = 35.0  # largest distance of an object's top above its grasp height
 _MIN_GRASP = 10.0  # lowest grasp height
@@ -32,29 +29,14 @@ _MAX_PART_POINTS = 24
 
 
 @cache
-def random_label(index: int) -> ObjectLabel:
-    """Returns the label of a random object; no instruction uses its name.
-
-    Successive indices run through all of `COLOR_SHAPE_PAIRS`, again and again, each time in a new order.
-
-    Args:
-        index: At least `FIRST_INDEX`.
-    """
-    turn, position = divmod(int(index) - FIRST_INDEX, len(COLOR_SHAPE_PAIRS))
-    order = np.random.default_rng((_SEED, turn)).permutation(len(COLOR_SHAPE_PAIRS))
-    color, shape = COLOR_SHAPE_PAIRS[order[position]]
-    return ObjectLabel(int(index), f"object {index}", shape, color)
-
-
-@cache
 def random_model(index: int) -> ObjectModel:
     """Returns the model of a random object; it is built on first use.
 
     Args:
-        index: At least `FIRST_INDEX`.
+        index: Index of the object, at least `FIRST_RANDOM_INDEX`.
     """
     label = random_label(index)
-    rng = np.random.default_rng((_SEED, 0, label.index))
+    rng = np.random.default_rng((RANDOM_SEED, 0, label.index))
     form = FAMILIES[label.shape](rng)
     return build_model(label, _recipe(form, label.color, rng))
 
@@ -102,12 +84,12 @@ def _cut_at_waists(rows: Sequence[Row]) -> list[Sequence[Row]]:
 
 def _convex(rows: Sequence[Row]) -> list[Row]:
     """Removes rings that lie within the convex hull of their neighbors."""
-    kept: list[Row] = []
+    convex: list[Row] = []
     for row in rows:
-        while len(kept) > 1 and not _stands_out(kept[-2], kept[-1], row):
-            kept.pop()
-        kept.append(row)
-    return kept
+        while len(convex) > 1 and not _stands_out(convex[-2], convex[-1], row):
+            convex.pop()
+        convex.append(row)
+    return convex
 
 
 def _stands_out(below: Row, row: Row, above: Row) -> bool:

@@ -61,7 +61,7 @@ def forward(joints: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]
     """
     waist, shoulder, elbow, roll, wrist, rotate = np.asarray(joints, dtype=np.float64)
     position, rotation = BASE_POSITION, _IDENTITY
-    turns = (
+    rotations = (
         _rotation("z", waist),
         _rotation("y", shoulder),
         _FLIP @ _rotation("y", elbow),
@@ -69,9 +69,9 @@ def forward(joints: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]
         _rotation("y", wrist),
         _FLIP @ _rotation("x", rotate),
     )
-    for origin, turn in zip(_ORIGINS, turns, strict=True):
+    for origin, joint_rotation in zip(_ORIGINS, rotations, strict=True):
         position = position + rotation @ origin
-        rotation = rotation @ turn
+        rotation = rotation @ joint_rotation
     return position + rotation @ _END_EFFECTOR_OFFSET, rotation
 
 
@@ -83,7 +83,7 @@ def inverse(position: ArrayLike, near: ArrayLike = REST_JOINTS) -> NDArray[np.fl
 
     Args:
         position: Position of the end effector in the world, (3,), m.
-        near: Current joint angles, (6,), rad; waist and wrist rotate take the turn that is nearest to them.
+        near: Current joint angles, (6,), rad. Of equivalent angles, waist and wrist rotate take the nearest.
 
     Returns:
         Joint angles, (6,), rad.

@@ -1,8 +1,8 @@
-"""A small interface to PyBullet, which no other module uses.
+"""The only module that uses PyBullet.
 
 Bodies are made from arrays instead of asset files: triangle meshes with one color per face are rendered,
-boxes and convex hulls collide. A scene is rebuilt for every episode, because a rebuilt world is reproducible
-to the last bit, whereas one restored from a saved state is not.
+boxes and convex hulls collide. Scenes are rebuilt for every episode, since a world that is restored from a
+saved state is not reproducible to the last bit.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def check_simulator() -> None:
     """Checks that PyBullet is installed.
 
     Raises:
-        ImportError: It is not; the message says what to install.
+        ImportError: PyBullet is not installed. The message says what to install.
     """
     if _import_error is not None:
         raise ImportError(
@@ -491,7 +491,7 @@ class Simulation:
             flags=pybullet.ER_NO_SEGMENTATION_MASK,
             physicsClientId=self._client,
         )
-        # They are tuples if PyBullet was built without NumPy.
+        # PyBullet returns tuples if it was built without NumPy.
         image = np.asarray(pixels, dtype=np.uint8).reshape(size, size, 4)
         return image[..., :3], np.asarray(depths, dtype=np.float32).reshape(size, size)
 

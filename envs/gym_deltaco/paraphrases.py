@@ -1,8 +1,8 @@
-"""Reads instructions that people wrote, from CSV files.
+"""Sentences for the tasks, other than the template: from the grammar, or from a CSV file.
 
-The benchmark's own instruction of a task is a template. The paper's authors also collected five sentences
-for each of the 300 tasks from people (appendix H), spelling mistakes included. Their license is not stated,
-so the project does not ship them: `curl -LO https://deltaco-robot.github.io/files/all_human_data.csv`.
+The paper's authors collected five sentences for each of the 300 tasks from people (appendix H), spelling
+mistakes included. Their license is not stated, so the project does not ship them:
+`curl -LO https://deltaco-robot.github.io/files/all_human_data.csv`.
 """
 
 from __future__ import annotations
@@ -16,29 +16,27 @@ from typing import get_args
 import numpy as np
 
 from gym_deltaco.phrases import PhraseSplit, paraphrase
-from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
+from gym_deltaco.tasks import ALL_TASKS, find_task, get_task
 
 PARAPHRASES_SPLITS = ("all", "train", "held_out")
-GRAMMAR = "grammar"  # in place of a file: sentences that the benchmark makes from phrases
+GRAMMAR = "grammar"  # in place of a file: sentences from `gym_deltaco.phrases`
 _N_FROM_GRAMMAR = 8  # sentences of each task and split
-# Columns of our files, and of the authors' file, which also numbers its rows
 _COLUMNS = ["task_id", "instruction"]
-_AUTHORS_COLUMNS = ["", "Task ID", "Instruction"]
+_AUTHORS_COLUMNS = ["", "Task ID", "Instruction"]  # of the authors' file, which also numbers its rows
 
 
 def read_paraphrases(
     path: str | Path, split: str = "all", task_ids: Iterable[int] | None = None
 ) -> dict[int, tuple[str, ...]]:
-    """Reads the sentences of tasks from a CSV file, or makes them from the benchmark's phrases.
+    """Returns the sentences of tasks, from a CSV file or the grammar.
 
     Args:
-        path: "grammar" for the benchmark's phrases; or a file in UTF-8 with the columns `task_id` (0..299, or
-            1000..1479 for tasks by color and shape) and `instruction`; or the authors' file, with the columns
-            "" (number of the row), "Task ID" and "Instruction".
+        path: "grammar"; or a file in UTF-8 with the columns `task_id` and `instruction`; or the authors'
+            file, with the columns "" (number of the row), "Task ID" and "Instruction".
         split: "all"; "held_out", the last sentence of each task (with "grammar", sentences with phrases that
-            are in no other); or "train", the sentences that are not held out for any task. Upper and lower
-            case do not distinguish sentences.
-        task_ids: Tasks for which sentences are made with "grammar"; None for all.
+            are in no training sentence); or "train", the sentences that are not held out for any task. Upper
+            and lower case do not distinguish sentences.
+        task_ids: Tasks for which the grammar makes sentences; None for all that an instruction describes.
 
     Returns:
         Distinct sentences by task index, in the order of the file; tasks ascending, without tasks that have
@@ -53,7 +51,7 @@ def read_paraphrases(
         )
     if path == GRAMMAR:
         if task_ids is None:
-            task_ids = (task.index for task in (*TASKS, *COLOR_SHAPE_TASKS))
+            task_ids = (task.index for task in ALL_TASKS.values() if task.object.index is None)
         return {task_id: _from_grammar(task_id, split) for task_id in sorted(task_ids)}
     distinct: dict[int, dict[str, str]] = {}
     for task_id, sentence in _read_rows(path):
@@ -71,6 +69,27 @@ def read_paraphrases(
     return sentences
 
 
+def training_sentences(
+    source: str | Path, task_strings: Iterable[str], split: str = "train"
+) -> dict[str, list[str]]:
+    """Returns sentences by task string, as the training of a policy takes them.
+
+    Args:
+        source: "grammar", or a CSV file, as `read_paraphrases` takes it.
+        task_strings: Task strings of a dataset. Those that are no template of the benchmark are left out.
+        split: Split of the sentences: "train", "held_out" or "all".
+
+    Returns:
+        Sentences of each task string that has some.
+
+    Raises:
+        ValueError: The split is unknown, or the file is missing or invalid.
+    """
+    tasks = {text: task for text in task_strings if (task := find_task(text)) is not None}
+    sentences = read_paraphrases(source, split, [task.index for task in tasks.values()])
+    return {text: list(sentences[task.index]) for text, task in tasks.items() if task.index in sentences}
+
+
 def choose_instructions(
     task_ids: Sequence[int],
     paraphrases: str | Path | None = None,
@@ -86,7 +105,7 @@ def choose_instructions(
         instruction: One sentence for all tasks, instead of a file.
 
     Returns:
-        One or more sentences for each task; without file and sentence None, for the benchmark's templates.
+        One or more sentences for each task; without file and sentence None, for the templates.
 
     Raises:
         ValueError: Both a file and a sentence are given, the sentence is empty, or the file is invalid or
@@ -113,13 +132,13 @@ def choose_instructions(
 
 @cache
 def _from_grammar(task_id: int, split: str) -> tuple[str, ...]:
-    found: list[str] = []
-    for number, own in enumerate(get_args(PhraseSplit)):
-        if split in (own, "all"):
+    sentences: list[str] = []
+    for number, phrase_split in enumerate(get_args(PhraseSplit)):
+        if split in (phrase_split, "all"):
             rng = np.random.default_rng((task_id, number))
-            sentences = [paraphrase(get_task(task_id), own, rng) for _ in range(_N_FROM_GRAMMAR)]
-            found += dict.fromkeys(sentences)
-    return tuple(found)
+            drawn = [paraphrase(get_task(task_id), phrase_split, rng) for _ in range(_N_FROM_GRAMMAR)]
+            sentences += dict.fromkeys(drawn)
+    return tuple(sentences)
 
 
 def _read_rows(path: str | Path) -> list[tuple[int, str]]:

@@ -1,8 +1,11 @@
-"""Files of instructions that people wrote: formats, splits and errors."""
+"""Sentences for the tasks: CSV files that people wrote, and the grammar."""
+
+import difflib
 
 import pytest
 
-from lerobot_deltaco.data.paraphrases import choose_instructions, read_paraphrases
+from gym_deltaco.paraphrases import GRAMMAR, choose_instructions, read_paraphrases, training_sentences
+from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
 
 OURS = """task_id,instruction
 4,move the speckled hourglass into the green box
@@ -71,3 +74,46 @@ def test_instructions_are_templates_a_file_or_one_sentence(tmp_path):
         choose_instructions([0], path, instruction="go")
     with pytest.raises(ValueError, match="It is empty"):
         choose_instructions([0], instruction=" ")
+
+
+def test_training_takes_sentences_by_task_string(tmp_path):
+    path = write(tmp_path / "shared.csv", SHARED)
+    strings = [get_task(task_id).instruction for task_id in (1, 4)]
+    mine = [*strings, "Stack the cups.", "Put thing in green bin."]
+    assert training_sentences(path, mine) == {strings[0]: ["d"]}
+    assert training_sentences(path, mine, "held_out") == {strings[0]: ["e"]}
+    assert list(training_sentences(GRAMMAR, mine)) == strings
+    assert training_sentences(GRAMMAR, mine)[strings[1]] == list(read_paraphrases(GRAMMAR, "train", [4])[4])
+
+
+# The grammar
+
+
+@pytest.fixture(scope="module")
+def sentences():
+    return {split: read_paraphrases(GRAMMAR, split) for split in ("train", "held_out", "all")}
+
+
+def test_every_task_has_sentences_of_both_splits(sentences):
+    for split in ("train", "held_out"):
+        assert list(sentences[split]) == [task.index for task in (*TASKS, *COLOR_SHAPE_TASKS)]
+        assert all(len(own) >= 4 for own in sentences[split].values())
+    assert all(own == sentences["train"][n] + sentences["held_out"][n] for n, own in sentences["all"].items())
+    distinct = {sentence for own in sentences["train"].values() for sentence in own}
+    assert len(distinct) > 4000
+    assert not any("True" in sentence.split() for sentence in distinct)  # "on", as YAML reads it
+    assert not distinct & {sentence for own in sentences["held_out"].values() for sentence in own}
+
+
+def test_sentences_name_what_the_task_asks_for(sentences):
+    """Up to typing errors, a sentence by name has the name, and none has another container's color."""
+    for task in TASKS[: len(TASKS) // 3]:
+        for sentence in (*sentences["train"][task.index], *sentences["held_out"][task.index]):
+            words = sentence.lower().rstrip(".!").replace(",", "").split()
+            assert "{" not in sentence
+            if task.kind == "name":
+                name = task.object.name.split()
+                assert all(difflib.get_close_matches(word, words, 1, 0.6) for word in name), sentence
+            if not task.is_position_task and task.kind == "shape":
+                other = {"green": "red", "red": "green"}[task.container]
+                assert other not in words
