@@ -24,7 +24,7 @@ from lerobot_deltaco.data.demonstrations import (
     read_demonstrations,
     sample_frames,
 )
-from lerobot_deltaco.policies.base.language import Paraphrases
+from lerobot_deltaco.policies.base.instructions import Paraphrases
 
 pytestmark = pytest.mark.usefixtures("fake_language")
 

@@ -37,7 +37,7 @@ from lerobot_deltaco.data.reading import (
 )
 from lerobot_deltaco.policies.base.action_queues import ActionQueues
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
-from lerobot_deltaco.policies.base.language import InstructionEmbeddings, Paraphrases
+from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.policies.base.losses import imitation_loss, join_action
 from lerobot_deltaco.policies.base.networks import ActionDistribution, PolicyNetwork, fuse_batch_norms
 from lerobot_deltaco.policies.base.normalization import StateLimits

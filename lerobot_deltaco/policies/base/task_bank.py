@@ -35,7 +35,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
-from lerobot_deltaco.policies.base.language import InstructionEmbeddings
+from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings
 
 TASK_BANK = "tasks.safetensors"
 PROCESSORS = "processors and statistics"
