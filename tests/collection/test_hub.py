@@ -17,8 +17,8 @@ from PIL import Image
 from gym_deltaco.env import ACTION_SCALE
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import TASKS
-from lerobot_deltaco.collection.cards import TASKS_IMAGE, dataset_card
 from lerobot_deltaco.collection.collect import CollectionPlan, collect
+from lerobot_deltaco.collection.dataset_card import TASKS_IMAGE, dataset_card
 from lerobot_deltaco.collection.hub import HubError, create_repository, push
 from lerobot_deltaco.collection.writer import INFO_FILE
 

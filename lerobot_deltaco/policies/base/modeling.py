@@ -41,6 +41,7 @@ from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings, Pa
 from lerobot_deltaco.policies.base.losses import imitation_loss, join_action
 from lerobot_deltaco.policies.base.networks import ActionDistribution, PolicyNetwork, fuse_batch_norms
 from lerobot_deltaco.policies.base.normalization import StateLimits
+from lerobot_deltaco.policies.base.policy_card import policy_card
 from lerobot_deltaco.policies.base.task_bank import (
     PROCESSORS,
     TASK_BANK,
@@ -446,8 +447,6 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> Any:
         """Returns the card of the policy on the Hugging Face Hub. The arguments are those of LeRobot."""
-        from lerobot_deltaco.collection.cards import policy_card
-
         demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
         return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
 
