@@ -54,7 +54,7 @@ class DeltacoConfig(TaskConditionedConfig):
 
     Args:
         language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'), all-MiniLM-L6-v2,
-            all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `offline`
+            all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `language`
             includes the first two.
         method: Method of the paper: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
         film: Ablation: input through FiLM, instead of the method's: none, demo, language or demo+language.
