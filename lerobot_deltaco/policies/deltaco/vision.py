@@ -111,8 +111,9 @@ def load_vision_encoder(name: str, image_size: int | None = None) -> VisionEncod
     try:
         network = spec.load().eval().requires_grad_(False)
     except (ImportError, OSError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
         raise PretrainedWeightsError(
-            f"The image encoder {name} cannot be loaded: {str(error).splitlines()[0]} Without a network, "
+            f"The image encoder {name} cannot be loaded: {reason}. Without a network, "
             "choose efficientnet-lite0, or fill the caches of Hugging Face and torch.hub elsewhere. CLIP "
             'needs `pip install "lerobot_policy_deltaco[language]"`.'
         ) from error
