@@ -26,13 +26,13 @@ from lerobot_deltaco.data.grasps import Grasp, find_grasps
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import check_dataset_folder, missing_files_named
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig, check_image_shapes
-from lerobot_deltaco.policies.base.optimization import keep_freed_memory
+from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
 
 def train() -> None:
     """Trains as the command line says, with the arguments of `lerobot-train`."""
-    keep_freed_memory()
+    disable_malloc_trim()
     training = _InMemoryTraining()
     with (
         patch.object(lerobot_train, "make_train_eval_datasets", training.make_datasets),

@@ -7,12 +7,12 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.optim.schedulers import LRSchedulerConfig
 
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.base.language import LANGUAGE_ENCODERS, MINILM_L3
 from lerobot_deltaco.policies.base.losses import GRIPPER_LOSSES
 from lerobot_deltaco.policies.base.networks import BACKBONES
-from lerobot_deltaco.policies.base.optimization import CosineSchedulerConfig
 from lerobot_deltaco.policies.deltaco.vision import VISION_ENCODERS
 
 
@@ -186,6 +186,6 @@ class DeltacoConfig(TaskConditionedConfig):
             return VISION_ENCODERS[self.vision_encoder].feature_dim
         return self.embedding_dim
 
-    def get_scheduler_preset(self) -> CosineSchedulerConfig | None:
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         """Returns the schedule of the learning rate; None for a constant one."""
         return None if self.scheduler_name == "constant" else super().get_scheduler_preset()
