@@ -56,7 +56,7 @@ release: $(INSTALLED) docs ## Build the wheel, and try it in an empty environmen
 	rm -rf dist
 	$(BIN)/uv build --out-dir dist
 	$(BIN)/uv venv --python $(BIN)/python dist/trial
-	$(BIN)/uv pip install --python dist/trial "$$(ls dist/*.whl)[sim,offline]"
+	$(BIN)/uv pip install --python dist/trial "$$(ls dist/*.whl)[sim,language]"
 	cd dist && trial/bin/deltaco evaluate trial/lib/python3*/site-packages/lerobot_deltaco/checkpoints/pick_place \
 		--tasks 24 --trials 1
 

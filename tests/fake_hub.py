@@ -40,14 +40,10 @@ class Repo:
 
 
 class FakeHub:
-    """Serves `repos`, {("dataset" or "model", "user/name"): Repo}, until the end of a `with` block.
-
-    Requests in whose method and path the regular expression `refused` is found are refused.
-    """
+    """Serves `repos`, {("dataset" or "model", "user/name"): Repo}, until the end of a `with` block."""
 
     def __init__(self):
         self.repos = {}
-        self.refused = None
         self._lock = threading.Lock()
         handler = type("Handler", (_Handler,), {"hub": self})
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
@@ -91,8 +87,6 @@ class FakeHub:
             return _json({"errors": [], "warnings": []})
         if method in ("POST", "DELETE") and token != TOKEN:
             return _error(403, "Forbidden: you do not have the required rights")
-        if self.refused and re.search(self.refused, f"{method} {path}"):
-            return _error(422, "This Hub does not do that")
         with self._lock:
             if path == "/api/repos/create":
                 return self._create(json.loads(body))

@@ -122,8 +122,8 @@ def test_a_mistyped_option_of_json_is_one_line(monkeypatch):
 
 @pytest.mark.slow
 def test_act_is_trained_and_evaluated_by_the_command_of_a_datasets_card(tmp_path):
-    from lerobot_deltaco.collection.cards import dataset_card
     from lerobot_deltaco.collection.collect import CollectionPlan, collect
+    from lerobot_deltaco.collection.dataset_card import dataset_card
 
     root = tmp_path / "data"
     collect(root, CollectionPlan("4", 2))

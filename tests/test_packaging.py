@@ -119,8 +119,7 @@ def test_the_wheel_holds_all_that_the_clone_has(wheel):
     expected = {name.removeprefix("envs/") for name in tracked.splitlines() if (ROOT / name).is_file()}
     for folder in ("lerobot_deltaco/", "gym_deltaco/"):
         assert {name for name in expected if name.startswith(folder)} <= names
-    for folder in ("datasets_cards/", "checkpoints/"):
-        assert {f"lerobot_deltaco/{name}" for name in expected if name.startswith(folder)} <= names
+    assert {f"lerobot_deltaco/{name}" for name in expected if name.startswith("checkpoints/")} <= names
     assert "lerobot_policy_deltaco.py" in names
     assert not {name for name in names if name.startswith(("tests/", "docs/", "results/", "envs/"))}
 

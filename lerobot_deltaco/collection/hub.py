@@ -13,8 +13,8 @@ import tyro
 from huggingface_hub import HfApi
 from huggingface_hub.errors import HFValidationError, RevisionNotFoundError
 
-from lerobot_deltaco.collection.cards import write_dataset_card
 from lerobot_deltaco.collection.collect import CollectionPlan, collect
+from lerobot_deltaco.collection.dataset_card import write_dataset_card
 from lerobot_deltaco.collection.writer import CODEBASE_VERSION
 
 

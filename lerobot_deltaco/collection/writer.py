@@ -1,9 +1,10 @@
 """Writes the files of a LeRobotDataset v3, one shard at a time.
 
-LeRobot's own writer takes 60 to 120 ms per episode and cannot be shared between processes. Here, a shard is
-one data file and one file of episode metadata with the same number. Processes write shards in parallel, and
-`write_metadata` then completes the dataset. This module imports neither torch nor LeRobot, which would cost
-every worker process 10 s; the tests compare the result with LeRobot's.
+LeRobot's own writer cannot be shared between processes, and takes 124 ms of a core for an episode of 30
+frames, 17 ms of them for statistics; this one takes 11 ms, beside 113 ms for the expert's episode. Here, a
+shard is one data file and one file of episode metadata with the same number. Processes write shards in
+parallel, and `write_metadata` then completes the dataset. This module imports neither torch nor LeRobot,
+which would cost every worker process 10 s; the tests compare the result with LeRobot's.
 """
 
 from __future__ import annotations

@@ -50,8 +50,8 @@ from lerobot_deltaco.evaluation.expert_demonstrations import ExpertBank
 from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord, read_records, write_records
 from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.policies.base.configuration import SOURCES
+from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
-from lerobot_deltaco.policies.base.optimization import keep_freed_memory
 
 # Most episodes that run at the same time. A policy's step costs little more for 8 than for 2, and each
 # episode needs a simulator of 50 MB, in each process.
@@ -254,7 +254,7 @@ def evaluate(loaded: LoadedPolicy, plan: EvaluationPlan, processes: int = 1) -> 
         ValueError: A task has no demonstration, or the policy is not one for the benchmark.
         RuntimeError: A process ended unexpectedly.
     """
-    keep_freed_memory()
+    disable_malloc_trim()
     evaluation = Evaluation(loaded, plan)
     rows: list[dict[str, Any]] = []
     with tqdm(total=sum(map(len, evaluation.batches)), desc="Evaluating", unit="episode") as progress:

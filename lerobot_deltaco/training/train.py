@@ -36,8 +36,8 @@ from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import check_dataset_folder, missing_files_named
 from lerobot_deltaco.data.training_data import read_robot_data
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig, check_image_shapes
+from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
-from lerobot_deltaco.policies.base.optimization import keep_freed_memory
 from lerobot_deltaco.training.lerobot_loop import replaced
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
@@ -50,7 +50,7 @@ def train(config: TrainPipelineConfig | None = None) -> None:
     Args:
         config: What `lerobot-train` would be given; None for the options on the command line.
     """
-    keep_freed_memory()
+    disable_malloc_trim()
     training = _InMemoryTraining()
     with replaced(
         make_train_eval_datasets=training.make_datasets,

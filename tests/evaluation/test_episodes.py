@@ -23,7 +23,7 @@ from lerobot_deltaco.data.demonstrations import (
     sample_frames,
 )
 from lerobot_deltaco.data.training_data import DatasetEpisodes, DemonstrationFormat, read_demonstrations
-from lerobot_deltaco.policies.base.language import Paraphrases
+from lerobot_deltaco.policies.base.instructions import Paraphrases
 
 pytestmark = pytest.mark.usefixtures("fake_language")
 

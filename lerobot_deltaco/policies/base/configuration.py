@@ -13,10 +13,11 @@ from typing import Any
 import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.optim import AdamWConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig, LRSchedulerConfig
 
 from lerobot_deltaco.data.gripper import Gripper
 from lerobot_deltaco.data.training_data import DemonstrationFormat
-from lerobot_deltaco.policies.base.optimization import CosineSchedulerConfig, FusedAdamWConfig
 
 logger = logging.getLogger(__name__)
 
@@ -295,17 +296,17 @@ class TaskConditionedConfig(PreTrainedConfig):
             setattr(saved, name, None)
         PreTrainedConfig._save_pretrained(saved, save_directory)
 
-    def get_optimizer_preset(self) -> FusedAdamWConfig:
+    def get_optimizer_preset(self) -> AdamWConfig:
         """Returns AdamW, which equals Adam without weight decay."""
-        return FusedAdamWConfig(
+        return AdamWConfig(
             lr=self.optimizer_lr,
             weight_decay=self.optimizer_weight_decay,
             grad_clip_norm=self.grad_clip_norm,
         )
 
-    def get_scheduler_preset(self) -> CosineSchedulerConfig | None:
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         """Returns the cosine schedule of the learning rate."""
-        return CosineSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
     @property
     def observation_delta_indices(self) -> None:

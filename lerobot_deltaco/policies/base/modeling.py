@@ -25,10 +25,11 @@ from lerobot_deltaco.data.reading import compare_robots, open_dataset
 from lerobot_deltaco.data.training_data import DatasetEpisodes, Episodes, TrainingData
 from lerobot_deltaco.policies.base.action_queues import ActionQueues
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
-from lerobot_deltaco.policies.base.language import InstructionEmbeddings, Paraphrases
+from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings, Paraphrases
 from lerobot_deltaco.policies.base.losses import imitation_loss, join_action
 from lerobot_deltaco.policies.base.networks import ActionDistribution, PolicyNetwork, fuse_batch_norms
 from lerobot_deltaco.policies.base.normalization import StateLimits
+from lerobot_deltaco.policies.base.policy_card import policy_card
 from lerobot_deltaco.policies.base.sentences import read_sentences
 from lerobot_deltaco.policies.base.task_bank import (
     TASK_BANK,
@@ -428,8 +429,6 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> Any:
         """Returns the card of the policy on the Hugging Face Hub. The arguments are those of LeRobot."""
-        from lerobot_deltaco.collection.cards import policy_card
-
         demonstrated = [] if self.demonstrations is None else list(self.demonstrations.rows)
         return policy_card(self.config, demonstrated, dataset_repo_id, license, tags, cfg, dataset_meta)
 

@@ -24,7 +24,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
-from lerobot_deltaco.policies.base.language import InstructionEmbeddings
+from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings
 
 TASK_BANK = "tasks.safetensors"
 _HUB_OPTIONS = ("revision", "cache_dir", "token", "local_files_only", "force_download")

@@ -7,13 +7,13 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.optim.schedulers import LRSchedulerConfig
 
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.base.language import LANGUAGE_ENCODERS, MINILM_L3
 from lerobot_deltaco.policies.base.losses import GRIPPER_LOSSES
 from lerobot_deltaco.policies.base.networks import BACKBONES
-from lerobot_deltaco.policies.base.optimization import CosineSchedulerConfig
-from lerobot_deltaco.policies.deltaco.vision import VISION_ENCODERS, VISION_INPUTS
+from lerobot_deltaco.policies.deltaco.vision import VISION_ENCODERS
 
 
 class Conditioning(NamedTuple):
@@ -54,7 +54,7 @@ class DeltacoConfig(TaskConditionedConfig):
 
     Args:
         language_encoder: Frozen sentence encoder: paraphrase-MiniLM-L3-v2 (the authors'), all-MiniLM-L6-v2,
-            all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `offline`
+            all-distilroberta-v1, distilbert-base-uncased or clip-vit-base-patch32. The extra `language`
             includes the first two.
         method: Method of the paper: deltaco, language_only, demo_only, one_hot, bc_z or mcil.
         film: Ablation: input through FiLM, instead of the method's: none, demo, language or demo+language.
@@ -68,11 +68,10 @@ class DeltacoConfig(TaskConditionedConfig):
         demo_encoder: Encoder of demonstrations: cnn, the paper's; attention, this project's, which compares
             the frames at each location and attends to a few locations; or pretrained, a frozen image encoder.
         vision_encoder: Frozen image encoder for `demo_encoder=pretrained`: efficientnet-lite0; or
-            clip-vit-base-patch32 or r3m-resnet18, which are downloaded.
+            clip-vit-base-patch32, r3m-resnet18 or r3m-resnet18-authors, which are downloaded. The last gets
+            images as in the authors' code: in 0..1 instead of 0..255, and not scaled.
         vision_image_size: Height and width to which the grid of a demonstration's frames is scaled for that
             encoder; by default, the size of the images that it was trained on.
-        vision_input: Format of R3M's images: published, that of R3M; or authors, as in the authors' code, in
-            0..1 instead of 0..255 and not scaled to 224 pixels.
         demo_variants: Number of variants of each demonstration (random shifts, and random frames between the
             ends) that a pretrained encoder encodes before training; each sample gets one of them.
         demo_head: Sizes of the hidden layers of fully connected layers after a pretrained encoder, such as
@@ -97,7 +96,6 @@ class DeltacoConfig(TaskConditionedConfig):
     demo_encoder: str = "cnn"
     vision_encoder: str = "clip-vit-base-patch32"
     vision_image_size: int | None = None
-    vision_input: str = "published"
     demo_variants: int = 8
     demo_head: list[int] | None = None
     demo_rows: int = 1
@@ -125,7 +123,6 @@ class DeltacoConfig(TaskConditionedConfig):
             encoder_loss=(None, *ENCODER_LOSSES),
             demo_encoder=DEMO_ENCODERS,
             vision_encoder=VISION_ENCODERS,
-            vision_input=VISION_INPUTS,
             backbone=BACKBONES,
             gripper_loss=GRIPPER_LOSSES,
             scheduler_name=("constant", "cosine"),
@@ -186,9 +183,9 @@ class DeltacoConfig(TaskConditionedConfig):
     def demo_dim(self) -> int:
         """Size of a demonstration's embedding."""
         if self.demo_encoder == "pretrained" and self.demo_head is None:
-            return VISION_ENCODERS[self.vision_encoder]
+            return VISION_ENCODERS[self.vision_encoder].feature_dim
         return self.embedding_dim
 
-    def get_scheduler_preset(self) -> CosineSchedulerConfig | None:
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         """Returns the schedule of the learning rate; None for a constant one."""
         return None if self.scheduler_name == "constant" else super().get_scheduler_preset()

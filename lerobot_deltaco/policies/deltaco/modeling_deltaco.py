@@ -23,7 +23,7 @@ from torch import Tensor
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank, sample_frames
 from lerobot_deltaco.data.reading import warn_of_equal_instructions
 from lerobot_deltaco.data.training_data import TrainingData
-from lerobot_deltaco.policies.base.language import InstructionEmbeddings
+from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings
 from lerobot_deltaco.policies.base.losses import contrastive_logits, contrastive_loss, cosine_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import (
@@ -287,7 +287,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
 
     def _encode_bank(self, bank: DemonstrationBank, n_variants: int) -> Tensor:
         config = self.config
-        encoder = load_vision_encoder(config.vision_encoder, config.vision_image_size, config.vision_input)
+        encoder = load_vision_encoder(config.vision_encoder, config.vision_image_size)
         padding, frames, rows = config.demo_shift_padding, config.n_demo_frames, config.demo_rows
         # The features do not depend on the precision of the training.
         with torch.autocast(bank.frames.device.type, enabled=False):
@@ -357,7 +357,7 @@ def _make_demo_encoder(config: DeltacoConfig) -> FrameGridEncoder | AttentionEnc
     if not config.uses_demonstrations:
         return None
     if config.demo_encoder == "pretrained":
-        return UnitHead(VISION_ENCODERS[config.vision_encoder], config.demo_head, config.demo_dim)
+        return UnitHead(VISION_ENCODERS[config.vision_encoder].feature_dim, config.demo_head, config.demo_dim)
     if config.demo_encoder == "attention":
         return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
     size, stride = config.image_size, BACKBONES[config.backbone].demo_stride

@@ -7,9 +7,9 @@ fixed number of such variants of each demonstration is drawn beforehand.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -23,107 +23,26 @@ from lerobot_deltaco.policies.base.image_encoder import (
     PretrainedWeightsError,
 )
 
-# Size of the features of each encoder: the authors' two, and one that comes as a Python package.
-VISION_ENCODERS = MappingProxyType(
-    {"clip-vit-base-patch32": 512, "r3m-resnet18": 512, "efficientnet-lite0": HEAD_CHANNELS}
-)
-# Format of R3M's images: that of its own example, or that of DeL-TaCo's authors.
-VISION_INPUTS = ("published", "authors")
 _BATCH_SIZE = 64
 _CLIP = "openai/clip-vit-base-patch32"
 _CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 _R3M_URL = "https://pytorch.s3.amazonaws.com/models/rl/r3m/r3m_18.pt"
 _R3M_PREFIX = "module.convnet."
 
-
+Values = tuple[float, ...]  # of each color channel
 # From images (batch, 3, height, width) in 0..1 to features (batch, features) in float32.
 VisionEncoder = Callable[[Tensor], Tensor]
 
 
-@torch.random.fork_rng(devices=[])  # initial weights of a policy do not depend on draws of its encoder's
-def load_vision_encoder(
-    name: str, image_size: int | None = None, input_kind: str = "published"
-) -> VisionEncoder:
-    """Loads a frozen image encoder.
+class VisionEncoderSpec(NamedTuple):
+    """A frozen image encoder."""
 
-    Args:
-        name: One of `VISION_ENCODERS`.
-        image_size: Height and width to which images are scaled, px; by default, those of the encoder.
-        input_kind: Format of R3M's images: "published"; or "authors", as in the code of DeL-TaCo's authors,
-            in 0..1 instead of 0..255, at their own size.
-
-    Raises:
-        PretrainedWeightsError: A package is missing, or the model can be neither found nor downloaded, or is
-            not the published one.
-        ValueError: The arguments do not fit together.
-    """
-    size: int | None = 224
-    mean: Sequence[float] = IMAGENET_MEAN
-    std: Sequence[float] = IMAGENET_STD
-    if name == "efficientnet-lite0":
-        network = EfficientNetLite0()
-        network.load_imagenet_weights()
-        mean, std = (127 / 255,) * 3, (128 / 255,) * 3  # its input is (x - 127) / 128 for x in 0..255
-        return _frozen(network, _mean_over_locations, image_size or size, mean, std)
-    if name == "r3m-resnet18":
-        if input_kind == "authors":
-            # They give 0..1 to a network that first divides by 255: its input is (x / 255 - mean) / std.
-            size, mean, std = None, [255 * value for value in mean], [255 * value for value in std]
-        return _frozen(_load(name, _r3m), nn.Module.__call__, image_size or size, mean, std)
-    return _frozen(_load(name, _clip), _projected, image_size or size, _CLIP_MEAN, _CLIP_STD)
-
-
-def _frozen(
-    network: nn.Module,
-    features: Callable[[Any, Tensor], Tensor],
-    size: int | None,
-    mean: Sequence[float],
-    std: Sequence[float],
-) -> VisionEncoder:
-    """Makes an encoder of a network and a function from it and normalized images to features."""
-    network.eval().requires_grad_(False)
-
-    @torch.no_grad()
-    def encode(images: Tensor) -> Tensor:
-        device = images.device
-        network.to(device)
-        center, scale = (torch.tensor(values, device=device)[:, None, None] for values in (mean, std))
-        parts = images.float().split(_BATCH_SIZE)
-        with torch.autocast(device.type, enabled=False):
-            return torch.cat(
-                [features(network, (_square(part, size) - center) / scale).float() for part in parts]
-            )
-
-    return encode
-
-
-def _square(images: Tensor, size: int | None) -> Tensor:
-    """Cuts the middle square out of images (batch, 3, height, width) in 0..1, and scales it to a size."""
-    height, width = images.shape[-2:]
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    images = images[..., top : top + side, left : left + side]
-    if size in (None, side):
-        return images
-    return F.interpolate(images, (size, size), mode="bicubic", antialias=True).clamp(0, 1)
-
-
-def _mean_over_locations(network: nn.Module, images: Tensor) -> Tensor:
-    return network(images).mean(dim=(2, 3))
-
-
-def _projected(network: nn.Module, images: Tensor) -> Tensor:
-    return network(pixel_values=images).image_embeds
-
-
-def _load(name: str, load: Callable[[], nn.Module]) -> nn.Module:
-    try:
-        return load()
-    except OSError as error:
-        raise PretrainedWeightsError(
-            f"The image encoder {name} cannot be downloaded: {str(error).splitlines()[0]} Without a network, "
-            "choose efficientnet-lite0, or fill the caches of Hugging Face and torch.hub elsewhere."
-        ) from error
+    feature_dim: int
+    load: Callable[[], nn.Module]
+    features: Callable[[Any], Tensor]  # from the network's output, (batch, feature_dim)
+    image_size: int | None  # px; None for images at their own size
+    mean: Values
+    std: Values
 
 
 def _clip() -> nn.Module:
@@ -146,3 +65,77 @@ def _r3m() -> nn.Module:
         }
     )
     return network
+
+
+VISION_ENCODERS = MappingProxyType(
+    {
+        # The authors' two. They give R3M images in 0..1, which it divides by 255, at their own size.
+        "clip-vit-base-patch32": VisionEncoderSpec(
+            512, _clip, lambda output: output.image_embeds, 224, _CLIP_MEAN, _CLIP_STD
+        ),
+        "r3m-resnet18": VisionEncoderSpec(512, _r3m, lambda output: output, 224, IMAGENET_MEAN, IMAGENET_STD),
+        "r3m-resnet18-authors": VisionEncoderSpec(
+            512,
+            _r3m,
+            lambda output: output,
+            None,
+            tuple(255 * value for value in IMAGENET_MEAN),
+            tuple(255 * value for value in IMAGENET_STD),
+        ),
+        # It comes as a Python package. Its input is (x - 127) / 128 for x in 0..255.
+        "efficientnet-lite0": VisionEncoderSpec(
+            HEAD_CHANNELS,
+            EfficientNetLite0,
+            lambda output: output[-1].mean(dim=(2, 3)),
+            224,
+            (127 / 255,) * 3,
+            (128 / 255,) * 3,
+        ),
+    }
+)
+
+
+@torch.random.fork_rng(devices=[])  # initial weights of a policy do not depend on draws of its encoder's
+def load_vision_encoder(name: str, image_size: int | None = None) -> VisionEncoder:
+    """Loads a frozen image encoder, which crops images to their middle square and scales it.
+
+    Args:
+        name: One of `VISION_ENCODERS`.
+        image_size: Height and width to which images are scaled, px; by default, those of the encoder.
+
+    Raises:
+        PretrainedWeightsError: A package is missing, or the weights can be neither found nor downloaded.
+    """
+    spec = VISION_ENCODERS[name]
+    size = image_size or spec.image_size
+    try:
+        network = spec.load().eval().requires_grad_(False)
+    except (ImportError, OSError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise PretrainedWeightsError(
+            f"The image encoder {name} cannot be loaded: {reason}. Without a network, "
+            "choose efficientnet-lite0, or fill the caches of Hugging Face and torch.hub elsewhere. CLIP "
+            'needs `pip install "lerobot_policy_deltaco[language]"`.'
+        ) from error
+
+    @torch.no_grad()
+    def encode(images: Tensor) -> Tensor:
+        device = images.device
+        network.to(device)
+        mean, std = (torch.tensor(values, device=device)[:, None, None] for values in (spec.mean, spec.std))
+        with torch.autocast(device.type, enabled=False):
+            batches = ((_square(part, size) - mean) / std for part in images.float().split(_BATCH_SIZE))
+            return torch.cat([spec.features(network(batch)).float() for batch in batches])
+
+    return encode
+
+
+def _square(images: Tensor, size: int | None) -> Tensor:
+    """Cuts the middle square out of images (batch, 3, height, width) in 0..1, and scales it to a size."""
+    height, width = images.shape[-2:]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    images = images[..., top : top + side, left : left + side]
+    if size in (None, side):
+        return images
+    return F.interpolate(images, (size, size), mode="bicubic", antialias=True).clamp(0, 1)

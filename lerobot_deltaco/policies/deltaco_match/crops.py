@@ -22,9 +22,8 @@ from lerobot_deltaco.policies.base.networks import cell_centers
 from lerobot_deltaco.policies.deltaco_match.calibration import robust_fit
 
 _RESOLUTION = 128  # px, of crops as the encoder sees them
-# Blocks whose maps describe a crop: at stride 16, as 4 x 4 cells, and at stride 32, as their mean.
-_FINE_BLOCK, _FINE_CHANNELS, _FINE_CELLS = 11, 112, 4
-_COARSE_BLOCK, _COARSE_CHANNELS = 16, 320
+# Maps that describe a crop: at stride 16, as 4 x 4 cells, and at stride 32, as their mean.
+_FINE_CHANNELS, _FINE_CELLS, _COARSE_CHANNELS = 112, 4, 320
 # Of the fit of the perspective: change of a pixel (in 0..1) that counts, distance from the grasp (in -1..1),
 # and width by which images blur an object (px).
 _CHANGE, _REACH, _BLUR = 0.1, 1 / 3, 1.0
@@ -49,7 +48,7 @@ def crop_features(images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
     mean, std = (
         torch.tensor(values, device=crops.device)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD)
     )
-    fine, coarse, last = _encoder(crops.device).maps((crops - mean) / std, (_FINE_BLOCK, _COARSE_BLOCK))
+    fine, coarse, last = _encoder(crops.device)((crops - mean) / std)
     parts = [
         F.adaptive_avg_pool2d(fine, _FINE_CELLS).flatten(1),
         coarse.mean(dim=(2, 3)),
@@ -113,6 +112,4 @@ def fit_perspective(first: Tensor, last: Tensor, locations: Tensor) -> Tensor:
 
 @cache
 def _encoder(device: torch.device) -> EfficientNetLite0:
-    encoder = EfficientNetLite0()
-    encoder.load_imagenet_weights()
-    return encoder.to(device)
+    return EfficientNetLite0().to(device)
