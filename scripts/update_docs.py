@@ -11,8 +11,9 @@ import pandas as pd
 
 from gym_deltaco.atomic_files import write_text
 from gym_deltaco.tasks import get_task
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records
-from lerobot_deltaco.reports.leaderboard import PAPER, ReportError, Result, collect_results, paper_row
+from lerobot_deltaco.reports.leaderboard import PAPER, Result, collect_results, paper_row
 from lerobot_deltaco.reports.metrics import paired_difference
 from lerobot_deltaco.reports.report import markdown_table
 
@@ -39,7 +40,7 @@ def leaderboard_tables() -> dict[str, pd.DataFrame]:
     """Returns the tables of the leaderboard by section: the rows in the protocol's scenes, then the others.
 
     Raises:
-        ReportError: A file of records lacks the experiment of a row, or has it for other tasks.
+        UserError: A file of records lacks the experiment of a row, or has it for other tasks.
     """
     protocol = str(EvaluationPlan().seed)
     sections: dict[str, list[tuple[tuple[bool, float], dict[str, object]]]] = {}
@@ -107,7 +108,7 @@ def _find(records: str, experiment: str, settings: Mapping[str, str]) -> Result:
     for result in _read(records):
         if result.experiment == experiment and settings.items() <= result.settings.items():
             return result
-    raise ReportError(f"results/{records} has no evaluation of {experiment!r} with {dict(settings)}.")
+    raise UserError(f"results/{records} has no evaluation of {experiment!r} with {dict(settings)}.")
 
 
 PAGES = {ROOT / "docs/leaderboard.md": leaderboard_tables, ROOT / "docs/paper.md": paper_tables}

@@ -17,8 +17,9 @@ from gym_deltaco.layout import Layout
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import Task
 from lerobot_deltaco.data.demonstrations import Demonstration, kept_frames, resize_images
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy, find_checkpoints, load_policy
-from lerobot_deltaco.evaluation.episodes import Episode
+from lerobot_deltaco.evaluation.episodes import EpisodeSpec
 from lerobot_deltaco.evaluation.evaluate import run_episodes
 from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
 from lerobot_deltaco.lerobot_env import check_policy_fits
@@ -79,7 +80,7 @@ def record_episode(
         frames.append(image)
         placed.update((n, env.scene.container_of(n)) for n in range(len(env.scene.bodies)))
 
-    episode = Episode(task_id, 0, seed, instruction, task_id if demonstrations else -1)
+    episode = EpisodeSpec(task_id, 0, seed, instruction, task_id if demonstrations else -1)
     with torch.inference_mode():
         (info,) = run_episodes(loaded, [env], [episode], [demonstrations], record)
     in_containers = frozenset(pair for pair in placed if pair[1] >= 0)
@@ -132,7 +133,7 @@ def benchmark_env(config: Any, render_size: int) -> PickPlaceEnv:
         render_size: Height and width of the frames of recordings, px.
 
     Raises:
-        ValueError: The policy is not one for the benchmark.
+        UserError: The policy is not one for the benchmark.
     """
     sizes = [feature.shape[-1] for feature in config.image_features.values()]
     control = control_of(config.image_features) or SceneConfig.control
@@ -149,14 +150,14 @@ def load_conditioned(checkpoint: str | Path) -> LoadedPolicy:
             a repository on the Hugging Face Hub.
 
     Raises:
-        ValueError: There is no checkpoint, or its policy is of another kind.
+        UserError: There is no checkpoint, or its policy is of another kind.
     """
     folder = Path(checkpoint)
     if folder.exists() or len(folder.parts) != 2:
         folder = find_checkpoints(folder)[-1].folder
     loaded = load_policy(folder)
     if not isinstance(loaded.policy, TaskConditionedPolicy):
-        raise ValueError(
+        raise UserError(
             f"{checkpoint} holds a policy of the type {loaded.policy.config.type!r}, which takes no "
             "demonstrations. Name one of the type deltaco or deltaco_match."
         )

@@ -26,7 +26,6 @@ from torch.utils.data import default_collate
 from tqdm import tqdm
 
 from gym_deltaco.atomic_files import write_text
-from lerobot_deltaco.arguments import CheckArguments
 from lerobot_deltaco.data.demonstrations import (
     DemonstrationBank,
     as_uint8,
@@ -38,6 +37,7 @@ from lerobot_deltaco.data.frames import memory_for_frames
 from lerobot_deltaco.data.grasps import Grasp, find_grasps, follows_gripper
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import open_folder_or_hub
+from lerobot_deltaco.pages.arguments import CheckArguments
 from lerobot_deltaco.pages.html import picture_uri, render
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.policies.base.configuration import dimension_names

@@ -14,7 +14,6 @@ from tqdm import tqdm
 from gym_deltaco.atomic_files import write_text
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
-from lerobot_deltaco.arguments import LookArguments
 from lerobot_deltaco.data.demonstrations import as_uint8, read_demonstrations, read_robot_data
 from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
@@ -24,6 +23,7 @@ from lerobot_deltaco.evaluation.video import (
     load_conditioned,
     record_episode,
 )
+from lerobot_deltaco.pages.arguments import LookArguments
 from lerobot_deltaco.pages.html import data_uri, picture_uri, render
 from lerobot_deltaco.pages.pictures import (
     MIN_SIDE,

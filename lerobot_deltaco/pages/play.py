@@ -16,7 +16,6 @@ from PIL import Image
 from gym_deltaco.layout import Layout
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import N_ROWS, TASKS, ContainerWord, get_task, select_tasks
-from lerobot_deltaco.arguments import PlayArguments
 from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.evaluation.video import (
     benchmark_env,
@@ -24,6 +23,7 @@ from lerobot_deltaco.evaluation.video import (
     load_conditioned,
     record_episode,
 )
+from lerobot_deltaco.pages.arguments import PlayArguments
 from lerobot_deltaco.pages.html import data_uri, picture_uri, render
 from lerobot_deltaco.pages.pictures import demonstration_ends, draw_found, encode_video
 from lerobot_deltaco.pages.verdict import Verdict, judge, object_name, parse_instruction

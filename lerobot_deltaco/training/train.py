@@ -30,15 +30,22 @@ from lerobot_deltaco.policies.base.optimization import keep_freed_memory
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
 
-def train() -> None:
-    """Trains as the command line says, with the arguments of `lerobot-train`."""
+def train(config: TrainPipelineConfig | None = None) -> None:
+    """Trains a policy.
+
+    Args:
+        config: Configuration of the training; None for that in the command line, as `lerobot-train` reads it.
+    """
     keep_freed_memory()
     training = _InMemoryTraining()
     with (
         patch.object(lerobot_train, "make_train_eval_datasets", training.make_datasets),
         patch.object(lerobot_train, "EpisodeAwareSampler", training.make_sampler),
     ):
-        lerobot_train.main()
+        if config is None:
+            lerobot_train.main()
+        else:
+            lerobot_train.train(config)
 
 
 class _InMemoryTraining:

@@ -10,11 +10,12 @@ import update_docs
 from example_records import make_record
 
 from gym_deltaco.tasks import TASKS, get_task
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.records import scene_columns, write_records
 from lerobot_deltaco.experiments.recipes import experiment_names
 from lerobot_deltaco.reports import metrics as statistics
 from lerobot_deltaco.reports import report
-from lerobot_deltaco.reports.leaderboard import PAPER, ReportError, collect_results, paper_row
+from lerobot_deltaco.reports.leaderboard import PAPER, collect_results, paper_row
 from lerobot_deltaco.reports.metrics import Estimate, bootstrap, paper_rate, task_rates
 from lerobot_deltaco.reports.report import escape, make_table, write_report
 
@@ -138,7 +139,7 @@ def test_what_cannot_be_compared_is_refused():
         ([make_record(versions={"benchmark": f"a-v{n}"}) for n in range(2)], "of the benchmark, a-v0, a-v1"),
         ([make_record(seed=0, step=1), make_record(seed=1, step=2)], "at no common step"),
     ]:
-        with pytest.raises(ReportError, match=message):
+        with pytest.raises(UserError, match=message):
             collect_results(records)
 
 
