@@ -12,7 +12,7 @@ MINUTES ?= 8
 
 export UV_PYTHON_DOWNLOADS := never
 
-.PHONY: help install demo play test test-slow test-browser lint docs benchmark coverage release
+.PHONY: help install demo play test test-slow test-browser lint docs results benchmark coverage release
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 20
@@ -44,6 +44,9 @@ lint: $(INSTALLED) ## Check style, types, and the files that GitHub reads
 
 docs: $(INSTALLED) ## Build the documentation, warnings being errors: docs/_build/html/index.html
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs docs/_build/html
+
+results: $(INSTALLED) ## Make tables and figures from the committed records: outputs/results/*/report.md
+	set -e; for folder in results/*/; do $(BIN)/deltaco report $$folder --out outputs/$$folder; done
 
 benchmark: $(INSTALLED) ## Measure speed: make benchmark ARGS=env, train or policy
 	$(BIN)/python benchmarks/benchmark.py $(or $(ARGS),env)

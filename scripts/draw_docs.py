@@ -29,7 +29,7 @@ from gym_deltaco.sim.fixtures import TABLE_BOXES, TRAY_BOXES, table_mesh, tray_m
 from gym_deltaco.sim.simulation import Simulation
 from gym_deltaco.sim.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 from gym_deltaco.tasks import SCENARIOS, TASK_SETS, get_task
-from lerobot_deltaco.evaluation.records import EvaluationPlan
+from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records
 from lerobot_deltaco.evaluation.video import (
     benchmark_env,
     find_demonstration,
@@ -39,6 +39,8 @@ from lerobot_deltaco.evaluation.video import (
 )
 from lerobot_deltaco.pages.pictures import demonstration_ends, draw_localization
 from lerobot_deltaco.pages.player import SHOWCASE
+from lerobot_deltaco.reports.leaderboard import collect_results
+from lerobot_deltaco.reports.report import calibration_rows, draw_calibration, make_table
 
 CHECKPOINT = Path("checkpoints/pick_place")
 # Tasks of all kinds with various containers: six names, three colors, three shapes
@@ -253,6 +255,8 @@ def main(out: Path = Path("docs/images")) -> None:
         draw_joint_control(out)
     draw_policy(out)
     draw_locations(out)
+    shipped = collect_results(read_records(Path("results/shipped")))
+    draw_calibration(make_table(shipped, calibration_rows)).savefig(out / "calibration.png")
 
 
 if __name__ == "__main__":

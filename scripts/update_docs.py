@@ -11,8 +11,9 @@ import pandas as pd
 
 from gym_deltaco.atomic_files import write_text
 from gym_deltaco.tasks import get_task
-from lerobot_deltaco.evaluation.records import read_records
-from lerobot_deltaco.reports.leaderboard import PAPER, ReportError, Result, collect_results, paper_row
+from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records
+from lerobot_deltaco.reports.leaderboard import PAPER, Result, collect_results, paper_row
 from lerobot_deltaco.reports.metrics import paired_difference
 from lerobot_deltaco.reports.report import markdown_table
 
@@ -36,12 +37,13 @@ def fill_tables(page: str, tables: Mapping[str, pd.DataFrame]) -> str:
 
 
 def leaderboard_tables() -> dict[str, pd.DataFrame]:
-    """Returns the tables of the leaderboard by section, the rows of each best first.
+    """Returns the tables of the leaderboard by section: the rows in the protocol's scenes, then the others.
 
     Raises:
-        ReportError: A file of records lacks the experiment of a row, or has it for other tasks.
+        UserError: A file of records lacks the experiment of a row, or has it for other tasks.
     """
-    sections: dict[str, list[tuple[float, dict[str, object]]]] = {}
+    protocol = str(EvaluationPlan().seed)
+    sections: dict[str, list[tuple[tuple[bool, float], dict[str, object]]]] = {}
     for row in pd.read_csv(ROOT / "results/leaderboard.csv").itertuples():
         tasks = "out_of_distribution" if row.section == "foreign" else "scenario_a_test"
         result = _find(row.records, row.experiment, {"tasks": tasks, "ambiguity": "container"})
@@ -58,9 +60,10 @@ def leaderboard_tables() -> dict[str, pd.DataFrame]:
             "training": row.data + (f"; {n_seeds} seeds" if n_seeds > 1 else ""),
             "experiment": f"`{row.experiment}` ({result.scenes})",
         }
-        sections.setdefault(row.section, []).append((result.success.value, cells))
+        rank = (result.scenes != protocol, -result.success.value)
+        sections.setdefault(row.section, []).append((rank, cells))
     return {
-        section: pd.DataFrame(cells for _, cells in sorted(rows, key=lambda item: -item[0])).dropna(
+        section: pd.DataFrame(cells for _, cells in sorted(rows, key=lambda item: item[0])).dropna(
             axis=1, how="all"
         )
         for section, rows in sections.items()
@@ -105,7 +108,7 @@ def _find(records: str, experiment: str, settings: Mapping[str, str]) -> Result:
     for result in _read(records):
         if result.experiment == experiment and settings.items() <= result.settings.items():
             return result
-    raise ReportError(f"results/{records} has no evaluation of {experiment!r} with {dict(settings)}.")
+    raise UserError(f"results/{records} has no evaluation of {experiment!r} with {dict(settings)}.")
 
 
 PAGES = {ROOT / "docs/leaderboard.md": leaderboard_tables, ROOT / "docs/paper.md": paper_tables}

@@ -3,7 +3,6 @@
 import ast
 import functools
 import importlib
-import inspect
 import re
 import shlex
 import subprocess
@@ -12,11 +11,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import tyro
 
 from gym_deltaco.tasks import OBJECTS, TASK_SETS
 from lerobot_deltaco import cli
-from lerobot_deltaco.experiments.recipes import experiments_named, read_recipe
+from lerobot_deltaco.experiments.recipes import expand_families, read_recipe
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -48,19 +46,6 @@ def commands(path):
                 words.pop(0)
             if words:
                 yield words
-
-
-def parse_deltaco(name, arguments):
-    """Parses the arguments of a subcommand, and runs nothing."""
-    kind = cli.command_arguments(name)
-    if isinstance(kind, type):
-        return vars(tyro.cli(kind, args=arguments))
-
-    @functools.wraps(kind)
-    def bind(*args, **kwargs):
-        return inspect.signature(kind).bind(*args, **kwargs).arguments
-
-    return tyro.cli(bind, args=arguments)
 
 
 LEROBOT_CONFIGURATIONS = {
@@ -113,10 +98,11 @@ def check(words, monkeypatch):
         if name == "train":
             parse_lerobot("lerobot-train", arguments, monkeypatch)
             return
-        parsed = parse_deltaco(name, arguments)
+        call = cli.parse_arguments(name, arguments)
         if name == "experiment":
-            for experiment in experiments_named(parsed["names"]):
-                read_recipe(experiment, parsed.get("scale", "small"), parsed.get("settings", ()))
+            parsed = call.keywords
+            for experiment in expand_families(parsed["names"]):
+                read_recipe(experiment, parsed["scale"], parsed["settings"])
     elif command in LEROBOT_CONFIGURATIONS and arguments != ["--help"]:
         parse_lerobot(command, arguments, monkeypatch)
     elif command == "make":

@@ -12,11 +12,11 @@ from small_policies import as_options, run_training
 
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import get_task
-from lerobot_deltaco.arguments import EvaluateArguments
 from lerobot_deltaco.collection.collect import CollectionPlan, collect
 from lerobot_deltaco.data.images import as_uint8
 from lerobot_deltaco.evaluation.checkpoints import find_checkpoints, load_policy
-from lerobot_deltaco.evaluation.evaluate import evaluate, evaluate_checkpoints
+from lerobot_deltaco.evaluation.command import EvaluateArguments, evaluate_checkpoints
+from lerobot_deltaco.evaluation.evaluate import evaluate
 from lerobot_deltaco.evaluation.protocol_env import ProtocolEnv
 from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records
 

@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import os
 import signal
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -39,6 +37,8 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.sim.simulation import check_simulator
 from gym_deltaco.tasks import HELD_OUT, get_task, select_tasks
 from lerobot_deltaco.collection import writer as dataset_writer
+from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.processes import end_with_parent
 
 Split = Literal["train", "validation"]
 
@@ -49,7 +49,7 @@ MAX_ATTEMPTS = 100
 PRIVILEGED = ("benchmark.task_id", "benchmark.target_object", "benchmark.target_container", "benchmark.seed")
 
 
-class CollectionError(RuntimeError):
+class CollectionError(UserError):
     """Raised when a collection cannot start or continue; the message says what to do."""
 
 
@@ -306,15 +306,7 @@ def _run(root: Path, plan: CollectionPlan, shards: Sequence[int], workers: int) 
 def _start_worker() -> None:
     # An interrupt in the terminal reaches all processes, and ends this one immediately.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-
-
-def _exit_with_parent() -> None:
-    """Ends this process when the main one ends or is killed; otherwise, it would wait for work forever."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
+    end_with_parent()
 
 
 def _collect_shard(root: Path, plan: CollectionPlan, shard: int) -> int:

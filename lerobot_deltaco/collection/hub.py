@@ -16,9 +16,10 @@ from huggingface_hub.errors import HFValidationError, RevisionNotFoundError
 from lerobot_deltaco.collection.collect import CollectionPlan, collect
 from lerobot_deltaco.collection.dataset_card import write_dataset_card
 from lerobot_deltaco.collection.writer import CODEBASE_VERSION
+from lerobot_deltaco.errors import UserError
 
 
-class HubError(RuntimeError):
+class HubError(UserError):
     """Raised when something cannot be published; the message says why, and what to do."""
 
 

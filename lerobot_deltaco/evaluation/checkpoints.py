@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gym_deltaco.atomic_files import read_json
 from gym_deltaco.control import control_of
+from lerobot_deltaco.errors import UserError
 
 if TYPE_CHECKING:
     from lerobot.policies import PreTrainedPolicy
@@ -56,7 +57,7 @@ def find_checkpoints(path: Path) -> list[Checkpoint]:
         path: Output folder of a training run, or folder of a policy.
 
     Raises:
-        ValueError: There are none, or one is damaged.
+        UserError: There are none, or one is damaged.
     """
     if (path / WEIGHTS).is_file() and (path / CONFIG).is_file():
         return [_read_checkpoint(path)]
@@ -69,7 +70,7 @@ def find_checkpoints(path: Path) -> list[Checkpoint]:
         if not last.isdecimal() or int(folder.name) <= int(last)
     ]
     if not found:
-        raise ValueError(
+        raise UserError(
             f"{path} has no checkpoints. Name the `--output_dir` of a training run, or a policy's folder "
             f"({CONFIG}, {WEIGHTS})."
         )
@@ -94,7 +95,7 @@ def _read_checkpoint(folder: Path) -> Checkpoint:
             control_of(images),
         )
     except (OSError, ValueError, KeyError, StopIteration, TypeError, AttributeError) as error:
-        raise ValueError(f"The configuration of the policy in {folder} cannot be read: {error!r}.") from error
+        raise UserError(f"The configuration of the policy in {folder} cannot be read: {error!r}.") from error
 
 
 def _step(folder: Path) -> int:
@@ -134,7 +135,7 @@ def load_policy(
             names; None for those used in training.
 
     Raises:
-        ValueError: The overrides do not fit the policy, or packages that its type needs are missing.
+        UserError: The overrides do not fit the policy, or packages that its type needs are missing.
     """
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies import get_policy_class, make_pre_post_processors
@@ -152,7 +153,7 @@ def load_policy(
         # If it has processor steps of its own, they are registered there.
         importlib.import_module(type(config).__module__.replace("configuration_", "processor_"))
     except ImportError as error:
-        raise ValueError(
+        raise UserError(
             f"{folder} holds a policy of the type {config.type!r}, whose packages are missing: {error}."
         ) from error
     policy = policy_class.from_pretrained(folder, config=config)

@@ -13,11 +13,12 @@ from gym_deltaco.paraphrases import choose_instructions
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import Task, get_task
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.expert_demonstrations import ExpertBank
 from lerobot_deltaco.evaluation.records import EvaluationPlan
 
 
-class Episode(NamedTuple):
+class EpisodeSpec(NamedTuple):
     """An episode before it is run.
 
     Attributes:
@@ -35,7 +36,9 @@ class Episode(NamedTuple):
     demonstration_task: int
 
 
-def draw_episodes(plan: EvaluationPlan, bank: DemonstrationBank | ExpertBank | None = None) -> list[Episode]:
+def draw_episodes(
+    plan: EvaluationPlan, bank: DemonstrationBank | ExpertBank | None = None
+) -> list[EpisodeSpec]:
     """Draws the episodes of an evaluation: the first trial of each task, then the second ones, and so on.
 
     Args:
@@ -43,7 +46,7 @@ def draw_episodes(plan: EvaluationPlan, bank: DemonstrationBank | ExpertBank | N
         bank: Demonstrations that the policy receives; None if it takes none.
 
     Raises:
-        ValueError: There is no other task for a counterfactual demonstration or instruction.
+        UserError: There is no other task for a counterfactual demonstration or instruction.
     """
     tasks = [get_task(task_id) for task_id in plan.task_ids]
     sentences = choose_instructions(plan.task_ids, plan.paraphrases, plan.paraphrases_split, plan.instruction)
@@ -66,7 +69,7 @@ def draw_episodes(plan: EvaluationPlan, bank: DemonstrationBank | ExpertBank | N
                 instruction = ""
             elif plan.without == "demonstration":
                 shown = -1
-            episodes.append(Episode(task.index, trial, seed, instruction, shown))
+            episodes.append(EpisodeSpec(task.index, trial, seed, instruction, shown))
     return episodes
 
 
@@ -78,7 +81,7 @@ def _counterfactual_task(candidates: Sequence[Task], scene: SceneConfig, task: T
     """
     others = [other for other in candidates if other.index != task.index]
     if not others:
-        raise ValueError(
+        raise UserError(
             "A counterfactual evaluation needs at least two tasks that the policy can perform. Evaluate more "
             "tasks, and give demonstrations of them."
         )

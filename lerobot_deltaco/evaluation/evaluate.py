@@ -2,74 +2,43 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import math
 import multiprocessing
-import shlex
 import signal
-import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
-import draccus
 import numpy as np
 import pandas as pd
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.envs.utils import preprocess_observation
-from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.random_utils import seeded_context
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from gym_deltaco import ENV_ID
-from gym_deltaco.atomic_files import parse_json
 from gym_deltaco.env import N_JOINTS, PickPlaceEnv
-from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import get_task
-from lerobot_deltaco.arguments import EvaluateArguments
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
-from lerobot_deltaco.evaluation.checkpoints import (
-    OWN_TYPES,
-    Checkpoint,
-    LoadedPolicy,
-    find_checkpoints,
-    load_policy,
-)
-from lerobot_deltaco.evaluation.episodes import Episode, draw_episodes
+from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
+from lerobot_deltaco.evaluation.episodes import EpisodeSpec, draw_episodes
 from lerobot_deltaco.evaluation.expert_demonstrations import ExpertBank
-from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord, read_records, write_records
+from lerobot_deltaco.evaluation.records import EvaluationPlan
 from lerobot_deltaco.lerobot_env import check_policy_fits
-from lerobot_deltaco.policies.base.configuration import SOURCES
 from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
+from lerobot_deltaco.processes import end_with_parent
 
 # Most episodes that run at the same time. A policy's step costs little more for 8 than for 2, and each
 # episode needs a simulator of 50 MB, in each process.
 _MAX_BATCH = 8
 # Processes share batches, so small evaluations need several, too.
 _MIN_BATCHES = 4
-_PACKAGES = ("lerobot_policy_deltaco", "lerobot", "torch", "gymnasium", "numpy", "pybullet")
-# Options of a policy that come from the training data, or say where they were.
-_NOT_RECORDED = (
-    "input_features",
-    "output_features",
-    "one_hot_tasks",
-    "known_words",
-    "gripper_range",
-    "demo_episodes",
-    *SOURCES,
-)
-
 
 # Called after the reset and after each step with the environments of a batch and their observations.
 StepCallback = Callable[[Sequence[PickPlaceEnv], Sequence[Mapping[str, NDArray]]], None]
@@ -86,7 +55,7 @@ class Evaluation:
         batches: The episodes, in batches that run at the same time.
 
     Raises:
-        ValueError: The policy is not one for the benchmark, or the plan is not one for this policy.
+        UserError: The policy is not one for the benchmark, or the plan is not one for this policy.
     """
 
     def __init__(self, loaded: LoadedPolicy, plan: EvaluationPlan) -> None:
@@ -145,7 +114,7 @@ class Evaluation:
         for env in self._envs:
             env.close()
 
-    def _demonstrations(self, episode: Episode) -> list[Demonstration]:
+    def _demonstrations(self, episode: EpisodeSpec) -> list[Demonstration]:
         """Returns the demonstrations of an episode; the trials of a task use its demonstrations in turn."""
         if self._bank is None or episode.demonstration_task < 0:
             return []
@@ -156,14 +125,14 @@ class Evaluation:
         known = self._bank.of_task(task.instruction, task.object.index)
         n_each = self.plan.n_demonstrations
         if len(known) < n_each:
-            raise ValueError(
+            raise UserError(
                 f"`n_demonstrations` is {n_each}, but the task {task.instruction!r} has {len(known)}. "
                 "Collect more and name them with --demo-repo-id and --demo-root."
             )
         return [known[(episode.trial * n_each + n) % len(known)] for n in range(n_each)]
 
     @contextmanager
-    def _computing(self, batch: Sequence[Episode]) -> Iterator[None]:
+    def _computing(self, batch: Sequence[EpisodeSpec]) -> Iterator[None]:
         config = self.loaded.policy.config
         n_threads = torch.get_num_threads()
         with ExitStack() as stack:
@@ -184,7 +153,7 @@ class Evaluation:
 def run_episodes(
     loaded: LoadedPolicy,
     envs: Sequence[PickPlaceEnv],
-    episodes: Sequence[Episode],
+    episodes: Sequence[EpisodeSpec],
     demonstrations: Sequence[Sequence[Demonstration]],
     callback: StepCallback | None = None,
     joint_noise: float = 0.0,
@@ -251,8 +220,8 @@ def evaluate(loaded: LoadedPolicy, plan: EvaluationPlan, processes: int = 1) -> 
         not depend on the number of processes.
 
     Raises:
-        ValueError: A task has no demonstration, or the policy is not one for the benchmark.
-        RuntimeError: A process ended unexpectedly.
+        UserError: A task has no demonstration, the policy is not one for the benchmark, or a process ended
+            unexpectedly.
     """
     disable_malloc_trim()
     evaluation = Evaluation(loaded, plan)
@@ -284,7 +253,7 @@ def _run_batches(evaluation: Evaluation, processes: int) -> Iterator[list[dict[s
         for future in as_completed(running):
             yield future.result()
     except BrokenProcessPool:
-        raise RuntimeError(
+        raise UserError(
             "A process of the evaluation ended unexpectedly; the memory may be full. Run the command again "
             "with fewer --processes."
         ) from None
@@ -299,6 +268,7 @@ def _start_process(evaluation: Evaluation) -> None:
     global _evaluation
     # Interrupts are left to the main process, which lets the running batches finish.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     _evaluation = evaluation
 
 
@@ -311,131 +281,22 @@ def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | ExpertBa
     """Returns the demonstrations that a policy receives: its own, or the expert's; None if it takes none.
 
     Raises:
-        ValueError: The plan asks for demonstrations that the policy does not take or have.
+        UserError: The plan asks for demonstrations that the policy does not take or have.
     """
     if not hasattr(policy, "set_tasks") or not getattr(policy.config, "uses_demonstrations", True):
         if plan.counterfactual == "demonstration" or plan.without == "demonstration":
-            raise ValueError("This policy takes no demonstrations: none can be replaced or left out.")
+            raise UserError("This policy takes no demonstrations: none can be replaced or left out.")
         return None
     is_ours = isinstance(policy, TaskConditionedPolicy)
     bank = policy.demonstrations if is_ours else ExpertBank(plan.task_ids, plan.scene)
     if bank is None:
         if plan.without == "demonstration":
             return None
-        raise ValueError(
+        raise UserError(
             "The policy has no demonstrations. Name a dataset of them with --demo-repo-id and --demo-root."
         )
     if plan.n_demonstrations > 1 and not hasattr(policy.config, "n_demonstrations"):
-        raise ValueError(
+        raise UserError(
             f"`n_demonstrations` is {plan.n_demonstrations}, but this policy does not combine any."
         )
     return bank
-
-
-def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
-    """Evaluates a policy, or the checkpoints of a training run, that have no record of the plan yet.
-
-    Returns:
-        A line for each checkpoint, with its success rate.
-
-    Raises:
-        ValueError: There is no such checkpoint, a record is of another policy, or the plan does not fit.
-    """
-    path, plan = arguments.checkpoint, arguments.plan
-    rename_map = None
-    if arguments.rename_map is not None:
-        rename_map = parse_json(arguments.rename_map, "--rename-map")
-    found = find_checkpoints(path)
-    is_run = (path / "checkpoints").is_dir()
-    folder = arguments.out or (path if is_run else Path("outputs/evaluate") / path.resolve().name)
-    given = {name: getattr(arguments, name) for name in ("device", "demo_repo_id", "demo_root")}
-    overrides = [f"--{name}={value}" for name, value in given.items() if value is not None]
-    demonstrations = digest = None
-    if arguments.demo_repo_id is not None:
-        digest = metadata_digest(arguments.demo_repo_id, arguments.demo_root)
-        demonstrations = (arguments.demo_repo_id, digest)
-    lines = []
-    for checkpoint in _chosen(found, arguments.steps):
-        if demonstrations is not None and checkpoint.policy_type not in OWN_TYPES:
-            raise ValueError(
-                f"--demo-repo-id is for {' and '.join(OWN_TYPES)}. A policy of another type, such as "
-                f"{checkpoint.policy_type}, gets the expert's demonstrations without it."
-            )
-        fitted = replace(plan, scene=_fitted(plan.scene, checkpoint))
-        file = folder / "evaluations" / _record_name(checkpoint, fitted, demonstrations)
-        if file.exists():
-            (record,) = read_records(file)
-            if record.weights != checkpoint.weights_digest:
-                raise ValueError(
-                    f"{file} is the record of another policy: its weights are not those of "
-                    f"{checkpoint.folder}. Name another folder with --out, or move that record away."
-                )
-        else:
-            loaded = load_policy(checkpoint.folder, overrides, rename_map)
-            config, start = loaded.policy.config, time.monotonic()
-            episodes = evaluate(loaded, fitted, arguments.processes if config.device == "cpu" else 1)
-            options = draccus.encode(config, PreTrainedConfig)
-            record = EvaluationRecord(
-                experiment=arguments.experiment or checkpoint.experiment,
-                policy_type=config.type,
-                train_seed=checkpoint.seed,
-                step=checkpoint.step,
-                plan=fitted,
-                wording=fitted.wording,
-                policy={name: value for name, value in options.items() if name not in _NOT_RECORDED},
-                versions={"benchmark": ENV_ID, **{name: version(name) for name in _PACKAGES}},
-                command=shlex.join(["deltaco", *sys.argv[1:]]),
-                seconds=time.monotonic() - start,
-                weights=checkpoint.weights_digest,
-                demonstrations=arguments.demo_repo_id,
-                demonstrations_digest=digest,
-                episodes=episodes,
-            )
-            write_records(file, [record])
-        lines.append(
-            f"{checkpoint.folder}, step {record.step}: {record.success_rate:.1%} of {len(record.episodes)} "
-            f"episodes of {record.plan.tasks} succeeded. Record: {file}"
-        )
-    return "\n".join(lines)
-
-
-def _chosen(found: Sequence[Checkpoint], steps: str) -> Sequence[Checkpoint]:
-    """Returns the checkpoints that `steps` selects.
-
-    Raises:
-        ValueError: There is no checkpoint of a step.
-    """
-    if steps in ("all", "last"):
-        return found if steps == "all" else found[-1:]
-    available = {str(checkpoint.step): checkpoint for checkpoint in found}
-    for step in steps.split(","):
-        if step not in available:
-            raise ValueError(
-                f"There is no checkpoint of step {step!r}. Valid are all, last and {', '.join(available)}."
-            )
-    return [available[step] for step in steps.split(",")]
-
-
-def _fitted(scene: SceneConfig, checkpoint: Checkpoint) -> SceneConfig:
-    """Returns settings with the control and image size of a policy's training, unless others are set."""
-    if scene.control == SceneConfig.control:
-        scene = replace(scene, control=checkpoint.control or scene.control)
-    if scene.image_size == SceneConfig.image_size:
-        scene = replace(scene, image_size=checkpoint.image_size)
-    return scene
-
-
-def _record_name(checkpoint: Checkpoint, plan: EvaluationPlan, demonstrations: tuple[str, str] | None) -> str:
-    """Returns the file name of a record: the step, and a digest of the evaluation's other settings."""
-    digest = hashlib.sha256(repr((plan, demonstrations)).encode()).hexdigest()[:8]
-    return f"{checkpoint.step:07d}_{digest}.parquet"
-
-
-def metadata_digest(repo_id: str, root: Path | None) -> str:
-    """Returns the SHA-256 of a dataset's metadata, which hold the statistics of all its frames."""
-    folder = root if root is not None else HF_LEROBOT_HOME / repo_id
-    digest = hashlib.sha256()
-    for path in sorted(path for path in (folder / "meta").rglob("*") if path.is_file()):
-        digest.update(path.relative_to(folder).as_posix().encode() + b"\0")
-        digest.update(path.read_bytes())
-    return digest.hexdigest()

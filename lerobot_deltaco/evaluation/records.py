@@ -27,6 +27,7 @@ from gym_deltaco.paraphrases import GRAMMAR
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
+from lerobot_deltaco.errors import UserError
 
 SCHEMA = pa.schema(
     {
@@ -49,10 +50,6 @@ TEMPLATES = "templates"
 _KEY = b"deltaco"
 
 Counterfactual = Literal["none", "demonstration", "instruction"]
-
-
-class RecordError(ValueError):
-    """Raised when a file holds no valid records; the message says what is wrong with it."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ class EvaluationPlan:
         joint_noise: Standard deviation of the noise on each joint angle that the policy observes, degrees.
 
     Raises:
-        ValueError: An argument is invalid; the message says what is valid.
+        UserError: An argument is invalid; the message says what is valid.
     """
 
     tasks: str = "scenario_a_test"
@@ -101,13 +98,13 @@ class EvaluationPlan:
         for name, least in leasts.items():
             number = getattr(self, name)
             if number is not None and number < least:
-                raise ValueError(f"`{name}` must be at least {least}. Got {number}.")
+                raise UserError(f"`{name}` must be at least {least}. Got {number}.")
         valid = get_args(Counterfactual)
         for name in ("counterfactual", "without"):
             if getattr(self, name) not in valid:
-                raise ValueError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
+                raise UserError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
         if self.wording != TEMPLATES and "instruction" in (self.counterfactual, self.without):
-            raise ValueError(
+            raise UserError(
                 "An instruction that is replaced or left out is not a paraphrase: leave out `paraphrases` "
                 "and `instruction`."
             )
@@ -183,7 +180,7 @@ def write_records(path: Path, records: Sequence[EvaluationRecord]) -> None:
     """Writes evaluations into one file, whole or not at all.
 
     Raises:
-        RecordError: The rows of an evaluation contradict each other.
+        UserError: The rows of an evaluation contradict each other.
     """
     for record in records:
         _check(record, path)
@@ -205,7 +202,7 @@ def read_records(*paths: Path) -> list[EvaluationRecord]:
         paths: Files, or folders that are searched for files.
 
     Raises:
-        RecordError: A path has no records, or a file is not one of records.
+        UserError: A path has no records, or a file is not one of records.
     """
     records = []
     for path in paths:
@@ -218,7 +215,7 @@ def read_records(*paths: Path) -> list[EvaluationRecord]:
             for record in _read(file)
         ]
         if not found:
-            raise RecordError(f"{path} has no records of evaluations. `deltaco evaluate` writes them.")
+            raise UserError(f"{path} has no records of evaluations. `deltaco evaluate` writes them.")
         records += found
     return records
 
@@ -235,7 +232,7 @@ def _read(path: Path) -> list[EvaluationRecord]:
             episodes = rows[rows["evaluation"] == n].drop(columns="evaluation").reset_index(drop=True)
             records.append(EvaluationRecord(plan=EvaluationPlan(**plan), episodes=episodes, **header))
     except (OSError, KeyError, TypeError, ValueError, RecursionError, pa.ArrowException) as error:
-        raise RecordError(f"{path} is not a file of evaluation records: {error}") from error
+        raise UserError(f"{path} is not a file of evaluation records: {error}") from error
     for record in records:
         _check(record, path)
     return records
@@ -245,7 +242,7 @@ def _check(record: EvaluationRecord, path: Path) -> None:
     """Checks that the rows of an evaluation contradict neither each other nor its plan.
 
     Raises:
-        RecordError: They contradict each other.
+        UserError: They contradict each other.
     """
     rows, task_ids, trials = record.episodes, record.plan.task_ids, record.plan.trials
     conditions = {
@@ -260,7 +257,7 @@ def _check(record: EvaluationRecord, path: Path) -> None:
     }
     for name, holds in conditions.items():
         if not np.all(holds):
-            raise RecordError(f"{path} contradicts itself: {record.experiment!r} must have {name}.")
+            raise UserError(f"{path} contradicts itself: {record.experiment!r} must have {name}.")
 
 
 def scene_columns(record: EvaluationRecord) -> pd.DataFrame:

@@ -20,8 +20,9 @@ from gym_deltaco.sim.workspace import CAMERA
 from gym_deltaco.tasks import Task
 from lerobot_deltaco.data.demonstrations import Demonstration, kept_frames
 from lerobot_deltaco.data.images import resize_images
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy, find_checkpoints, load_policy
-from lerobot_deltaco.evaluation.episodes import Episode
+from lerobot_deltaco.evaluation.episodes import EpisodeSpec
 from lerobot_deltaco.evaluation.evaluate import run_episodes
 from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
 from lerobot_deltaco.lerobot_env import check_policy_fits
@@ -78,7 +79,7 @@ def record_episode(
         positions.append([env.scene.object_pose(n).position for n in numbers])
         placements.update((n, env.scene.container_of(n)) for n in numbers)
 
-    episode = Episode(task_id, 0, seed, instruction, task_id if demonstrations else -1)
+    episode = EpisodeSpec(task_id, 0, seed, instruction, task_id if demonstrations else -1)
     with torch.inference_mode():
         (info,) = run_episodes(loaded, [env], [episode], [demonstrations], record)
     return Recording(
@@ -137,7 +138,7 @@ def benchmark_env(config: Any, render_size: int) -> PickPlaceEnv:
         render_size: Height and width of the frames of recordings, px.
 
     Raises:
-        ValueError: The policy is not one for the benchmark.
+        UserError: The policy is not one for the benchmark.
     """
     sizes = [feature.shape[-1] for feature in config.image_features.values()]
     control = control_of(config.image_features) or SceneConfig.control
@@ -154,14 +155,14 @@ def load_conditioned(checkpoint: str | Path) -> LoadedPolicy:
             repository on the Hugging Face Hub.
 
     Raises:
-        ValueError: There is no checkpoint, or its policy is of another kind.
+        UserError: There is no checkpoint, or its policy is of another kind.
     """
     folder = Path(checkpoint)
     if folder.exists() or len(folder.parts) != 2:
         folder = find_checkpoints(folder)[-1].folder
     loaded = load_policy(folder)
     if not isinstance(loaded.policy, TaskConditionedPolicy):
-        raise ValueError(
+        raise UserError(
             f"{checkpoint} holds a policy of the type {loaded.policy.config.type!r}, which takes no "
             "demonstrations. Name one of the type deltaco or deltaco_match."
         )

@@ -1,6 +1,6 @@
 """Recipes of experiments: the rows of the paper's tables and the project's own.
 
-A recipe in `experiments.yaml` is parsed into the plans and options of the steps of an experiment, so that
+A recipe in `experiments.yaml` is read into the plans and options of the steps of an experiment, so that
 mistakes are found before anything is collected.
 """
 
@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, make_dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import draccus
 import yaml
 
+from gym_deltaco.atomic_files import read_json
 from lerobot_deltaco.collection.collect import CollectionPlan
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.records import EvaluationPlan
-from lerobot_deltaco.policy_options import read_options
+
+if TYPE_CHECKING:
+    from lerobot.configs import PreTrainedConfig
 
 Scale = Literal["small", "paper"]
 
@@ -26,10 +30,6 @@ SCALES: tuple[Scale, ...] = ("small", "paper")
 RECIPES = Path(__file__).with_name("experiments.yaml")
 SHARED = "shared"  # settings of all rows of a family
 SECTIONS = ("data", "demonstrations", "policy", "training", "evaluation")
-
-
-class ExperimentError(RuntimeError):
-    """Raised when an experiment cannot start or continue; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,9 @@ class TrainingOptions:
         steps: Number of training steps.
         save_freq: Steps between two checkpoints, all of which are evaluated.
         log_freq: Steps between two lines of the log.
+
+    Raises:
+        UserError: A number is less than 1.
     """
 
     batch_size: int
@@ -50,7 +53,7 @@ class TrainingOptions:
 
     def __post_init__(self) -> None:
         if min(asdict(self).values()) < 1:
-            raise ValueError(f"All numbers must be at least 1. Got {asdict(self)}.")
+            raise UserError(f"All numbers must be at least 1. Got {asdict(self)}.")
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class Recipe:
         scale: Amount of data and training.
         data: Training data.
         demonstrations: Collection of demonstrations of the test tasks.
-        policy: Options of `--policy`, with its type.
+        policy: Type of the policy, and those of its options that are not defaults.
         training: Options of the training loop.
         evaluation: Evaluation of every checkpoint.
         start_from: Experiment whose best seed is fine-tuned; None to train from scratch.
@@ -84,11 +87,11 @@ def experiment_names(path: Path = RECIPES) -> list[str]:
     return [f"{family}/{row}" for family, rows in families.items() for row in rows if row != SHARED]
 
 
-def experiments_named(names: Sequence[str]) -> list[str]:
-    """Returns the experiments that are meant by names of experiments and of families."""
+def expand_families(names: Sequence[str]) -> list[str]:
+    """Returns names of experiments, with those of its experiments in place of a family's."""
     every = experiment_names()
-    meant = ([each for each in every if each.startswith(f"{name}/")] or [name] for name in names)
-    return list(dict.fromkeys(itertools.chain.from_iterable(meant)))
+    expanded = ([each for each in every if each.startswith(f"{name}/")] or [name] for name in names)
+    return list(dict.fromkeys(itertools.chain.from_iterable(expanded)))
 
 
 def read_recipe(
@@ -104,11 +107,11 @@ def read_recipe(
         path: File with recipes.
 
     Raises:
-        ExperimentError: There is no such experiment, or the file or a setting is invalid.
+        UserError: There is no such experiment, or the file or a setting is invalid.
     """
     content, names = _read_file(path), experiment_names(path)
     if name not in names:
-        raise ExperimentError(f"There is no experiment {name!r}. Valid are {', '.join(names)}.")
+        raise UserError(f"There is no experiment {name!r}. Valid are {', '.join(names)}.")
     family, row = name.split("/")
     rows = content["families"][family]
     layers = [rows.get(SHARED, {}), rows[row], *map(_read_setting, settings)]
@@ -117,21 +120,55 @@ def read_recipe(
     policy_type = _merged({}, *layers, scale=scale).get("policy", {}).get("type", "deltaco")
     scales = content["scales"].get(policy_type, {})
     if scale not in scales:
-        known = "; ".join(f"{kind}: {', '.join(there)}" for kind, there in content["scales"].items())
-        raise ExperimentError(
-            f"{name} trains the policy {policy_type!r}, which has no scale {scale!r}. Valid are {known}."
+        valid = "; ".join(f"{kind}: {', '.join(there)}" for kind, there in content["scales"].items())
+        raise UserError(
+            f"{name} trains the policy {policy_type!r}, which has no scale {scale!r}. Valid are {valid}."
         )
     merged = _merged(scales[scale], {"policy": {"type": policy_type}}, *layers, scale=scale)
     start_from = merged.get("start_from")
     if start_from is not None and start_from not in names:
-        raise ExperimentError(f"{name} starts from {start_from!r}, which is not an experiment.")
-    kinds = (CollectionPlan, CollectionPlan, _policy_class(policy_type), TrainingOptions, EvaluationPlan)
-    parsed = {
-        section: _parse(kind, merged.get(section, {}), f"{section} of {name}")
-        for section, kind in zip(SECTIONS, kinds, strict=True)
+        raise UserError(f"{name} starts from {start_from!r}, which is not an experiment.")
+    # Null stands for a default.
+    sections = {
+        section: {option: value for option, value in merged.get(section, {}).items() if value is not None}
+        for section in SECTIONS
     }
-    given = {option: value for option, value in asdict(parsed["policy"]).items() if value is not None}
-    return Recipe(name, scale, start_from=start_from, **{**parsed, "policy": given})
+    make_policy_config(sections["policy"], where=f"policy of {name}")  # or an error
+    kinds = {
+        "data": CollectionPlan,
+        "demonstrations": CollectionPlan,
+        "training": TrainingOptions,
+        "evaluation": EvaluationPlan,
+    }
+    plans = {
+        section: _decode(kind, sections[section], f"{section} of {name}") for section, kind in kinds.items()
+    }
+    return Recipe(name, scale, policy=sections["policy"], start_from=start_from, **plans)
+
+
+def make_policy_config(
+    options: Mapping[str, Any], start: Path | None = None, where: str = "policy"
+) -> PreTrainedConfig:
+    """Returns the configuration of a policy.
+
+    Args:
+        options: Its type, and the options that are not defaults.
+        start: Folder of the policy that training starts from, whose options are the defaults.
+        where: Name of the options in errors.
+
+    Raises:
+        UserError: An option is invalid; the message says what is valid.
+    """
+    from lerobot.configs import PreTrainedConfig  # slow
+
+    import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
+
+    if start is not None:
+        options = {**read_json(start / "config.json"), **options}
+    kind = PreTrainedConfig.get_choice_class(options["type"])
+    config = _decode(kind, {name: value for name, value in options.items() if name != "type"}, where)
+    config.pretrained_path = start
+    return config
 
 
 @cache
@@ -142,13 +179,11 @@ def _read_file(path: Path) -> dict[str, Any]:
 def _read_setting(setting: str) -> dict[str, Any]:
     key, equals, value = setting.partition("=")
     if not equals:
-        raise ExperimentError(
-            f"A setting is SECTION.NAME=VALUE, such as training.steps=2000. Got {setting!r}."
-        )
+        raise UserError(f"A setting is SECTION.NAME=VALUE, such as training.steps=2000. Got {setting!r}.")
     try:
         nested = yaml.safe_load(value)
     except yaml.YAMLError as error:
-        raise ExperimentError(f"Cannot read the value of {setting!r}: {error}") from None
+        raise UserError(f"Cannot read the value of {setting!r}: {error}") from None
     for name in reversed(key.split(".")):
         nested = {name: nested}
     return nested
@@ -159,7 +194,7 @@ def _check_layer(layer: Any, name: str) -> None:
     for section, value in layer.items() if isinstance(layer, dict) else [("", layer)]:
         is_valid = isinstance(value, dict) if section in SECTIONS else section == "start_from"
         if not is_valid:
-            raise ExperimentError(
+            raise UserError(
                 f"{name} must have the mappings {', '.join(SECTIONS)}, or `start_from`. Got "
                 f"{section!r}: {value!r}."
             )
@@ -180,11 +215,10 @@ def _merged(*layers: dict[str, Any], scale: str) -> dict[str, Any]:
     return merged
 
 
-def _parse(kind: Any, settings: dict[str, Any], where: str) -> Any:
-    """Makes a dataclass of settings; null stands for a default."""
-    settings = {name: value for name, value in settings.items() if value is not None}
+def _decode(kind: Any, settings: Mapping[str, Any], where: str) -> Any:
+    """Makes a dataclass of settings."""
     try:
-        parsed = draccus.decode(kind, settings)
+        return draccus.decode(kind, dict(settings))
     except draccus.utils.ParsingError as error:
         reason: BaseException = error
         # An error of the dataclass itself, or of one within it
@@ -192,29 +226,4 @@ def _parse(kind: Any, settings: dict[str, Any], where: str) -> Any:
             reason = reason.__cause__
         is_of_names = isinstance(error, draccus.utils.DecodingError) and not error.key_path
         valid = f". Valid are {', '.join(field.name for field in fields(kind))}." if is_of_names else ""
-        raise ExperimentError(f"{where}: {reason}{valid}") from None
-    for name, value in settings.items():
-        # draccus takes true for 1, and anything for a text.
-        found = getattr(parsed, name)
-        is_other = isinstance(value, bool | list | dict | float) and found is not value
-        if isinstance(found, str | int) and is_other:
-            raise ExperimentError(f"{where}: `{name}` must be {type(found).__name__}. Got {value!r}.")
-    return parsed
-
-
-@cache
-def _policy_class(policy_type: str) -> Any:
-    """Returns a dataclass of a policy's options, all of which default to None."""
-    # LeRobot's own options that recipes use
-    types = {"type": "str", "device": "str"}
-    for options in (read_options("both"), read_options(policy_type)):
-        types |= {name: option.type for name, option in options.items()}
-    return make_dataclass(policy_type, [(name, _resolve(kind), None) for name, kind in types.items()])
-
-
-def _resolve(annotation: str) -> Any:
-    """Returns the type that an annotation names; Any where it needs an import."""
-    try:
-        return eval(f"{annotation} | None", {})
-    except (NameError, TypeError):
-        return Any
+        raise UserError(f"{where}: {reason}{valid}") from None

@@ -2,41 +2,68 @@
 
     recipe -> collect -> train -> evaluate -> report
 
-Each step is a `deltaco` command. Finished steps are skipped, so the same command continues after an
-interruption.
+Finished steps are skipped, so the same command continues after an interruption.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
-import shlex
 import shutil
-import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, fields, is_dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from gym_deltaco.atomic_files import read_json, write_json
-from lerobot_deltaco.arguments import EvaluateArguments
-from lerobot_deltaco.collection.collect import CollectionPlan, is_finished
+from lerobot_deltaco.collection.collect import CollectionPlan, collect, is_finished
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import find_checkpoints
+from lerobot_deltaco.evaluation.command import EvaluateArguments, evaluate_checkpoints
 from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord, read_records
 from lerobot_deltaco.experiments.recipes import (
-    ExperimentError,
     Recipe,
     Scale,
+    expand_families,
     experiment_names,
-    experiments_named,
+    make_policy_config,
     read_recipe,
 )
+from lerobot_deltaco.processes import call_in_new_process
+from lerobot_deltaco.reports.report import write_report
+
+if TYPE_CHECKING:
+    from lerobot.configs.train import TrainPipelineConfig
 
 
-class Run:
+@dataclass(frozen=True)
+class Step:
+    """A step of an experiment.
+
+    Attributes:
+        name: "collect", "train" or "evaluate".
+        description: What it does, and where, in a line.
+        call: Function that does it, and returns what to print.
+    """
+
+    name: str
+    description: str
+    call: Callable[[], str | None]
+
+    def run(self) -> None:
+        """Prints the description, runs the step and prints its result."""
+        sys.stdout.write(f"\n{self.description}\n")
+        sys.stdout.flush()
+        if result := self.call():
+            sys.stdout.write(f"{result}\n")
+
+
+class TrainingRun:
     """A recipe with a seed, in a folder for the outputs of experiments.
 
     Args:
@@ -57,52 +84,36 @@ class Run:
 
     def dataset(self, plan: CollectionPlan) -> Path:
         """Returns the folder of a dataset, named after its plan."""
-        name = "_".join(f"{key.rpartition('.')[2]}-{value}" for key, value in plan_options(plan))
+        name = "_".join(f"{key.rpartition('.')[2]}-{value}" for key, value in _settings_of(plan))
         return self.out / "data" / re.sub(r"[^\w.,-]", "-", name)
 
-    def commands(self) -> Iterator[list[str]]:
-        """Yields the commands that are still to be run, as arguments of `deltaco`.
+    def steps(self) -> Iterator[Step]:
+        """Yields the steps that are still to be run.
 
         Raises:
-            ExperimentError: The experiment that this one starts from was not trained and evaluated.
+            UserError: The experiment that this one starts from was not trained and evaluated.
         """
+        workers = len(os.sched_getaffinity(0))
         for plan in dict.fromkeys((self.recipe.data, self.recipe.demonstrations)):
-            if not is_finished(self.dataset(plan)):
-                yield ["collect", *_flags(plan), "--root", str(self.dataset(plan))]
-        step = last_step(self.folder)
-        trains = step < self.recipe.training.steps
-        if trains:
-            yield self._resume_command() if step else self._train_command()
-        if trains or self.unevaluated_steps():
-            yield self.evaluate_command()
+            root = self.dataset(plan)
+            if not is_finished(root):
+                description = f"collect: {plan.n_episodes} episodes in {root}"
+                yield Step("collect", description, partial(collect, root, plan, workers))
+        step, last = last_step(self.folder), self.recipe.training.steps
+        if step < last:
+            yield Step("train", f"train: {self.folder}, from step {step} to {last}", self._train)
+        if step < last or self.unevaluated_steps():
+            yield self.evaluation()
 
-    def _resume_command(self) -> list[str]:
-        config = last_checkpoint(self.folder) / "train_config.json"
-        return ["train", f"--config_path={config}", "--resume=true"]
-
-    def _train_command(self) -> list[str]:
-        policy = dict(self.recipe.policy)
-        start = {"policy.type": policy.pop("type")}
-        if self.recipe.start_from is not None:
-            start = {"policy.path": last_checkpoint(self.best_start())}
-        options = {
-            **start,
-            **{f"policy.{name}": value for name, value in policy.items()},
-            "policy.seed": self.seed,
-            "policy.demo_repo_id": "deltaco/demonstrations",
-            "policy.demo_root": self.dataset(self.recipe.demonstrations),
-            "dataset.repo_id": "deltaco/training",
-            "dataset.root": self.dataset(self.recipe.data),
-            **asdict(self.recipe.training),
-            "seed": self.seed,
-            "job_name": f"{self.recipe.scale}/{self.recipe.name}",
-            "output_dir": self.folder,
-        }
-        return ["train", *(f"--{name}={_text(value)}" for name, value in options.items())]
-
-    def evaluate_command(self, plan: EvaluationPlan | None = None) -> list[str]:
-        """Returns the command that evaluates the checkpoints, by default as the recipe says."""
-        return ["evaluate", str(self.folder), *_flags(plan or self.recipe.evaluation)]
+    def evaluation(self, plan: EvaluationPlan | None = None) -> Step:
+        """Returns the step that evaluates the checkpoints, by default as the recipe says."""
+        plan = plan or self.recipe.evaluation
+        settings = ", ".join(f"{name} {value}" for name, value in _settings_of(plan))
+        return Step(
+            "evaluate",
+            f"evaluate: {self.folder}{settings and ', '}{settings}",
+            partial(evaluate_checkpoints, EvaluateArguments(self.folder, plan)),
+        )
 
     def unevaluated_steps(self, plan: EvaluationPlan | None = None) -> list[int]:
         """Returns the steps of the checkpoints without a record; by default, of the recipe's plan."""
@@ -110,33 +121,58 @@ class Run:
             return []
         plan = plan or self.recipe.evaluation
         done = {record.step for record in read_run_records(self.folder) if record.plan == plan}
-        return [found.step for found in find_checkpoints(self.folder) if found.step not in done]
+        return [
+            checkpoint.step for checkpoint in find_checkpoints(self.folder) if checkpoint.step not in done
+        ]
 
-    def execute(self, command: Sequence[str]) -> None:
-        """Runs one of the commands.
+    def _train(self) -> None:
+        """Begins the training, or continues it from its last checkpoint, in a process of its own."""
+        if last_step(self.folder) > 0:
+            call_in_new_process(_resume_training, last_checkpoint(self.folder))
+            return
+        # A run that stopped before its first checkpoint has left a folder.
+        shutil.rmtree(self.folder, ignore_errors=True)
+        write_json(self.settings_file, self._settings())
+        call_in_new_process(_train, self.training_config())
+
+    def training_config(self) -> TrainPipelineConfig:
+        """Returns the configuration of LeRobot's training loop.
 
         Raises:
-            ExperimentError: It failed.
+            UserError: The experiment that this one starts from was not trained and evaluated.
         """
-        if command[0] == "train" and last_step(self.folder) == 0:
-            # A run that stopped before its first checkpoint has left a folder.
-            shutil.rmtree(self.folder, ignore_errors=True)
-            write_json(self.settings_file, self._settings())
-        call(command)
+        from lerobot.configs.default import DatasetConfig  # slow
+        from lerobot.configs.train import TrainPipelineConfig
+
+        options = {
+            **self.recipe.policy,
+            "seed": self.seed,
+            "demo_repo_id": "deltaco/demonstrations",
+            "demo_root": str(self.dataset(self.recipe.demonstrations)),
+        }
+        start = None if self.recipe.start_from is None else last_checkpoint(self.best_start())
+        return TrainPipelineConfig(
+            dataset=DatasetConfig("deltaco/training", root=str(self.dataset(self.recipe.data))),
+            policy=make_policy_config(options, start),
+            output_dir=self.folder,
+            job_name=f"{self.recipe.scale}/{self.recipe.name}",
+            seed=self.seed,
+            **asdict(self.recipe.training),
+        )
 
     def check_settings(self) -> None:
         """Checks that the run, if it has a checkpoint, began with the same settings.
 
         Raises:
-            ExperimentError: It began with others.
+            UserError: It began with others.
         """
         if last_step(self.folder) == 0 or not self.settings_file.is_file():
             return
-        found = read_json(self.settings_file)
+        begun = read_json(self.settings_file)
         for section, settings in self._settings().items():
-            if found.get(section) != settings:
-                raise ExperimentError(
-                    f"{self.folder} was begun with other settings: {section} was {found.get(section)}, now "
+            if begun.get(section) != settings:
+                raise UserError(
+                    f"{self.folder} was begun with other settings: {section} was {begun.get(section)}, now "
                     f"it is {settings}. Use the same settings or another --out, or move the run away."
                 )
 
@@ -149,7 +185,7 @@ class Run:
         """Returns the run of `start_from` with the highest success rate at its last step.
 
         Raises:
-            ExperimentError: None was trained and evaluated.
+            UserError: None was trained and evaluated.
         """
         assert self.recipe.start_from is not None
         rates = {}
@@ -159,11 +195,26 @@ class Run:
                 if record.plan == self.recipe.evaluation and record.step == last_step(folder):
                     rates[folder] = record.success_rate
         if not rates:
-            raise ExperimentError(
+            raise UserError(
                 f"{self} starts from {self.recipe.start_from}, of which {folders} has no evaluated run. "
                 "Run that experiment first, or both at once."
             )
         return max(rates, key=lambda folder: rates[folder])
+
+
+def _train(config: TrainPipelineConfig) -> None:
+    from lerobot_deltaco.training.train import train
+
+    train(config)
+
+
+def _resume_training(checkpoint: Path) -> None:
+    import lerobot_policy_deltaco  # noqa: F401  (registers the types of this project)
+    from lerobot_deltaco.training.train import train
+
+    # LeRobot finds the checkpoint to resume in the command line alone.
+    sys.argv = ["lerobot-train", f"--config_path={checkpoint / 'train_config.json'}", "--resume=true"]
+    train()
 
 
 def last_checkpoint(run: Path) -> Path:
@@ -182,56 +233,14 @@ def read_run_records(run: Path) -> list[EvaluationRecord]:
     return read_records(run / "evaluations") if (run / "evaluations").is_dir() else []
 
 
-def plan_options(plan: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _settings_of(plan: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yields the fields of a plan that differ from their defaults, nested ones as "scene.objects"."""
     for field in fields(plan):
         value = getattr(plan, field.name)
         if is_dataclass(value):
-            yield from plan_options(value, f"{prefix}{field.name}.")
+            yield from _settings_of(value, f"{prefix}{field.name}.")
         elif value != field.default:
             yield f"{prefix}{field.name}", value
-
-
-def _flags(plan: Any) -> list[str]:
-    flags = []
-    for name, value in plan_options(plan):
-        flags += [f"--{name.replace('_', '-')}", _text(value)]
-    return flags
-
-
-def _text(value: Any) -> str:
-    return json.dumps(value) if isinstance(value, (bool, list, tuple)) else str(value)
-
-
-def call(arguments: Sequence[str]) -> None:
-    """Runs a `deltaco` command in its own process; an evaluation in this one, to import LeRobot once.
-
-    Args:
-        arguments: Subcommand and its arguments.
-
-    Raises:
-        ExperimentError: The command failed in another process.
-    """
-    sys.stdout.write(f"\n{command_line(arguments)}\n")
-    sys.stdout.flush()
-    if arguments[0] == "evaluate":
-        from lerobot_deltaco.evaluation.evaluate import evaluate_checkpoints  # slow
-
-        sys.argv = ["deltaco", *arguments]  # which records hold
-        lines = evaluate_checkpoints(tyro.cli(EvaluateArguments, args=arguments[1:]))
-        sys.stdout.write(f"{lines}\n")
-        return
-    status = subprocess.run([sys.executable, "-m", "lerobot_deltaco.cli", *arguments], check=False).returncode
-    if status != 0:
-        raise ExperimentError(
-            f"`deltaco {arguments[0]}` failed (exit status {status}); see above for the reason. The same "
-            "command continues."
-        )
-
-
-def command_line(arguments: Sequence[str]) -> str:
-    """Returns a `deltaco` command as a user would type it."""
-    return shlex.join(["deltaco", *arguments])
 
 
 def run_experiments(
@@ -241,7 +250,7 @@ def run_experiments(
     out: Path = Path("outputs/experiments"),
     settings: Annotated[Sequence[str], tyro.conf.arg(name="set")] = (),
     dry_run: bool = False,
-) -> str | None:
+) -> str | Path:
     """Runs the steps of experiments that are not finished yet.
 
     Args:
@@ -251,33 +260,29 @@ def run_experiments(
         seed: Seeds of the training; each is a separate run.
         out: Folder of all outputs.
         settings: Settings that override the recipe, such as training.steps=2000.
-        dry_run: Print the commands without running them.
+        dry_run: Print the steps without running them.
+
+    Returns:
+        The page of the report; or the names or the steps, one a line.
 
     Raises:
-        ExperimentError: A setting is invalid, a run began with other settings, or a step failed.
+        UserError: A setting is invalid, a run began with other settings, or a step failed.
     """
     if not names:
         return "\n".join(experiment_names())
-    names = experiments_named(names)
+    names = expand_families(names)
     recipes = [read_recipe(name, scale, settings) for name in names]
     # Fine-tuning starts once the runs that it may start from are done.
     recipes.sort(key=lambda recipe: recipe.start_from in names)
-    runs = [Run(recipe, each, out) for recipe in recipes for each in dict.fromkeys(seed)]
+    runs = [TrainingRun(recipe, each, out) for recipe in recipes for each in dict.fromkeys(seed)]
     for run in runs:
         run.check_settings()
         if run.recipe.start_from not in (None, *names) and last_step(run.folder) == 0:
             run.best_start()  # or an error, before anything is collected
-    report = ["report", *(str(run.folder) for run in runs), "--out", str(out / "report")]
     if dry_run:
-        lines = []
-        for run in runs:
-            if run.recipe.start_from in names:
-                lines.append(f"# then {run}, from its best start")
-            else:
-                lines += map(command_line, run.commands())
-        return "\n".join(dict.fromkeys([*lines, command_line(report)]))
+        lines = [step.description for run in runs for step in run.steps()]
+        return "\n".join(dict.fromkeys([*lines, f"report: {out / 'report'}"]))
     for run in runs:
-        for command in run.commands():
-            run.execute(command)
-    call(report)
-    return None
+        for step in run.steps():
+            step.run()
+    return write_report([run.folder for run in runs], out / "report")

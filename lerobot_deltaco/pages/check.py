@@ -25,7 +25,6 @@ from torch import Tensor
 from torch.utils.data import default_collate
 from tqdm import tqdm
 
-from lerobot_deltaco.arguments import CheckArguments
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.data.frames import memory_for_frames
 from lerobot_deltaco.data.grasps import Grasp, find_grasps, follows_gripper
@@ -33,6 +32,7 @@ from lerobot_deltaco.data.images import as_uint8, resize_images
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
+from lerobot_deltaco.pages.arguments import CheckArguments
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.policies.base.configuration import dimension_names

@@ -23,9 +23,8 @@ import pandas as pd
 
 from gym_deltaco.atomic_files import read_json, write_json
 from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord
-from lerobot_deltaco.experiments import run as experiments
 from lerobot_deltaco.experiments.recipes import read_recipe
-from lerobot_deltaco.experiments.run import Run, last_checkpoint, last_step, read_run_records
+from lerobot_deltaco.experiments.run import TrainingRun, last_checkpoint, last_step, read_run_records
 from lerobot_deltaco.pages.html import EpisodeView, write_page
 from lerobot_deltaco.reports.leaderboard import CHANCE, PAPER
 from lerobot_deltaco.reports.metrics import followed, success_interval
@@ -51,7 +50,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
         The page, `index.html`. A line about the run is appended to `records.csv` beside it.
 
     Raises:
-        ExperimentError: A step failed.
+        UserError: A step failed.
     """
     os.environ.setdefault("HF_HUB_OFFLINE", "1")  # the language encoder comes as a package
     episodes_per_task, steps = BUDGETS[minutes]
@@ -61,12 +60,12 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
         f"training.save_freq={steps}",
     )
     recipe = read_recipe(EXPERIMENT, settings=settings)
-    run = Run(recipe, seed=0, out=out / f"{minutes}_minutes")
+    run = TrainingRun(recipe, seed=0, out=out / f"{minutes}_minutes")
     run.check_settings()
     times = run.out / "minutes.json"
-    for command in run.commands():
-        with _timed(times, command[0]):
-            run.execute(command)
+    for step in run.steps():
+        with _timed(times, step.name):
+            step.run()
     swapped = {
         kind: replace(recipe.evaluation, counterfactual=kind, trials=1)
         for kind in ("demonstration", "instruction")
@@ -74,7 +73,7 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
     for plan in swapped.values():
         if run.unevaluated_steps(plan):
             with _timed(times, "counterfactuals"):
-                experiments.call(run.evaluate_command(plan))
+                run.evaluation(plan).run()
     scene = run.out / "scene.json"
     if not scene.is_file():
         with _timed(times, "videos"):
@@ -147,7 +146,7 @@ def record_showcase(checkpoint: Path) -> list[EpisodeView]:
     return [player.run(choice) for choice in SHOWCASE]
 
 
-def _record(run: Run, plan: EvaluationPlan) -> EvaluationRecord:
+def _record(run: TrainingRun, plan: EvaluationPlan) -> EvaluationRecord:
     step = last_step(run.folder)
     return next(
         record for record in read_run_records(run.folder) if record.plan == plan and record.step == step

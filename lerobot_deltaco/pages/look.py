@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gym_deltaco.tasks import select_tasks
-from lerobot_deltaco.arguments import LookArguments
 from lerobot_deltaco.data.grasps import find_keyframes
 from lerobot_deltaco.data.images import as_uint8
 from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, read_demonstrations, read_robot_data
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import load_conditioned
+from lerobot_deltaco.pages.arguments import LookArguments
 from lerobot_deltaco.pages.html import EpisodeView, picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
 from lerobot_deltaco.pages.player import Player

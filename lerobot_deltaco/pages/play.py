@@ -10,8 +10,8 @@ from typing import Any
 
 from gym_deltaco.layout import Layout
 from gym_deltaco.tasks import TASKS, ContainerWord, get_task
-from lerobot_deltaco.arguments import PlayArguments
 from lerobot_deltaco.evaluation.video import load_conditioned
+from lerobot_deltaco.pages.arguments import PlayArguments
 from lerobot_deltaco.pages.html import TEMPLATES, picture_uri, render
 from lerobot_deltaco.pages.pictures import demonstration_ends
 from lerobot_deltaco.pages.player import MAX_SEED, Choice, Player

@@ -16,6 +16,7 @@ from typing import Any
 
 import pandas as pd
 
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.records import TEMPLATES, EvaluationRecord
 from lerobot_deltaco.reports.metrics import Estimate, success_interval
 
@@ -29,10 +30,6 @@ PAPER[["rate", "sd"]] /= 100
 _OLDER_FAMILIES = {"small_a": "scenario_a", "small_b": "scenario_b", "small_ambiguity": "ambiguity_object"}
 # Settings that never belong to the main ones of a group, other than with these values.
 _MAIN = {"counterfactual": "none", "without": "none", "wording": TEMPLATES}
-
-
-class ReportError(ValueError):
-    """Raised when records cannot be reported on together; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,7 @@ def collect_results(records: Iterable[EvaluationRecord]) -> list[Result]:
     """Groups records by experiment and settings, in the paper's order, others by name.
 
     Raises:
-        ReportError: Records are of several versions of the benchmark, two are of the same checkpoint and
+        UserError: Records are of several versions of the benchmark, two are of the same checkpoint and
             settings, or training seeds have no step in common.
     """
     groups = defaultdict(list)
@@ -115,7 +112,7 @@ def collect_results(records: Iterable[EvaluationRecord]) -> list[Result]:
         groups[record.experiment.rpartition("/")[0]].append(record)
     versions = {record.versions["benchmark"] for group in groups.values() for record in group}
     if len(versions) > 1:
-        raise ReportError(
+        raise UserError(
             f"The records are of several versions of the benchmark, {', '.join(sorted(versions))}, which are "
             "not comparable. Report on them separately."
         )
@@ -169,13 +166,13 @@ def _by_step_and_seed(records: Sequence[EvaluationRecord]) -> pd.DataFrame:
     table = pd.DataFrame({"step": [record.step for record in records]})
     table["seed"] = [record.train_seed for record in records]
     for step, seed in table[table.duplicated()].itertuples(index=False):
-        raise ReportError(
+        raise UserError(
             f"Two records are of step {step} of {name!r} with the training seed {seed} and the same "
             "settings. Report on one of them, or name the experiments differently."
         )
     table = table.assign(record=records).pivot(index="step", columns="seed", values="record").dropna()
     if table.empty:
-        raise ReportError(
+        raise UserError(
             f"The training seeds of {name!r} were evaluated at no common step. Evaluate them at one."
         )
     return table

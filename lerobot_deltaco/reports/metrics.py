@@ -8,13 +8,12 @@ drawn with all its episodes of all training seeds.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from math import sqrt
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
+from scipy import stats
 
 from gym_deltaco.objects.labels import find_label
 from gym_deltaco.sim.workspace import Quadrant, container_matches
@@ -24,7 +23,7 @@ from lerobot_deltaco.evaluation.records import EvaluationRecord, scene_columns
 N_DRAWS = 10_000
 N_BEST_SETS = 10  # evaluation sets that the paper averages
 _SEED = 0  # of the bootstrap, so that a report is a function of its records
-_FEW = 5  # successes, with fewer of which the bootstrap's interval is too narrow
+_FEW = 5  # successes; with fewer, the bootstrap's interval is too narrow
 
 
 class Estimate(NamedTuple):
@@ -36,21 +35,15 @@ class Estimate(NamedTuple):
 
 
 def bootstrap(values: ArrayLike) -> Estimate:
-    """Estimates the mean of one value per task, with the 2.5 % and 97.5 % quantiles of resampled means."""
+    """Estimates the mean of one value per task; its interval has the percentiles of resampled means."""
     values = np.asarray(values, dtype=np.float64)
-    rng = np.random.default_rng(_SEED)
-    means = values[rng.integers(len(values), size=(N_DRAWS, len(values)))].mean(axis=1)
-    low, high = np.quantile(means, (0.025, 0.975))
-    return Estimate(float(values.mean()), float(low), float(high))
-
-
-def wilson_interval(count: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Returns Wilson's interval of a fraction (Wilson 1927), which is not empty at 0 and 1."""
-    z = NormalDist().inv_cdf((1 + confidence) / 2)
-    rate = count / total
-    middle = (rate + z**2 / (2 * total)) / (1 + z**2 / total)
-    half = z / (1 + z**2 / total) * sqrt(rate * (1 - rate) / total + z**2 / (4 * total**2))
-    return max(middle - half, 0.0), min(middle + half, 1.0)
+    mean = float(values.mean())
+    if len(values) == 1:  # nothing to resample
+        return Estimate(mean, mean, mean)
+    interval = stats.bootstrap(
+        (values,), np.mean, n_resamples=N_DRAWS, method="percentile", rng=_SEED
+    ).confidence_interval
+    return Estimate(mean, float(interval.low), float(interval.high))
 
 
 def task_rates(episodes: pd.DataFrame) -> pd.Series:
@@ -62,7 +55,8 @@ def success_interval(episodes: pd.DataFrame) -> Estimate:
     """Returns the success rate with its 95 % interval: Wilson's if few succeed, else by bootstrap."""
     count, total = int(episodes["success"].sum()), len(episodes)
     if count < _FEW:
-        return Estimate(count / total, *wilson_interval(count, total))
+        interval = stats.binomtest(count, total).proportion_ci(method="wilson")
+        return Estimate(count / total, float(interval.low), float(interval.high))
     return bootstrap(task_rates(episodes))
 
 

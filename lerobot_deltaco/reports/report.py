@@ -13,6 +13,7 @@ import tyro
 
 from gym_deltaco.atomic_files import write_text
 from gym_deltaco.tasks import get_task, task_kinds
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.records import read_records
 from lerobot_deltaco.reports.leaderboard import CHANCE, Result, collect_results, settings_text
 from lerobot_deltaco.reports.metrics import (
@@ -45,9 +46,12 @@ def write_report(paths: tyro.conf.Positional[Sequence[Path]], out: Path = Path("
         The page, `report.md`.
 
     Raises:
-        RecordError: A path has no valid records.
-        ReportError: The records cannot be reported on together.
+        UserError: A path has no valid records, or they cannot be reported on together.
     """
+    if not paths:
+        raise UserError(
+            "Name files or folders of records, such as the output folder of an evaluated training run."
+        )
     results = collect_results(read_records(*paths))
     tables = {name: make_table(results, rows_of) for name, (rows_of, _) in TABLES.items()}
     out.mkdir(parents=True, exist_ok=True)

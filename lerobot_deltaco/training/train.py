@@ -58,7 +58,10 @@ def train(config: TrainPipelineConfig | None = None) -> None:
         EpisodeAwareSampler=training.make_sampler,
         cycle=training.batches,
     ):
-        lerobot_train.main() if config is None else lerobot_train.train(config)
+        if config is None:
+            lerobot_train.main()
+        else:
+            lerobot_train.train(config)
 
 
 class _InMemoryTraining:

@@ -25,11 +25,12 @@ from gym_deltaco.layout import sample_layout
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco import cli
-from lerobot_deltaco.arguments import EvaluateArguments
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation import evaluate as evaluate_module
 from lerobot_deltaco.evaluation.checkpoints import find_checkpoints, load_policy
+from lerobot_deltaco.evaluation.command import EvaluateArguments, evaluate_checkpoints
 from lerobot_deltaco.evaluation.episodes import draw_episodes
-from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate, evaluate_checkpoints
+from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
 from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records, scene_columns
 from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
@@ -287,11 +288,20 @@ def test_the_command_records_each_checkpoint_once(run, tmp_path, capsys, monkeyp
 
 def test_different_evaluations_are_recorded_side_by_side(run, benchmark, tmp_path):
     arguments = [run, "--tasks", "4", "--steps", "last", "--out", tmp_path, *BRIEFLY]
-    demos = ["--demo-repo-id", "test/others", "--demo-root", benchmark]
-    for more in ([], ["--scene.adversarial-probability", 0], demos):
+    evaluations = [
+        [],
+        ["--scene.adversarial-probability", 0],
+        ["--demo-repo-id", "test/others", "--demo-root", benchmark],
+        ["--device", "cpu"],
+        ["--rename-map", "{}"],
+        ["--experiment", "another name"],
+    ]
+    for more in evaluations:
         run_command(*arguments, "--trials", 1, *more)
     records = read_records(tmp_path)
-    assert sorted(str(record.demonstrations) for record in records) == ["None", "None", "test/others"]
+    assert len(records) == len(evaluations)
+    assert sorted(str(record.demonstrations) for record in records)[-2:] == ["None", "test/others"]
+    assert "another name" in {record.experiment for record in records}
     # A record of the same evaluation of another policy is refused.
     path = tmp_path / "other" / "000002" / "pretrained_model"
     other = shutil.copytree(find_checkpoints(run)[0].folder, path)
@@ -315,7 +325,7 @@ def test_an_interrupted_evaluation_leaves_no_record(run, loaded, tmp_path, monke
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
     # A process that is killed is reported.
     monkeypatch.setattr(Evaluation, "run", lambda self, number: os._exit(9))
-    with pytest.raises(RuntimeError, match="fewer --processes"):
+    with pytest.raises(UserError, match="fewer --processes"):
         evaluate(loaded, short_plan("4,14", trials=1), 2)
 
 

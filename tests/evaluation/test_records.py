@@ -15,7 +15,7 @@ from gym_deltaco.scene_config import SceneConfig
 from lerobot_deltaco.evaluation import records
 from lerobot_deltaco.evaluation.records import (
     EvaluationPlan,
-    RecordError,
+    UserError,
     read_records,
     scene_columns,
     write_records,
@@ -78,14 +78,14 @@ def test_contradictions_are_refused(tmp_path, monkeypatch, message):
     if message == "12 episodes":
         wrong = replace(wrong, episodes=wrong.episodes[:-1])
     found = [make_record(), wrong]
-    with pytest.raises(RecordError, match=f"must have {message}"):
+    with pytest.raises(UserError, match=f"must have {message}"):
         write_records(tmp_path / "some.parquet", found)
     assert not list(tmp_path.iterdir())
     # As if another program had written it.
     with monkeypatch.context() as patch:
         patch.setattr(records, "_check", lambda record, path: None)
         write_records(tmp_path / "some.parquet", found)
-    with pytest.raises(RecordError, match=f"must have {message}"):
+    with pytest.raises(UserError, match=f"must have {message}"):
         read_records(tmp_path / "some.parquet")
 
 
@@ -94,10 +94,10 @@ def test_what_is_no_file_of_records_is_named(tmp_path):
     (tmp_path / "text.parquet").write_text("{}")
     (tmp_path / "empty").mkdir()
     for name in ("other.parquet", "text.parquet", "missing.parquet"):
-        with pytest.raises(RecordError, match=f"{name}.*is not a file of evaluation records"):
+        with pytest.raises(UserError, match=f"{name}.*is not a file of evaluation records"):
             read_records(tmp_path / name)
     with pytest.raises(
-        RecordError, match="empty.*has no records of evaluations. `deltaco evaluate` writes them"
+        UserError, match="empty.*has no records of evaluations. `deltaco evaluate` writes them"
     ):
         read_records(tmp_path / "empty")
 

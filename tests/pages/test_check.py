@@ -20,7 +20,7 @@ from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from lerobot_deltaco import cli
-from lerobot_deltaco.arguments import CheckArguments, PolicyOptions
+from lerobot_deltaco.pages.arguments import CheckArguments, PolicyOptions
 from lerobot_deltaco.pages.check import _staying_edges, check
 
 

@@ -1,40 +1,32 @@
 import json
 import re
-from pathlib import Path
 
 import pandas as pd
 import pytest
 from example_records import make_record
-from test_experiments import FakeCommands
+from fake_steps import FakeSteps, fake_steps
 
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.tasks import get_task
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation import records
-from lerobot_deltaco.experiments import run as experiments
-from lerobot_deltaco.experiments.recipes import ExperimentError
 from lerobot_deltaco.pages import demo
 from lerobot_deltaco.pages.html import EpisodeView
 from lerobot_deltaco.pages.player import SHOWCASE
 
 
-class FakeDemoCommands(FakeCommands):
+class FakeDemoSteps(FakeSteps):
     """Also leaves the evaluations with the inputs of other tasks, in which every fourth episode succeeds."""
 
-    def _evaluate(self, arguments, fails):
-        run = Path(arguments[1])
-        options = dict(zip(arguments[2::2], arguments[3::2], strict=True))
-        kind = options.get("--counterfactual", "none")
-        plan = {"tasks": "scenario_a_test", "trials": int(options.get("--trials", 4)), "counterfactual": kind}
-        record = make_record(step=experiments.last_step(run), succeeds=lambda _, trial: trial == 0, plan=plan)
-        if not fails:
-            records.write_records(run / "evaluations" / f"{kind}.parquet", [record])
+    def record(self, run, step, plan):
+        record = make_record(step=step, succeeds=lambda _, trial: trial == 0, plan=vars(plan))
+        records.write_records(run / "evaluations" / f"{plan.counterfactual}.parquet", [record])
 
 
 @pytest.fixture
-def commands(monkeypatch):
-    """Fake commands and videos."""
-    fake = FakeDemoCommands()
-    monkeypatch.setattr(experiments, "call", fake)
+def steps(monkeypatch):
+    """Fake steps and videos."""
+    fake = fake_steps(monkeypatch, FakeDemoSteps())
 
     def record_showcase(checkpoint):
         picture, video = "data:image/jpeg", "data:video/mp4"
@@ -48,7 +40,7 @@ def commands(monkeypatch):
     return fake
 
 
-def test_the_page_shows_the_result(tmp_path, commands):
+def test_the_page_shows_the_result(tmp_path, steps):
     page = demo.run_demo(8, tmp_path).read_text()
     assert page.count("<video src=") == 4
     assert page.count('src="data:image/jpeg') == 4 + 4
@@ -64,17 +56,17 @@ def test_the_page_shows_the_result(tmp_path, commands):
     assert line["calibration_gflops"] > 0
 
 
-def test_finished_steps_are_skipped(tmp_path, commands):
-    commands.failing = "evaluate"
-    with pytest.raises(ExperimentError):
+def test_finished_steps_are_skipped(tmp_path, steps):
+    steps.failing = "evaluate"
+    with pytest.raises(UserError):
         demo.run_demo(8, tmp_path)
     times = tmp_path / "8_minutes" / "minutes.json"
     first = json.loads(times.read_text())["evaluate"]
-    commands.failing = None
+    steps.failing = None
     for names in (["evaluate"] * 3, []):
-        commands.called.clear()
+        steps.names.clear()
         demo.run_demo(8, tmp_path)
-        assert commands.names == names
+        assert steps.names == names
     assert json.loads(times.read_text())["evaluate"] > first
 
 

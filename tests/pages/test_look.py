@@ -13,7 +13,6 @@ from gym_deltaco.env import ACTION_NAMES, PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import OBJECTS, TASKS, get_task
-from lerobot_deltaco.arguments import LookArguments
 from lerobot_deltaco.evaluation.video import (
     benchmark_env,
     find_demonstration,
@@ -21,6 +20,7 @@ from lerobot_deltaco.evaluation.video import (
     record_episode,
 )
 from lerobot_deltaco.pages import look as look_module
+from lerobot_deltaco.pages.arguments import LookArguments
 from lerobot_deltaco.pages.html import EpisodeView, render
 from lerobot_deltaco.pages.look import look
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_localization, encode_video

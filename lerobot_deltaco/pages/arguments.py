@@ -1,44 +1,11 @@
-"""Arguments of the commands whose modules import torch, which their `--help` should not wait for."""
+"""Arguments of `deltaco check`, `look` and `play`, apart from the pages: help does not import torch."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import tyro
-
-from lerobot_deltaco.evaluation.records import EvaluationPlan
-
-
-@dataclass(frozen=True)
-class EvaluateArguments:
-    """Arguments of `deltaco evaluate`. The defaults are the leaderboard's protocol.
-
-    Args:
-        checkpoint: Output folder of a training run, or folder of a policy.
-        plan: Episodes to run.
-        steps: Checkpoints of a training run to evaluate: all, last, or steps such as 4000,8000.
-        out: Folder of the records; by default, that of the training run, or outputs/evaluate/NAME.
-        processes: Number of processes that share the episodes; by default, one for each core.
-        device: Device of the policy, such as cpu.
-        demo_repo_id: Dataset of demonstrations, in place of the checkpoint's own.
-        demo_root: Folder of that dataset, if it is not in LeRobot's cache.
-        experiment: Name of the policy in tables; by default, the job name of its training run.
-        rename_map: Names under which the policy knows the environment's observations, as JSON.
-    """
-
-    checkpoint: tyro.conf.Positional[Path]
-    plan: Annotated[EvaluationPlan, tyro.conf.arg(name="")] = EvaluationPlan()  # noqa: RUF009
-    steps: str = "all"
-    out: Path | None = None
-    processes: int = len(os.sched_getaffinity(0))
-    device: str | None = None
-    demo_repo_id: str | None = None
-    demo_root: Path | None = None
-    experiment: str | None = None
-    rename_map: str | None = None
 
 
 @dataclass(frozen=True)
