@@ -82,7 +82,7 @@ class CollectionPlan:
         for name, lowest in (("episodes_per_task", 1), ("seed", 0), ("noise", 0)):
             number = getattr(self, name)
             if not lowest <= number < math.inf:
-                raise ValueError(f"`{name}` must be at least {lowest}. Got {number}.")
+                raise UserError(f"`{name}` must be at least {lowest}. Got {number}.")
         object.__setattr__(self, "scene", self.scene.for_tasks(self.tasks))
         self.scene.check_tasks(self.task_ids)
         if self.split is None:

@@ -15,6 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_deltaco.data.reading import shortened
+from lerobot_deltaco.errors import UserError
 
 # Frames of an episode that are kept, evenly spaced, if a demonstration has more than its two ends.
 N_KEPT_FRAMES = 16
@@ -153,7 +154,7 @@ class DemonstrationBank(torch.nn.Module):
             moved = self.target_objects
             rows = [row for row in rows if moved is not None and moved[row] == target_object]
         if not rows:
-            raise ValueError(
+            raise UserError(
                 f"There is no demonstration of the task {task!r}"
                 f"{'' if target_object is None else f' with object {target_object}'}. There are some of "
                 f"{len(self.rows)} tasks, such as {next(iter(self.rows))!r}. Name a dataset that has the "
@@ -170,7 +171,7 @@ class DemonstrationBank(torch.nn.Module):
         """
         found = (self.episodes == episode).nonzero().flatten().tolist()
         if not found:
-            raise ValueError(
+            raise UserError(
                 f"`demo_episode` is {episode}, which is not among the demonstrations. They are the episodes "
                 f"{shortened(self.episodes.tolist())}."
             )
@@ -215,7 +216,7 @@ class DemonstrationBank(torch.nn.Module):
         rows = [-1] * len(tasks)
         for sample in wanted.nonzero().flatten().tolist():
             if tasks[sample] not in self.rows:
-                raise ValueError(
+                raise UserError(
                     f"The task {tasks[sample]!r} has no episode among those that demonstrations are drawn "
                     "from. Hold back fewer of its episodes."
                 )

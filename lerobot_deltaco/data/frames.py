@@ -20,6 +20,7 @@ from lerobot_deltaco.data.reading import (
     column,
     episode_spans,
 )
+from lerobot_deltaco.errors import UserError
 
 _CHUNK = 1024  # rows decoded at a time
 _MEMORY_FRACTION = 0.8  # of the free memory, that frames may take
@@ -48,7 +49,7 @@ class FramesInMemory(torch.utils.data.Dataset):
         rename_map: Mapping[str, str] | None = None,
     ) -> None:
         if dataset.image_transforms is not None:
-            raise ValueError(
+            raise UserError(
                 "Frames in memory are decoded once and cannot be transformed at random each time. Leave out "
                 "--dataset.image_transforms, or train with `lerobot-train`."
             )
@@ -153,7 +154,7 @@ class FramesInMemory(torch.utils.data.Dataset):
         """Returns images of a camera, (images, 3, H, W) uint8. See `Episodes.images`."""
         name = self._source(camera)
         if name not in self.meta.camera_keys:
-            raise ValueError(
+            raise UserError(
                 f"{self.repo_id} has no camera {camera!r}, only {', '.join(self.meta.camera_keys)}. If it "
                 "has another name there, pass --rename_map."
             )

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchvision.io import ImageReadMode, decode_image
 
 from lerobot_deltaco.data.reading import column, decoding, frame_name
+from lerobot_deltaco.errors import UserError
 
 _RESIZED_AT_A_TIME = 256
 _IMAGES_PER_THREAD = 32
@@ -73,7 +74,7 @@ def _stored_images(dataset: LeRobotDataset, camera: str, rows: list[int]) -> Ten
         with decoding(dataset, row, camera):
             image = _decoded(file["bytes"])
         if sorted((*image.shape[1:], min(shape))) != sorted(shape):
-            raise ValueError(
+            raise UserError(
                 f"The image {camera} in {frame_name(dataset, row)} has {image.shape[2]} x {image.shape[1]} "
                 f"pixels, but by meta/info.json the shape is {shape}. Record the episode again, or leave it "
                 "out with --dataset.episodes."

@@ -20,6 +20,8 @@ from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_deltaco.errors import UserError
+
 logger = logging.getLogger(__name__)
 
 _TOLERANCE = 1e-3  # of numbers beyond the range of the statistics, as a fraction of it
@@ -119,7 +121,7 @@ def check_episode_numbers(repo_id: str, total: int, episodes: Sequence[int]) -> 
         ValueError: It does not.
     """
     if not len(episodes) or not all(0 <= episode < total for episode in episodes):
-        raise ValueError(
+        raise UserError(
             f"{repo_id} has the episodes 0 to {total - 1}. Got {shortened(episodes)}. Name others in "
             "--dataset.episodes or `training_episodes`."
         )
@@ -206,7 +208,7 @@ def decoding(dataset: LeRobotDataset, row: int, camera: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise ValueError(
+        raise UserError(
             f"The image {camera} in {frame_name(dataset, row, camera)} cannot be decoded: {error}. Record "
             "the episode again, or leave it out with --dataset.episodes."
         ) from error
@@ -226,7 +228,7 @@ def check_dataset(dataset: LeRobotDataset) -> None:
     stats = dataset.meta.stats or {}
     for name in (ACTION, OBS_STATE):
         if name in dataset.meta.features and not {"min", "max", "mean", "std"} <= set(stats.get(name, ())):
-            raise ValueError(
+            raise UserError(
                 f"{dataset.meta.root / 'meta/stats.json'} has no statistics of `{name}`, which normalize it. "
                 "Compute them with LeRobot's lerobot-edit-dataset, or record the dataset again."
             )
@@ -240,7 +242,7 @@ def _check_tasks(meta: LeRobotDatasetMetadata) -> None:
     indices = meta.tasks["task_index"].tolist()
     if indices != list(range(len(indices))):
         wrong = next(n for n, index in enumerate(indices) if index != n)
-        raise ValueError(
+        raise UserError(
             f"In {meta.root / 'meta/tasks.parquet'}, row {wrong} has the `task_index` {indices[wrong]}, but "
             "LeRobot finds tasks by their rows. Sort the rows, and number them from 0."
         )
@@ -278,7 +280,7 @@ def _check_episodes(dataset: LeRobotDataset) -> None:
         ):
             problem = f"its frames are not those with the indices {start} to {stop - 1}, as in the table"
         if problem is not None:
-            raise ValueError(
+            raise UserError(
                 f"Episode {episode} of {dataset.repo_id}: {problem} (frames: "
                 f"{meta.root / meta.get_data_file_path(episode)}; table: {meta.root / 'meta/episodes'}). "
                 "Convert or record the dataset again, or leave out the episode with --dataset.episodes."
@@ -298,7 +300,7 @@ def _check_numbers(dataset: LeRobotDataset, name: str, stats: dict[str, Any]) ->
             problem = f"is outside of the range in {dataset.meta.root / 'meta/stats.json'}"
     if wrong.any():
         row, dimension = np.argwhere(wrong)[0]
-        raise ValueError(
+        raise UserError(
             f"`{name}` {problem}: dimension {dimension} is {values[row, dimension]:g} in "
             f"{frame_name(dataset, int(row))}. {int(wrong.any(axis=1).sum())} frames are such. Leave out "
             "damaged episodes with --dataset.episodes; compute wrong statistics again."

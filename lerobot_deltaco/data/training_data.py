@@ -25,6 +25,7 @@ from lerobot_deltaco.data.grasps import Keyframes, find_keyframes
 from lerobot_deltaco.data.gripper import Gripper
 from lerobot_deltaco.data.images import read_images, resize_images
 from lerobot_deltaco.data.reading import check_episode_numbers, column, episode_spans
+from lerobot_deltaco.errors import UserError
 
 # Index of the object that an episode moves, in datasets of the benchmark.
 TARGET_OBJECT = "benchmark.target_object"
@@ -105,7 +106,7 @@ class DatasetEpisodes:
         cameras = self._dataset.meta.camera_keys
         name = self._source(camera, cameras)
         if name not in cameras:
-            raise ValueError(
+            raise UserError(
                 f"{self.repo_id} has no camera {camera!r}, only {', '.join(cameras)}. If it has another name "
                 "there, pass --rename_map to `deltaco train`."
             )

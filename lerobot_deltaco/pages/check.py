@@ -32,6 +32,7 @@ from lerobot_deltaco.data.images import as_uint8, resize_images
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
@@ -149,7 +150,7 @@ def check(arguments: CheckArguments) -> str:
     ]
     report = "\n".join(lines)
     if start.refusal is not None:
-        raise ValueError(f"Training would refuse this dataset. {start.refusal}\n{report}")
+        raise UserError(f"Training would refuse this dataset. {start.refusal}\n{report}")
     return report
 
 

@@ -16,6 +16,7 @@ from lerobot_deltaco.data.grasps import find_keyframes
 from lerobot_deltaco.data.images import as_uint8
 from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, read_demonstrations, read_robot_data
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.pages.arguments import LookArguments
@@ -47,7 +48,7 @@ def look(arguments: LookArguments) -> str:
     checkpoint, dataset = arguments.checkpoint, arguments.dataset
     loaded = load_conditioned(checkpoint)
     if not isinstance(loaded.policy, DeltacoMatchPolicy):
-        raise ValueError(
+        raise UserError(
             f"{checkpoint} holds a policy of the type {loaded.policy.config.type!r}, which does not look for "
             "locations. `deltaco look` needs one of the type deltaco_match."
         )
@@ -147,14 +148,14 @@ def _check_features(config: TaskConditionedConfig, dataset: LeRobotDataset) -> N
     features = dataset.meta.features
     missing = [name for name in (*(config.input_features or {}), ACTION) if name not in features]
     if missing:
-        raise ValueError(
+        raise UserError(
             f"The policy needs {missing[0]!r}, which {dataset.repo_id} does not have. Its features are "
             f"{', '.join(name for name in features if name.startswith(('observation', 'action')))}."
         )
     for name, feature in (config.input_features or {}).items():
         shape = tuple(features[name]["shape"])
         if name not in config.image_features and shape != tuple(feature.shape):
-            raise ValueError(
+            raise UserError(
                 f"{dataset.repo_id} is of another robot: its {name!r} has the shape {shape}, that of the "
                 f"policy {tuple(feature.shape)}. Name a dataset of the policy's robot."
             )

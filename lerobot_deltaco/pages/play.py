@@ -10,6 +10,7 @@ from typing import Any
 
 from gym_deltaco.layout import Layout
 from gym_deltaco.tasks import TASKS, ContainerWord, get_task
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.pages.arguments import PlayArguments
 from lerobot_deltaco.pages.html import TEMPLATES, picture_uri, render
@@ -216,4 +217,4 @@ def play(arguments: PlayArguments) -> None:
             footer_links=[],
         )
     except OSError as error:
-        raise ValueError(f"Port {arguments.port} is taken. Choose another one with --port.") from error
+        raise UserError(f"Port {arguments.port} is taken. Choose another one with --port.") from error

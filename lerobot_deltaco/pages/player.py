@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gym_deltaco.layout import Layout
 from gym_deltaco.tasks import TASKS, get_task, select_tasks
 from lerobot_deltaco.data.demonstrations import Demonstration
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.records import EvaluationPlan
 from lerobot_deltaco.evaluation.video import benchmark_env, find_demonstration, record_episode
@@ -132,7 +133,7 @@ class Player:
         """
         sentence = "" if choice.inputs == DEMONSTRATION else " ".join(choice.instruction.split())
         if not sentence and choice.inputs != DEMONSTRATION:
-            raise ValueError("Type an instruction first, or use the demonstration only.")
+            raise UserError("Type an instruction first, or use the demonstration only.")
         demonstrations = [] if choice.inputs == INSTRUCTION else [self.demonstration(choice)]
         recording = record_episode(
             self._loaded, self._env, choice.task_id, choice.scene_seed, sentence, demonstrations
@@ -161,7 +162,7 @@ class Player:
             ValueError: The policy does not take both inputs.
         """
         if BOTH not in self.inputs:
-            raise ValueError("The comparison needs a policy that takes a demonstration and an instruction.")
+            raise UserError("The comparison needs a policy that takes a demonstration and an instruction.")
         _, layout = self.show_scene(choice)
         labels = [item.label for item in layout.objects]
         fitting = [label for label in labels if get_task(choice.demo_task).describes(label)]

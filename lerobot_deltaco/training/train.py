@@ -35,6 +35,7 @@ from lerobot_deltaco.data.grasps import Grasp, find_grasps
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import check_dataset_folder, missing_files_named
 from lerobot_deltaco.data.training_data import read_robot_data
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig, check_image_shapes
 from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
@@ -75,7 +76,7 @@ class _InMemoryTraining:
         """Makes LeRobot's datasets, the first of them in memory."""
         policy = config.policy
         if policy is None or config.dataset.streaming:
-            raise ValueError(
+            raise UserError(
                 "`deltaco train` trains policies on frames in memory. For reward models and "
                 "--dataset.streaming, use `lerobot-train`."
             )
@@ -144,7 +145,7 @@ def image_size_in_memory(dataset: LeRobotDataset, policy: PreTrainedConfig) -> i
         features = dataset_to_policy_features(dataset.meta.features)
         check_image_shapes({name: features[name].shape for name in dataset.meta.camera_keys})
     if dataset.meta.depth_keys or dataset.meta.has_language_columns:
-        raise ValueError(
+        raise UserError(
             "The dataset has depth images or columns of messages, which only `lerobot-train` prepares."
         )
     if isinstance(policy, TaskConditionedConfig):
@@ -192,7 +193,7 @@ def _upsampled(pattern: str | None, task_names: Sequence[str], present: set[int]
         return []
     found = [n for n, name in enumerate(task_names) if n in present and re.search(pattern, name)]
     if not found:
-        raise ValueError(
+        raise UserError(
             f"`upsampled_tasks` is {pattern!r}, which is found in no task of the dataset. They are such as "
             f"{task_names[0]!r}."
         )
@@ -214,7 +215,7 @@ def check_statistics(checkpoint: Path, stats: Mapping[str, Mapping[str, Any]]) -
         for name, values in stats.get(feature, {}).items():
             known = saved.get(f"{feature}.{name}")
             if known is not None and not np.allclose(known, np.asarray(values), rtol=1e-5):
-                raise ValueError(
+                raise UserError(
                     f"The dataset is not the one that the training began with: its statistics of `{feature}` "
                     "differ. Resume on the same data, or begin a new training from the checkpoint with "
                     "--policy.path."

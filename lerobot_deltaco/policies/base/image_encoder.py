@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.networks import channels_last
 
 # Mean and standard deviation of ImageNet, with which R3M and feature matching normalize images.
@@ -25,7 +26,7 @@ _N_CLASSIFIER_WEIGHTS = 2  # at the end of the file
 _STAGES = [3, 4]  # timm's numbers of the last stages at strides 16 and 32
 
 
-class PretrainedWeightsError(RuntimeError):
+class PretrainedWeightsError(UserError):
     """Raised when weights of a frozen image encoder cannot be loaded; the message says what to do."""
 
 

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base import language
 
 _UNIT_TOLERANCE = 1e-6  # deviation from length 1 below which a vector is left as it is
@@ -83,7 +84,7 @@ class Paraphrases:
         """
         sentences = self.sentences.get(task, ())
         if self.is_complete and not sentences:
-            raise ValueError(
+            raise UserError(
                 f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add some."
             )
         return sentences

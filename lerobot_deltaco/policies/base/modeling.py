@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
 from lerobot_deltaco.data.reading import compare_robots, open_dataset
 from lerobot_deltaco.data.training_data import DatasetEpisodes, Episodes, TrainingData
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.action_queues import ActionQueues
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings, Paraphrases
@@ -50,7 +51,7 @@ _DATASET_OPTIONS = ("gripper", "gripper_closed", "demo_camera")
 DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
 
 
-class TrainingDivergedError(FloatingPointError):
+class TrainingDivergedError(UserError, FloatingPointError):
     """Raised when the loss or a weight is not finite; the message names the likely cause."""
 
 
@@ -128,7 +129,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             ValueError: They differ in number.
         """
         if len(instructions) != len(demonstrations):
-            raise ValueError(
+            raise UserError(
                 f"There must be as many lists of demonstrations as instructions. Got {len(demonstrations)} "
                 f"and {len(instructions)}."
             )
@@ -188,7 +189,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         tasks = batch.get("task")
         if isinstance(tasks, (list, tuple)) and tasks and all(isinstance(task, str) for task in tasks):
             return tuple(tasks), None
-        raise ValueError(
+        raise UserError(
             "`task` must be a list with an instruction for each sample of the batch. Got "
             f"{'none' if tasks is None else repr(tasks)}. LeRobot takes it from the environment's "
             '`task_description`, or from --task; in Python, set observation["task"] before the preprocessor.'
@@ -208,7 +209,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         if bank is None and self.training_data is not None:
             bank = self.training_data.demonstrations
         if bank is None:
-            raise ValueError(
+            raise UserError(
                 "The policy has no demonstrations. Name a dataset of them with --policy.demo_repo_id and "
                 "--policy.demo_root, or pass some to `set_tasks`."
             )
@@ -297,7 +298,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """
         if self.training_data is None:
             if self._meta is None:
-                raise ValueError(
+                raise UserError(
                     "Training needs the episodes: call `prepare_training`, or pass the dataset's metadata as "
                     "`dataset_meta`."
                 )
@@ -311,7 +312,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         if bool(wrong.any()):
             episode = int(episodes[wrong][0])
             problem = "to be trained on, but was not" if self.training else "held out, but was"
-            raise ValueError(
+            raise UserError(
                 f"Episode {episode} is {problem} among the training episodes that the policy was "
                 "given. `lerobot-train` does not tell a policy of --dataset.episodes and "
                 "--dataset.eval_split: train with `deltaco train`, or name the training episodes in "
@@ -396,14 +397,14 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         try:
             policy = super().from_pretrained(pretrained_name_or_path, **{**kwargs, "strict": True})
         except RuntimeError as error:
-            raise ValueError(
+            raise UserError(
                 f"{pretrained_name_or_path} does not have the weights of this policy: "
                 f"{str(error).splitlines()[-1].strip()} Its config.json belongs to other weights, or to "
                 "another version."
             ) from error
         damaged = _not_finite(policy.state_dict())
         if damaged:
-            raise ValueError(
+            raise UserError(
                 f"{pretrained_name_or_path} is damaged: the weight {damaged[0]} has numbers that are not "
                 "finite."
             )
@@ -446,7 +447,7 @@ def _check_options(config: TaskConditionedConfig, saved: Mapping[str, Any], is_t
     """
     for name in _TRAINED_OPTIONS if is_trained else (*_TRAINED_OPTIONS, *_DATASET_OPTIONS):
         if name in saved and getattr(config, name) != saved[name]:
-            raise ValueError(
+            raise UserError(
                 f"The checkpoint was trained with `{name}` {saved[name]!r}, and cannot be used with "
                 f"{getattr(config, name)!r}. Leave out --policy.{name}."
             )
@@ -458,7 +459,7 @@ def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadat
         return None
     sentences = read_sentences(config.paraphrases)
     if not sentences.keys() & set(meta.tasks.index):
-        raise ValueError(
+        raise UserError(
             f"{config.paraphrases} has sentences for none of the dataset's tasks, such as "
             f"{meta.tasks.index[0]!r}, but for tasks such as {next(iter(sentences))!r}."
         )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+from lerobot_deltaco.errors import UserError
+
 _COLUMNS = ("task", "instruction")
 
 
@@ -23,20 +25,20 @@ def read_sentences(path: str | Path) -> dict[str, tuple[str, ...]]:
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, strict=True)
             if set(reader.fieldnames or ()) != set(_COLUMNS):
-                raise ValueError(
+                raise UserError(
                     f"{path} must have the columns {' and '.join(_COLUMNS)}. Got "
                     f"{', '.join(reader.fieldnames or ()) or 'none'}."
                 )
             for row in reader:
                 task, instruction = (" ".join((row[name] or "").split()) for name in _COLUMNS)
                 if None in row or not (task and instruction):
-                    raise ValueError(
+                    raise UserError(
                         f"{path}, line {reader.line_num}: expected a task and a sentence. Put those with "
                         "a comma between double quotes."
                     )
                 sentences.setdefault(task, []).append(instruction)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"Cannot read the paraphrases {path}: {error}.") from error
+        raise UserError(f"Cannot read the paraphrases {path}: {error}.") from error
     if not sentences:
-        raise ValueError(f"{path} has no sentences.")
+        raise UserError(f"{path} has no sentences.")
     return {task: tuple(dict.fromkeys(own)) for task, own in sentences.items()}

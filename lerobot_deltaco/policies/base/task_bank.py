@@ -24,6 +24,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings
 
 TASK_BANK = "tasks.safetensors"
@@ -106,7 +107,7 @@ def read_task_bank(path: Path, instructions: InstructionEmbeddings | None) -> De
             tensors.get("pick_states"),
         )
     except (OSError, SafetensorError, ValueError, RecursionError, KeyError, TypeError) as error:
-        raise ValueError(
+        raise UserError(
             f"The task bank {path} cannot be used: {error}. Fetch or copy all files of the checkpoint "
             "again, or save it again."
         ) from error

@@ -10,6 +10,7 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_deltaco.data.gripper import Gripper
 from lerobot_deltaco.data.training_data import DemonstrationFormat
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 
 
@@ -75,7 +76,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             frames_after_release=(0, 1_000_000),
         )
         if self.n_demonstrations > 1 and self.demo_episode is not None:
-            raise ValueError(
+            raise UserError(
                 "`demo_episode` names a single demonstration, but `n_demonstrations` is "
                 f"{self.n_demonstrations}. Set `demo_episode` to null, or `n_demonstrations` to 1."
             )
@@ -116,7 +117,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         """
         super().validate_features()
         if self.gripper_index is None or not self.state_dim:
-            raise ValueError(
+            raise UserError(
                 "`deltaco_match` learns where objects are from when the gripper closes and opens: it needs "
                 "the feature 'observation.state' and a gripper among the action's dimensions, which "
                 "`gripper` names. Without them, train --policy.type=deltaco."

@@ -34,6 +34,7 @@ from lerobot_deltaco.data.grasps import follows_gripper, warn_of_missing
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork, random_shifts, shift_images
@@ -326,7 +327,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         attention = last = descriptors = heights = None
         if given is None:
             if not bool(by_instruction.all()):
-                raise ValueError("Neither a demonstration nor an instruction is given. Pass one of them.")
+                raise UserError("Neither a demonstration nor an instruction is given. Pass one of them.")
         else:
             n_each = given.ends.shape[1]
             ends, states = given.ends.flatten(0, 1), given.pick_states.flatten(0, 1)
@@ -383,7 +384,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """Batches the demonstrations of several tasks; None if they are left out."""
         counts = {len(shown) for shown in demonstrations}
         if len(counts) != 1:
-            raise ValueError(
+            raise UserError(
                 f"The samples of a batch must have as many demonstrations each. Got {sorted(counts)}."
             )
         (n_each,) = counts
@@ -448,7 +449,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         warn_if_inverted(opening, robot, self.config.gripper_closed)
         n_grasps = int(grasps.has_grasp.sum())
         if n_grasps < MIN_EPISODES:
-            raise ValueError(
+            raise UserError(
                 f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} "
                 f"episodes in which the gripper closes and opens. Got {n_grasps}. Collect more, or train "
                 "--policy.type=deltaco with --policy.demo_encoder=attention, which needs none. The gripper "
@@ -537,7 +538,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             sizes = (data.robot.states.shape[1], data.robot.actions.shape[1])
             expected = (self.config.state_dim, self.config.action_feature.shape[0])
             if sizes != expected:
-                raise ValueError(
+                raise UserError(
                     f"The demonstrations in {self.config.demo_repo_id} are of another robot: their states "
                     f"and actions have {sizes[0]} and {sizes[1]} numbers, those of the policy "
                     f"{expected[0]} and {expected[1]}. Name a dataset of the policy's robot."
