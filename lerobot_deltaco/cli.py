@@ -138,9 +138,9 @@ def _imported(path: str) -> Any:
 
 
 def _is_for_users(error: Exception) -> bool:
-    """Returns whether an error says what a user can change: it was raised for that, or by the system."""
+    """Returns whether an error says what a user can change: it was raised for that, or the system refused."""
     is_without_simulator = isinstance(error, ImportError) and error.name == "pybullet"
-    return isinstance(error, UserError | OSError) or is_without_simulator
+    return isinstance(error, UserError | OSError | MemoryError) or is_without_simulator
 
 
 def _overview() -> str:

@@ -28,6 +28,7 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.data.paraphrases import choose_instructions
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
 
 logger = logging.getLogger(__name__)
@@ -72,14 +73,14 @@ class DeltacoEnv(EnvConfig):
         try:
             task_ids = select_tasks(self.task)
             if any(get_task(task_id).kind == "foreign" for task_id in task_ids):
-                raise ValueError(
+                raise UserError(
                     "Only a demonstration says which foreign object is meant, and LeRobot's evaluation looks "
                     "for it by the sentence. Evaluate foreign objects with `deltaco evaluate`."
                 )
             self.scene = self.scene.for_tasks(self.task)
             self.scene.check_tasks(task_ids)
             if self.max_parallel_tasks != 1:
-                raise ValueError(
+                raise UserError(
                     "`max_parallel_tasks` must be 1: a policy holds the task of one episode. To use more "
                     f"cores, evaluate with `deltaco evaluate`. Got {self.max_parallel_tasks}."
                 )
@@ -212,12 +213,12 @@ def check_policy_fits(
             names, as LeRobot's `--rename_map` takes them.
 
     Raises:
-        ValueError: The policy was trained on something else.
+        UserError: The policy was trained on something else.
     """
     control, cameras = scene.interface, list(policy.image_features)
     trained_for = control_of(cameras)
     if trained_for not in (None, scene.control):
-        raise ValueError(
+        raise UserError(
             f"The policy was trained with the control {trained_for!r}, but that of the environment is "
             f"{scene.control!r}. Set `scene.control` to {trained_for}."
         )
@@ -228,14 +229,14 @@ def check_policy_fits(
     can_lack_cameras = hasattr(policy, "empty_cameras")
     if not known or (len(known) < len(cameras) and not can_lack_cameras):
         example = json.dumps({control.camera_keys[0]: cameras[0]}) if cameras else "{}"
-        raise ValueError(
+        raise UserError(
             f"The policy was trained on images of {', '.join(cameras) or 'no camera'}, but the benchmark's "
             f"environment has {', '.join(there)} alone. Evaluate it where it was trained for, or, if it is "
             f"the same camera, rename it: --rename_map='{example}'."
         )
     trained_on = policy.image_features[known[0]].shape[-1]
     if trained_on != scene.image_size and not can_lack_cameras:
-        raise ValueError(
+        raise UserError(
             f"The policy was trained on images of {trained_on} pixels, but those of the environment have "
             f"{scene.image_size}. Set `scene.image_size` to {trained_on}."
         )
@@ -247,7 +248,7 @@ def check_policy_fits(
     )
     for name, feature, size in sizes:
         if feature is not None and tuple(feature.shape) != (size,):
-            raise ValueError(
+            raise UserError(
                 f"The policy was trained on `{name}` of the shape {tuple(feature.shape)}, but that of the "
                 f"benchmark's environment is ({size},). Evaluate it where it was trained for."
             )

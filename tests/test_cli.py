@@ -92,6 +92,7 @@ AGAIN = "Run the same command again to continue."
     [
         (UserError("no record"), "deltaco report: no record"),
         (FileNotFoundError("no file"), "deltaco report: no file"),
+        (MemoryError("no room"), "deltaco report: no room"),
         (ImportError("no simulator", name="pybullet"), "deltaco report: no simulator"),
         (KeyboardInterrupt(), f"\nInterrupted. {AGAIN}"),
         # As libraries report it

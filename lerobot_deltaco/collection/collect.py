@@ -76,7 +76,7 @@ class CollectionPlan:
         scene: Settings of the scenes.
 
     Raises:
-        ValueError: An argument is invalid; the message says what is valid.
+        UserError: An argument is invalid; the message says what is valid.
     """
 
     tasks: str
@@ -90,7 +90,7 @@ class CollectionPlan:
         for name, lowest in (("episodes_per_task", 1), ("seed", 0), ("noise", 0)):
             number = getattr(self, name)
             if not lowest <= number < math.inf:
-                raise ValueError(f"`{name}` must be at least {lowest}. Got {number}.")
+                raise UserError(f"`{name}` must be at least {lowest}. Got {number}.")
         object.__setattr__(self, "scene", self.scene.for_tasks(self.tasks))
         self.scene.check_tasks(self.task_ids)
         if self.split is None:

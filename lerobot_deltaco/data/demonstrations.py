@@ -27,6 +27,7 @@ from lerobot_deltaco.data.reading import (
     shortened,
     source_of,
 )
+from lerobot_deltaco.errors import UserError
 
 logger = logging.getLogger(__name__)
 
@@ -161,14 +162,14 @@ class DemonstrationBank(torch.nn.Module):
             target_object: Index of the object that they move, where the task string does not say which.
 
         Raises:
-            ValueError: There are none; the message names tasks that have some.
+            UserError: There are none; the message names tasks that have some.
         """
         rows = self.rows.get(task, [])
         if target_object is not None:
             moved = self.target_objects
             rows = [row for row in rows if moved is not None and moved[row] == target_object]
         if not rows:
-            raise ValueError(
+            raise UserError(
                 f"There is no demonstration of the task {task!r}"
                 f"{'' if target_object is None else f' with object {target_object}'}. There are some of "
                 f"{len(self.rows)} tasks, such as {next(iter(self.rows))!r}. Name a dataset that has the "
@@ -181,11 +182,11 @@ class DemonstrationBank(torch.nn.Module):
         """Returns the demonstration of an episode of the dataset.
 
         Raises:
-            ValueError: The episode is not in the bank.
+            UserError: The episode is not in the bank.
         """
         found = (self.episodes == episode).nonzero().flatten().tolist()
         if not found:
-            raise ValueError(
+            raise UserError(
                 f"`demo_episode` is {episode}, which is not among the demonstrations. They are the episodes "
                 f"{shortened(self.episodes.tolist())}."
             )
@@ -211,7 +212,7 @@ class DemonstrationBank(torch.nn.Module):
             Rows, (batch,). The only episode of a task demonstrates itself.
 
         Raises:
-            ValueError: No episode of a task is in the bank.
+            UserError: No episode of a task is in the bank.
         """
         draws = torch.rand(len(episodes), generator=generator).to(self.frames.device)
         rows = self.episode_rows(episodes)
@@ -230,7 +231,7 @@ class DemonstrationBank(torch.nn.Module):
         rows = [-1] * len(tasks)
         for sample in wanted.nonzero().flatten().tolist():
             if tasks[sample] not in self.rows:
-                raise ValueError(
+                raise UserError(
                     f"The task {tasks[sample]!r} has no episode among those that demonstrations are drawn "
                     "from. Hold back fewer of its episodes, or name some in `demo_episodes`."
                 )
@@ -306,12 +307,12 @@ def read_demonstrations(
         episodes: Episodes to read; None for all.
 
     Raises:
-        ValueError: The dataset has no such camera or episode.
+        UserError: The dataset has no such camera or episode.
     """
     meta, repo_id = dataset.meta, dataset.repo_id
     camera = source_of(camera, meta.camera_keys)
     if camera not in meta.camera_keys:
-        raise ValueError(
+        raise UserError(
             f"The demonstrations in {repo_id} have no camera {camera!r}, only {', '.join(meta.camera_keys)}. "
             "If it has another name there, pass --rename_map."
         )

@@ -40,6 +40,7 @@ from lerobot_deltaco.data.reading import (
     read_frame,
     source_of,
 )
+from lerobot_deltaco.errors import UserError
 
 # Number of rows decoded at a time, and number of these that a thread takes at a time.
 _CHUNK, _PART = 1024, 32
@@ -58,12 +59,12 @@ class FramesInMemory(torch.utils.data.Dataset):
 
     Raises:
         MemoryError: The frames do not fit into the memory of this machine.
-        ValueError: The dataset transforms images when they are read.
+        UserError: The dataset transforms images when they are read.
     """
 
     def __init__(self, dataset: LeRobotDataset, image_size: int | None = None) -> None:
         if dataset.image_transforms is not None:
-            raise ValueError(
+            raise UserError(
                 "Frames in memory are decoded once and cannot be transformed at random each time. Leave out "
                 "--dataset.image_transforms, or train with `lerobot-train`."
             )
@@ -264,7 +265,7 @@ def _stored_images(dataset: LeRobotDataset, camera: str, rows: range, threads: T
         with decoding(dataset, row, camera):
             image = _decoded(files[row - rows.start]["bytes"])
         if sorted((*image.shape[1:], min(shape))) != sorted(shape):
-            raise ValueError(
+            raise UserError(
                 f"The image {camera} in {frame_name(dataset, row)} has {image.shape[2]} x {image.shape[1]} "
                 f"pixels, but by meta/info.json the shape is {shape}. Record the episode again, or leave it "
                 "out with --dataset.episodes."

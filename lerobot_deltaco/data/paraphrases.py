@@ -17,6 +17,7 @@ import numpy as np
 
 from gym_deltaco.phrases import PhraseSplit, paraphrase
 from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
+from lerobot_deltaco.errors import UserError
 
 PARAPHRASES_SPLITS = ("all", "train", "held_out")
 GRAMMAR = "grammar"  # in place of a file: sentences that the benchmark makes from phrases
@@ -45,12 +46,10 @@ def read_paraphrases(
         no sentence in the split.
 
     Raises:
-        ValueError: The split is unknown, or the file is missing or invalid; the message names the line.
+        UserError: The split is unknown, or the file is missing or invalid; the message names the line.
     """
     if split not in PARAPHRASES_SPLITS:
-        raise ValueError(
-            f"`paraphrases_split` must be one of {', '.join(PARAPHRASES_SPLITS)}. Got {split!r}."
-        )
+        raise UserError(f"`paraphrases_split` must be one of {', '.join(PARAPHRASES_SPLITS)}. Got {split!r}.")
     if path == GRAMMAR:
         if task_ids is None:
             task_ids = (task.index for task in (*TASKS, *COLOR_SHAPE_TASKS))
@@ -89,14 +88,14 @@ def choose_instructions(
         One or more sentences for each task; without file and sentence None, for the benchmark's templates.
 
     Raises:
-        ValueError: Both a file and a sentence are given, the sentence is empty, or the file is invalid or
+        UserError: Both a file and a sentence are given, the sentence is empty, or the file is invalid or
             lacks a task.
     """
     if instruction is not None:
         if paraphrases is not None:
-            raise ValueError("Give either `paraphrases` (a file) or `instruction` (a sentence), not both.")
+            raise UserError("Give either `paraphrases` (a file) or `instruction` (a sentence), not both.")
         if not instruction.strip():
-            raise ValueError("`instruction` must be a sentence. It is empty.")
+            raise UserError("`instruction` must be a sentence. It is empty.")
         return dict.fromkeys(task_ids, (" ".join(instruction.split()),))
     if paraphrases is None:
         return None
@@ -104,7 +103,7 @@ def choose_instructions(
     missing = [task_id for task_id in task_ids if task_id not in sentences]
     if missing:
         more = f" and {len(missing) - 1} more tasks" if len(missing) > 1 else ""
-        raise ValueError(
+        raise UserError(
             f"{paraphrases} (split {split!r}) has no instruction for task {missing[0]} "
             f"({get_task(missing[0]).instruction!r}){more}. Add some, or choose other tasks."
         )
@@ -127,28 +126,28 @@ def _read_rows(path: str | Path) -> list[tuple[int, str]]:
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"Cannot read the paraphrases {path}: {error}.") from error
+        raise UserError(f"Cannot read the paraphrases {path}: {error}.") from error
     reader = csv.reader(text.splitlines(keepends=True), strict=True)
     rows = []
     try:
         header = [name.strip() for name in next(reader, [])]
         if header not in (_COLUMNS, _AUTHORS_COLUMNS):
-            raise ValueError(
+            raise UserError(
                 f"expected the columns {','.join(_COLUMNS)} or {','.join(_AUTHORS_COLUMNS)} (the authors' "
                 f"file). Got {','.join(header)!r}."
             )
         for row in filter(None, reader):
             if len(row) != len(header):
-                raise ValueError(
+                raise UserError(
                     f"expected {len(header)} columns. Got {len(row)}. Put sentences with a comma between "
                     "double quotes."
                 )
             number, sentence = row[-2].strip(), " ".join(row[-1].split())
             if not sentence:
-                raise ValueError("the instruction is empty.")
+                raise UserError("the instruction is empty.")
             rows.append((get_task(int(number) if number.isdecimal() else number).index, sentence))  # type: ignore[arg-type]
     except (csv.Error, ValueError) as error:
-        raise ValueError(f"{path}, line {max(reader.line_num, 1)}: {error}") from None
+        raise UserError(f"{path}, line {max(reader.line_num, 1)}: {error}") from None
     if not rows:
-        raise ValueError(f"{path} has no instructions.")
+        raise UserError(f"{path} has no instructions.")
     return rows

@@ -23,6 +23,8 @@ from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_deltaco.errors import UserError
+
 logger = logging.getLogger(__name__)
 
 _TOLERANCE = 1e-3  # of numbers beyond the range of the statistics, as a fraction of it
@@ -54,7 +56,7 @@ def open_dataset(
 
     Raises:
         FileNotFoundError: The folder holds no dataset, or a file of it is missing.
-        ValueError: The dataset is damaged, or has no such episode.
+        UserError: The dataset is damaged, or has no such episode.
     """
     check_dataset_folder(option, root)
     with missing_files_named(repo_id, root, episodes):
@@ -70,7 +72,7 @@ def open_folder_or_hub(name: str) -> LeRobotDataset:
 
     Raises:
         FileNotFoundError: The folder holds no dataset.
-        ValueError: The dataset is damaged.
+        UserError: The dataset is damaged.
     """
     folder = Path(name)
     if not folder.exists() and len(folder.parts) == 2:
@@ -119,10 +121,10 @@ def check_episode_numbers(repo_id: str, total: int, episodes: Sequence[int]) -> 
     """Checks that a dataset has episodes.
 
     Raises:
-        ValueError: It does not.
+        UserError: It does not.
     """
     if not len(episodes) or not all(0 <= episode < total for episode in episodes):
-        raise ValueError(
+        raise UserError(
             f"{repo_id} has the episodes 0 to {total - 1}. Got {shortened(episodes)}. Name others in "
             "`demo_episodes` or --dataset.episodes."
         )
@@ -154,7 +156,7 @@ def episodes_trained_on(meta: LeRobotDatasetMetadata) -> list[int]:
     These are --dataset.episodes without those of --dataset.eval_split, which are the last ones of each task.
 
     Raises:
-        ValueError: There is no such episode.
+        UserError: There is no such episode.
     """
     chosen = list(dict.fromkeys(training_argument("dataset.episodes") or range(meta.total_episodes)))
     check_episode_numbers(meta.repo_id, meta.total_episodes, chosen)
@@ -233,7 +235,7 @@ def read_frame(dataset: LeRobotDataset, row: int, camera: str) -> dict[str, Any]
     """Returns a row of a dataset; an error names the frame whose image cannot be decoded.
 
     Raises:
-        ValueError: An image of a camera cannot be decoded.
+        UserError: An image of a camera cannot be decoded.
     """
     with decoding(dataset, row, camera):
         item = dataset[row]
@@ -245,12 +247,12 @@ def decoding(dataset: LeRobotDataset, row: int, camera: str) -> Iterator[None]:
     """Names the frame in errors while an image of a camera is decoded.
 
     Raises:
-        ValueError: It fails; the message names the frame.
+        UserError: It fails; the message names the frame.
     """
     try:
         yield
     except Exception as error:
-        raise ValueError(
+        raise UserError(
             f"The image {camera} in {frame_name(dataset, row, camera)} cannot be decoded: {error}. Record "
             "the episode again, or leave it out with --dataset.episodes."
         ) from error
@@ -263,14 +265,14 @@ def check_dataset(dataset: LeRobotDataset) -> None:
     """Checks that a dataset is not damaged, and that what it stores twice agrees.
 
     Raises:
-        ValueError: It is, or does not; the message names the episode and the file.
+        UserError: It is, or does not; the message names the episode and the file.
     """
     _check_tasks(dataset.meta)
     _check_episodes(dataset)
     stats = dataset.meta.stats or {}
     for name in (ACTION, OBS_STATE):
         if name in dataset.meta.features and not {"min", "max", "mean", "std"} <= set(stats.get(name, ())):
-            raise ValueError(
+            raise UserError(
                 f"{dataset.meta.root / 'meta/stats.json'} has no statistics of `{name}`, which normalize it. "
                 "Compute them with LeRobot's lerobot-edit-dataset, or record the dataset again."
             )
@@ -284,7 +286,7 @@ def _check_tasks(meta: LeRobotDatasetMetadata) -> None:
     indices = meta.tasks["task_index"].tolist()
     if indices != list(range(len(indices))):
         wrong = next(n for n, index in enumerate(indices) if index != n)
-        raise ValueError(
+        raise UserError(
             f"In {meta.root / 'meta/tasks.parquet'}, row {wrong} has the `task_index` {indices[wrong]}, but "
             "LeRobot finds tasks by their rows. Sort the rows, and number them from 0."
         )
@@ -322,7 +324,7 @@ def _check_episodes(dataset: LeRobotDataset) -> None:
         ):
             problem = f"its frames are not those with the indices {start} to {stop - 1}, as in the table"
         if problem is not None:
-            raise ValueError(
+            raise UserError(
                 f"Episode {episode} of {dataset.repo_id}: {problem} (frames: "
                 f"{meta.root / meta.get_data_file_path(episode)}; table: {meta.root / 'meta/episodes'}). "
                 "Convert or record the dataset again, or leave out the episode with --dataset.episodes."
@@ -342,7 +344,7 @@ def _check_numbers(dataset: LeRobotDataset, name: str, stats: dict[str, Any]) ->
             problem = f"is outside of the range in {dataset.meta.root / 'meta/stats.json'}"
     if wrong.any():
         row, dimension = np.argwhere(wrong)[0]
-        raise ValueError(
+        raise UserError(
             f"`{name}` {problem}: dimension {dimension} is {values[row, dimension]:g} in "
             f"{frame_name(dataset, int(row))}. {int(wrong.any(axis=1).sum())} frames are such. Leave out "
             "damaged episodes with --dataset.episodes; compute wrong statistics again."

@@ -37,6 +37,7 @@ from lerobot_deltaco.data.frames import memory_for_frames
 from lerobot_deltaco.data.grasps import Grasp, find_grasps, follows_gripper
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import open_folder_or_hub
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments
 from lerobot_deltaco.pages.html import picture_uri, render
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
@@ -114,7 +115,7 @@ def check(arguments: CheckArguments) -> str:
         The report.
 
     Raises:
-        ValueError: Training would refuse the dataset; the message has the reason, and the report.
+        UserError: Training would refuse the dataset; the message has the reason, and the report.
     """
     opened = open_folder_or_hub(arguments.dataset)
     config = DeltacoMatchConfig(**asdict(arguments.policy))
@@ -154,7 +155,7 @@ def check(arguments: CheckArguments) -> str:
     ]
     report = "\n".join(lines)
     if start.refusal is not None:
-        raise ValueError(f"Training would refuse this dataset. {start.refusal}\n{report}")
+        raise UserError(f"Training would refuse this dataset. {start.refusal}\n{report}")
     return report
 
 

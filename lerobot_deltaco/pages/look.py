@@ -16,6 +16,7 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.data.demonstrations import as_uint8, read_demonstrations, read_robot_data
 from lerobot_deltaco.data.reading import open_folder_or_hub
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import (
     benchmark_env,
@@ -52,12 +53,12 @@ def look(arguments: LookArguments) -> str:
         How many are right, and where the page is.
 
     Raises:
-        ValueError: The policy finds no locations, or does not fit the dataset.
+        UserError: The policy finds no locations, or does not fit the dataset.
     """
     checkpoint, dataset, episodes = arguments.checkpoint, arguments.dataset, arguments.episodes
     loaded = load_conditioned(checkpoint)
     if not isinstance(loaded.policy, DeltacoMatchPolicy):
-        raise ValueError(
+        raise UserError(
             f"{checkpoint} holds a policy of the type {loaded.policy.config.type!r}, which does not look for "
             "locations. `deltaco look` needs one of the type deltaco_match."
         )
@@ -192,19 +193,19 @@ def _check_features(config: TaskConditionedConfig, dataset: LeRobotDataset) -> N
     """Checks that a dataset has the policy's observations.
 
     Raises:
-        ValueError: It does not.
+        UserError: It does not.
     """
     features = dataset.meta.features
     missing = [name for name in (*(config.input_features or {}), ACTION) if name not in features]
     if missing:
-        raise ValueError(
+        raise UserError(
             f"The policy needs {missing[0]!r}, which {dataset.repo_id} does not have. Its features are "
             f"{', '.join(name for name in features if name.startswith(('observation', 'action')))}."
         )
     for name, feature in (config.input_features or {}).items():
         shape = tuple(features[name]["shape"])
         if name not in config.image_features and shape != tuple(feature.shape):
-            raise ValueError(
+            raise UserError(
                 f"{dataset.repo_id} is of another robot: its {name!r} has the shape {shape}, that of the "
                 f"policy {tuple(feature.shape)}. Name a dataset of the policy's robot."
             )

@@ -17,6 +17,7 @@ from gym_deltaco.layout import Layout
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import N_ROWS, TASKS, ContainerWord, get_task, select_tasks
 from lerobot_deltaco.data.demonstrations import Demonstration
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.video import (
     benchmark_env,
     find_demonstration,
@@ -33,7 +34,7 @@ os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")
 try:
     import gradio as gr
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
+    raise UserError(
         "The page needs Gradio. Install the extra `play`: pip install 'lerobot_policy_deltaco[play]'"
     ) from error
 
@@ -111,7 +112,7 @@ class Player:
         uses: What the policy may receive, of `BOTH`, `DEMONSTRATION` and `INSTRUCTION`.
 
     Raises:
-        ValueError: There is no checkpoint, or its policy is not one for the benchmark.
+        UserError: There is no checkpoint, or its policy is not one for the benchmark.
     """
 
     def __init__(self, checkpoint: str | Path) -> None:
@@ -162,11 +163,11 @@ class Player:
         """Runs an episode.
 
         Raises:
-            ValueError: The instruction is needed and empty.
+            UserError: The instruction is needed and empty.
         """
         sentence = "" if choice.use == DEMONSTRATION else " ".join(choice.sentence.split())
         if not sentence and choice.use != DEMONSTRATION:
-            raise ValueError("Type an instruction first, or use the demonstration only.")
+            raise UserError("Type an instruction first, or use the demonstration only.")
         demonstration = self.demonstration(choice)
         shown = [] if choice.use == INSTRUCTION else [demonstration]
         recording = record_episode(
@@ -200,10 +201,10 @@ class Player:
         The demonstrations show two of the scene's objects, and the sentences name only the bin.
 
         Raises:
-            ValueError: The policy does not take both inputs.
+            UserError: The policy does not take both inputs.
         """
         if BOTH not in self.uses:
-            raise ValueError("The comparison needs a policy that takes a demonstration and an instruction.")
+            raise UserError("The comparison needs a policy that takes a demonstration and an instruction.")
         _, layout = self.show_scene(choice)
         labels = [item.label for item in layout.objects]
         fitting = [label for label in labels if get_task(choice.demonstrated).describes(label)]
@@ -411,7 +412,7 @@ def play(arguments: PlayArguments) -> None:
     """Serves the page on this machine until it is interrupted.
 
     Raises:
-        ValueError: There is no checkpoint, its policy is not one for the benchmark, or the port is taken.
+        UserError: There is no checkpoint, its policy is not one for the benchmark, or the port is taken.
     """
     chosen = Path(arguments.checkpoint) if arguments.checkpoint else shipped_checkpoint()
     page = build_page(Player(chosen), arguments.checkpoint or chosen.name)
@@ -429,4 +430,4 @@ def play(arguments: PlayArguments) -> None:
             footer_links=[],
         )
     except OSError as error:
-        raise ValueError(f"Port {arguments.port} is taken. Choose another one with --port.") from error
+        raise UserError(f"Port {arguments.port} is taken. Choose another one with --port.") from error

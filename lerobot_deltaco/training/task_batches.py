@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_deltaco.errors import UserError
+
 
 class TaskBatchSampler:
     """Frames in an order whose successive batches hold the same number of samples of each of a few tasks.
@@ -26,7 +28,7 @@ class TaskBatchSampler:
         use: Whether each frame may be drawn, (frames,) bool; all by default.
 
     Raises:
-        ValueError: The numbers do not fit together; the message says what is valid.
+        UserError: The numbers do not fit together; the message says what is valid.
     """
 
     def __init__(
@@ -40,7 +42,7 @@ class TaskBatchSampler:
         use: NDArray[np.bool_] | None = None,
     ) -> None:
         if batch_size % tasks_per_batch:
-            raise ValueError(
+            raise UserError(
                 f"A batch of {batch_size} samples cannot hold {tasks_per_batch} tasks with as many samples "
                 f"each. Set `batch_size` to a multiple of `tasks_per_batch`, such as "
                 f"{max(1, round(batch_size / tasks_per_batch)) * tasks_per_batch}."
@@ -64,7 +66,7 @@ class TaskBatchSampler:
         if upsampled:
             n_upsampled = round(fraction * tasks_per_batch)
             if not 0 < n_upsampled < tasks_per_batch:
-                raise ValueError(
+                raise UserError(
                     "`upsampled_fraction` must leave at least one of the tasks of a batch to the upsampled "
                     f"ones, and one to the others. Got {fraction} of {tasks_per_batch} tasks."
                 )
@@ -75,7 +77,7 @@ class TaskBatchSampler:
         for members, n_tasks in groups:
             if len(members) < n_tasks:
                 kind = "upsampled tasks" if upsampled and members == groups[0][0] else "tasks"
-                raise ValueError(
+                raise UserError(
                     f"Each batch is to hold {n_tasks} different {kind}, but the dataset has only "
                     f"{len(members)}. Set `tasks_per_batch` to fewer, or to 0 for batches of any tasks."
                 )

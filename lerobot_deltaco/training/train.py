@@ -25,6 +25,7 @@ from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.data.grasps import Grasp, find_grasps
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import check_dataset_folder, missing_files_named
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig, check_image_shapes
 from lerobot_deltaco.policies.base.optimization import keep_freed_memory
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
@@ -60,7 +61,7 @@ class _InMemoryTraining:
         """Makes LeRobot's datasets, the first of them in memory."""
         policy = config.policy
         if policy is None or config.dataset.streaming:
-            raise ValueError(
+            raise UserError(
                 "`deltaco train` trains policies on frames in memory. For reward models and "
                 "--dataset.streaming, use `lerobot-train`."
             )
@@ -109,13 +110,13 @@ def image_size_in_memory(dataset: LeRobotDataset, policy: PreTrainedConfig) -> i
     """Returns the size to which images are scaled in memory; None for their own.
 
     Raises:
-        ValueError: The dataset cannot be held in memory.
+        UserError: The dataset cannot be held in memory.
     """
     if isinstance(policy, TaskConditionedConfig):
         features = dataset_to_policy_features(dataset.meta.features)
         check_image_shapes({name: features[name].shape for name in dataset.meta.camera_keys})
     if dataset.meta.depth_keys or dataset.meta.has_language_columns:
-        raise ValueError(
+        raise UserError(
             "The dataset has depth images or columns of messages, which only `lerobot-train` prepares."
         )
     if isinstance(policy, TaskConditionedConfig):
@@ -163,7 +164,7 @@ def _upsampled(pattern: str | None, task_names: Sequence[str], present: set[int]
         return []
     found = [n for n, name in enumerate(task_names) if n in present and re.search(pattern, name)]
     if not found:
-        raise ValueError(
+        raise UserError(
             f"`upsampled_tasks` is {pattern!r}, which is found in no task of the dataset. They are such as "
             f"{task_names[0]!r}."
         )
