@@ -150,6 +150,7 @@ def test_after_an_interrupt_training_names_the_command_that_continues(monkeypatc
         (["evaluate", "run", "--rename-map", "[1]"], "--rename-map must be a JSON object"),
         (["collect", "--root", "data", "--tasks", "4", "--episodes-per-task", "0"], "must be at least 1"),
     ],
+    ids=lambda value: value[0] if isinstance(value, list) else None,
 )
 def test_a_wrong_argument_is_one_line(monkeypatch, arguments, message):
     monkeypatch.setattr(sys, "argv", ["deltaco", *arguments])

@@ -16,6 +16,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from gym_deltaco.env import ACTION_NAMES
 from lerobot_deltaco.data.paraphrases import GRAMMAR
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.optimization import CosineSchedulerConfig, FusedAdamWConfig
 
 logger = logging.getLogger(__name__)
@@ -123,11 +124,11 @@ class TaskConditionedConfig(PreTrainedConfig):
         """Checks the options.
 
         Raises:
-            ValueError: An option is invalid; the message says what is valid.
+            UserError: An option is invalid; the message says what is valid.
         """
         self.check_choices(gripper_closed=("low", "high"), dtype=("float32", "bfloat16"))
         if self.gripper not in ("auto", "none") and not self.gripper.isdecimal():
-            raise ValueError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
+            raise UserError(f"`gripper` must be 'auto', 'none' or an index. Got {self.gripper!r}.")
         self.check_ranges(
             p_paraphrase=(0, 1),
             image_size=(16, 1024),
@@ -141,12 +142,12 @@ class TaskConditionedConfig(PreTrainedConfig):
             seed=(0, 2**63 - 1),
         )
         if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
-            raise ValueError(
+            raise UserError(
                 "`temporal_ensemble_coeff` needs `n_action_steps=1`: it predicts a chunk at every step. "
                 f"Got {self.n_action_steps}."
             )
         if self.demo_repo_id is not None and not self.demo_repo_id.strip():
-            raise ValueError(
+            raise UserError(
                 "`demo_repo_id` is empty. Name a dataset, such as USER/NAME, or leave it out. With "
                 "--policy.demo_root, any name will do."
             )
@@ -155,7 +156,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         for kind, valid in {"VISUAL": ("IDENTITY",), "ACTION": ("MIN_MAX", "IDENTITY")}.items():
             mode = self.normalization_mapping.get(kind, NormalizationMode.IDENTITY)
             if mode.name not in valid:
-                raise ValueError(
+                raise UserError(
                     f"`normalization_mapping` must be {' or '.join(valid)} for {kind}. Got {mode.name}."
                 )
 
@@ -163,23 +164,23 @@ class TaskConditionedConfig(PreTrainedConfig):
         """Checks that options are among their valid values.
 
         Raises:
-            ValueError: One is not.
+            UserError: One is not.
         """
         for name, valid in choices.items():
             if getattr(self, name) not in valid:
                 names = ", ".join(filter(None, valid))
-                raise ValueError(f"`{name}` must be one of {names}. Got {getattr(self, name)!r}.")
+                raise UserError(f"`{name}` must be one of {names}. Got {getattr(self, name)!r}.")
 
     def check_ranges(self, **ranges: tuple[float, float]) -> None:
         """Checks that options, if given, are between their minimum and maximum valid values.
 
         Raises:
-            ValueError: One is not.
+            UserError: One is not.
         """
         for name, (least, greatest) in ranges.items():
             value = getattr(self, name)
             if value is not None and not least <= value <= greatest:
-                raise ValueError(f"`{name}` must be from {least} to {greatest}. Got {value}.")
+                raise UserError(f"`{name}` must be from {least} to {greatest}. Got {value}.")
 
     # From the dataset
 
@@ -192,7 +193,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         it again with the statistics, which tell which of several grippers moves.
 
         Raises:
-            ValueError: The names of the action's dimensions cannot be read.
+            UserError: The names of the action's dimensions cannot be read.
         """
         action = features.get("action", {})
         if action.get("names") == ACTION_NAMES:
@@ -231,10 +232,10 @@ class TaskConditionedConfig(PreTrainedConfig):
         """Checks the inputs and outputs that LeRobot found in the dataset.
 
         Raises:
-            ValueError: There is no camera, no action, or no such gripper.
+            UserError: There is no camera, no action, or no such gripper.
         """
         if not self.image_features:
-            raise ValueError(
+            raise UserError(
                 "The policy needs at least one camera. The dataset's inputs are "
                 f"{', '.join(sorted(self.input_features or {})) or 'none'}."
             )
@@ -242,12 +243,12 @@ class TaskConditionedConfig(PreTrainedConfig):
         check_image_shapes({name: feature.shape for name, feature in self.image_features.items()})
         (action_dim,) = self.action_feature.shape
         if self.gripper_index is not None and not self.gripper_index < action_dim:
-            raise ValueError(
+            raise UserError(
                 f"`gripper` is {self.gripper_index}, but the action has only the dimensions 0 to "
                 f"{action_dim - 1}. Name one of these, or 'none'."
             )
         if self.demo_camera is not None and self.demo_camera not in self.image_features:
-            raise ValueError(
+            raise UserError(
                 f"`demo_camera` must be one of the dataset's cameras, {', '.join(self.image_features)}. Got "
                 f"{self.demo_camera!r}."
             )
@@ -328,14 +329,14 @@ def dimension_names(feature: dict[str, Any]) -> list[str]:
     These are a list, lists in a list or under names of groups, and a dictionary from name to index.
 
     Raises:
-        ValueError: The names cannot be read, or are not as many as the dimensions.
+        UserError: The names cannot be read, or are not as many as the dimensions.
     """
     names, shape = feature.get("names"), feature.get("shape", ())
     if names is None:
         return []
     found = _flat_names(names)
     if not all(isinstance(name, str) for name in found) or (len(shape) == 1 and len(found) != shape[0]):
-        raise ValueError(
+        raise UserError(
             f"The `names` of 'action' in meta/info.json must name each of its {shape[0] if shape else '?'} "
             f"dimensions. Got {names}. Correct them, or set --policy.gripper to the gripper's dimension, or "
             "to none."
@@ -360,11 +361,11 @@ def check_image_shapes(shapes: dict[str, Sequence[int]]) -> None:
         shapes: Shapes of the cameras' images, by name.
 
     Raises:
-        ValueError: One does not, such as a depth camera.
+        UserError: One does not, such as a depth camera.
     """
     wrong = {name: tuple(shape) for name, shape in shapes.items() if len(shape) != 3 or shape[0] != 3}
     if wrong:
-        raise ValueError(
+        raise UserError(
             f"Images must have the shape (3, height, width). Got {wrong}. Leave out depth and gray cameras: "
             "lerobot-edit-dataset --repo_id=DATASET --operation.type=remove_feature "
             f'--operation.feature_names="{list(wrong)}" makes a dataset without them.'

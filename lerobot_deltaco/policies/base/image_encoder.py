@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.networks import channels_last
 
 # Mean and standard deviation of ImageNet, with which R3M and feature matching normalize images.
@@ -40,7 +41,7 @@ _BLOCKS = tuple(
 )
 
 
-class PretrainedWeightsError(RuntimeError):
+class PretrainedWeightsError(UserError):
     """Raised when weights of a frozen image encoder cannot be loaded; the message says what to do."""
 
 

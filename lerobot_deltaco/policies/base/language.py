@@ -18,6 +18,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
+from lerobot_deltaco.errors import UserError
+
 if TYPE_CHECKING:
     from transformers import BertModel
 
@@ -126,11 +128,11 @@ class Paraphrases:
         """Returns the sentences of a task.
 
         Raises:
-            ValueError: There are none, and there should be.
+            UserError: There are none, and there should be.
         """
         found = self.sentences.get(task, ())
         if self.is_complete and not found:
-            raise ValueError(
+            raise UserError(
                 f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add some."
             )
         return found
@@ -151,7 +153,7 @@ class Paraphrases:
             generator: Source of the draws, on the CPU.
 
         Raises:
-            ValueError: There is no sentence for a task, and there should be.
+            UserError: There is no sentence for a task, and there should be.
         """
         draws = torch.rand(len(tasks), generator=generator).tolist()
         drawn = []

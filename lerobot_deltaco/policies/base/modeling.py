@@ -35,6 +35,7 @@ from lerobot_deltaco.data.reading import (
     open_dataset,
     training_argument,
 )
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.action_queues import ActionQueues
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.base.language import InstructionEmbeddings, Paraphrases
@@ -134,10 +135,10 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             demonstrations: One or more demonstrations of each sample's task; an empty list leaves them out.
 
         Raises:
-            ValueError: They differ in number.
+            UserError: They differ in number.
         """
         if len(instructions) != len(demonstrations):
-            raise ValueError(
+            raise UserError(
                 f"There must be as many lists of demonstrations as instructions. Got {len(demonstrations)} "
                 f"and {len(instructions)}."
             )
@@ -156,7 +157,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             Actions, (batch, action), normalized as in `forward`.
 
         Raises:
-            ValueError: There is no instruction, or a task has no demonstration.
+            UserError: There is no instruction, or a task has no demonstration.
             FloatingPointError: The action is not finite, or absurdly large.
         """
         # In bfloat16, in which LeRobot's training evaluates, an action would depend on the rest of the batch.
@@ -197,7 +198,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         tasks = batch.get("task")
         if isinstance(tasks, (list, tuple)) and tasks and all(isinstance(task, str) for task in tasks):
             return tuple(tasks), None
-        raise ValueError(
+        raise UserError(
             "`task` must be a list with an instruction for each sample of the batch. Got "
             f"{'none' if tasks is None else repr(tasks)}. LeRobot takes it from the environment's "
             '`task_description`, or from --task; in Python, set observation["task"] before the preprocessor.'
@@ -211,11 +212,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             n_each: Number of demonstrations of each sample.
 
         Raises:
-            ValueError: There is no demonstration of a task.
+            UserError: There is no demonstration of a task.
         """
         bank = self.demonstrations if self.demonstrations is not None else self.training_bank
         if bank is None:
-            raise ValueError(
+            raise UserError(
                 "The policy has no demonstrations. Name a dataset of them with --policy.demo_repo_id and "
                 "--policy.demo_root, or pass some to `set_tasks`."
             )
@@ -291,7 +292,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     def _read_training_data(self) -> None:
         if self._meta is None:
-            raise ValueError("Training needs the metadata of the dataset. Pass them as `dataset_meta`.")
+            raise UserError("Training needs the metadata of the dataset. Pass them as `dataset_meta`.")
         frames = getattr(self._meta, "frames_in_memory", None)
         if frames is not None and self.config.demo_episodes is None:
             bank = frames.demonstrations(
@@ -396,7 +397,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         See `PreTrainedPolicy.from_pretrained` for the arguments.
 
         Raises:
-            ValueError: A file of the checkpoint is damaged, or does not fit the others.
+            UserError: A file of the checkpoint is damaged, or does not fit the others.
         """
         policy = super().from_pretrained(pretrained_name_or_path, **{**kwargs, "strict": True})
         path = checkpoint_file(pretrained_name_or_path, TASK_BANK, **kwargs)
@@ -421,7 +422,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         try:
             policy = super()._load_as_safetensor(model, model_file, map_location, strict)
         except RuntimeError as error:
-            raise ValueError(
+            raise UserError(
                 f"{model_file} does not have the weights of this policy: "
                 f"{str(error).splitlines()[-1].strip()} "
                 "The config.json beside it belongs to other weights, or to another version."
@@ -431,7 +432,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             policy.state_limits = limits
         damaged = _not_finite(policy.state_dict())
         if damaged:
-            raise ValueError(
+            raise UserError(
                 f"{model_file} is damaged: the weight {damaged[0]} has numbers that are not finite."
             )
         return policy
@@ -458,11 +459,11 @@ def _check_resumed_data(policy: TaskConditionedPolicy, saved_with: str | None) -
     LeRobot keeps the checkpoint's processors, which would normalize other data by the old statistics.
 
     Raises:
-        ValueError: The statistics of the dataset differ.
+        UserError: The statistics of the dataset differ.
     """
     assert policy._stats is not None
     if saved_with is not None and saved_with != made_processors_digest(policy.config, policy._stats):
-        raise ValueError(
+        raise UserError(
             "The dataset is not the one that the training began with: its statistics differ. Resume on the "
             "same data, or begin a new training from the checkpoint with --policy.path."
         )

@@ -35,6 +35,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.language import InstructionEmbeddings
 
 TASK_BANK = "tasks.safetensors"
@@ -183,7 +184,7 @@ def processors_digest(pretrained: str | Path, **options: Any) -> str | None:
         options: Arguments of `PreTrainedPolicy.from_pretrained`.
 
     Raises:
-        ValueError: They are damaged.
+        UserError: They are damaged.
     """
     found = []
     for name in (POLICY_PREPROCESSOR_DEFAULT_NAME, POLICY_POSTPROCESSOR_DEFAULT_NAME):
@@ -199,7 +200,7 @@ def processors_digest(pretrained: str | Path, **options: Any) -> str | None:
                 tensors = load_file(checkpoint_file(pretrained, state, **options)) if state else {}
                 found.append(_digest([step["registry_name"], kept], tensors))
         except (OSError, SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
-            raise ValueError(
+            raise UserError(
                 f"{path} is damaged: {error!r}. Fetch or copy all files of the checkpoint again."
             ) from error
     return _digest(found, {})

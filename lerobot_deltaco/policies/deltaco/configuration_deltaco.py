@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.base.language import LANGUAGE_ENCODERS, MINILM_L3
 from lerobot_deltaco.policies.base.losses import GRIPPER_LOSSES
@@ -114,7 +115,7 @@ class DeltacoConfig(TaskConditionedConfig):
         """Checks the options.
 
         Raises:
-            ValueError: An option is invalid; the message says what is valid.
+            UserError: An option is invalid; the message says what is valid.
         """
         super().check()
         self.check_choices(
@@ -138,16 +139,16 @@ class DeltacoConfig(TaskConditionedConfig):
     def _check_conditioning(self) -> None:
         overridden = [name for name in ("film", "concat", "encoder_loss") if getattr(self, name) is not None]
         if overridden and self.method in ("one_hot", "mcil"):
-            raise ValueError(f"`{overridden[0]}` cannot be changed in the method {self.method!r}.")
+            raise UserError(f"`{overridden[0]}` cannot be changed in the method {self.method!r}.")
         encoder_loss = self.conditioning.encoder_loss
         if encoder_loss != "none" and not self.uses_demonstrations:
-            raise ValueError(
+            raise UserError(
                 f"`encoder_loss` is {encoder_loss!r}, but no demonstration is used. Set it to 'none', or use "
                 "one in `film` or `concat`."
             )
         is_compared = encoder_loss != "none" or self.method == "mcil"
         if is_compared and self.demo_dim != self.embedding_dim:
-            raise ValueError(
+            raise UserError(
                 f"The demonstrations' embeddings, of {self.vision_encoder!r}, have {self.demo_dim} numbers, "
                 f"and the instructions' have {self.embedding_dim}. To compare them, give `demo_head` layers, "
                 "such as [256]; or set `encoder_loss` to 'none'."

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank, sample_frames
 from lerobot_deltaco.data.reading import warn_of_equal_instructions
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.language import InstructionEmbeddings
 from lerobot_deltaco.policies.base.losses import contrastive_logits, contrastive_loss, cosine_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
@@ -78,7 +79,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         self.config: DeltacoConfig = config
         if config.method == "one_hot" and not config.one_hot_tasks:
             if dataset_meta is None:
-                raise ValueError("A one-hot policy needs the tasks that it knows: set `one_hot_tasks`.")
+                raise UserError("A one-hot policy needs the tasks that it knows: set `one_hot_tasks`.")
             config.one_hot_tasks = list(dataset_meta.tasks.index)
         self.model = _make_network(config)
         self.demo_encoder = _make_demo_encoder(config)
@@ -106,7 +107,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
             The loss, () or (batch,), and the scalars to log.
 
         Raises:
-            ValueError: A task has no demonstration, or is not known to a one-hot policy.
+            UserError: A task has no demonstration, or is not known to a one-hot policy.
             TrainingDivergedError: The loss is not finite.
         """
         generator, tasks = self._step_generator(), list(batch["task"])
@@ -220,7 +221,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
             missing = needs_instruction and not all(instructions)
             missing |= self.config.uses_demonstrations and not all(demonstrations or ())
         if missing:
-            raise ValueError(
+            raise UserError(
                 f"The method {self.config.method!r} is missing an input. Pass an instruction and a "
                 "demonstration of each sample's task, whichever the method takes."
             )
@@ -377,11 +378,11 @@ def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) ->
     """Returns one-hot vectors of tasks, (batch, known tasks).
 
     Raises:
-        ValueError: A task is not known.
+        UserError: A task is not known.
     """
     unknown = next((task for task in tasks if task not in known), None)
     if unknown is not None:
-        raise ValueError(
+        raise UserError(
             f"This one-hot policy does not know the task {unknown!r}. It knows the {len(known)} tasks of its "
             f"training dataset, such as {known[0]!r}."
         )

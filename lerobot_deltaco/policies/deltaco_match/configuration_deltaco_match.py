@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 
 
@@ -61,7 +62,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         """Checks the options.
 
         Raises:
-            ValueError: An option is invalid; the message says what is valid.
+            UserError: An option is invalid; the message says what is valid.
         """
         super().check()
         self.check_ranges(
@@ -74,7 +75,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             frames_after_release=(0, 1_000_000),
         )
         if self.n_demonstrations > 1 and self.demo_episode is not None:
-            raise ValueError(
+            raise UserError(
                 "`demo_episode` names a single demonstration, but `n_demonstrations` is "
                 f"{self.n_demonstrations}. Set `demo_episode` to null, or `n_demonstrations` to 1."
             )
@@ -85,7 +86,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         """Finds out which dimension is the gripper, how far it moves, and how actions are scaled.
 
         Raises:
-            ValueError: The names of the action's dimensions cannot be read.
+            UserError: The names of the action's dimensions cannot be read.
         """
         super().set_dataset_feature_metadata(features, stats)
         if stats is not None and self.gripper_index is not None:
@@ -100,11 +101,11 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         """Checks the inputs and outputs that LeRobot found in the dataset.
 
         Raises:
-            ValueError: There is no camera, no state, or no gripper.
+            UserError: There is no camera, no state, or no gripper.
         """
         super().validate_features()
         if self.gripper_index is None or not self.state_dim:
-            raise ValueError(
+            raise UserError(
                 "`deltaco_match` learns where objects are from when the gripper closes and opens: it needs "
                 "the feature 'observation.state' and a gripper among the action's dimensions, which "
                 "`gripper` names. Without them, train --policy.type=deltaco."

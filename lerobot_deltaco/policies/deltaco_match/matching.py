@@ -30,6 +30,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.networks import gaussian_maps
 from lerobot_deltaco.policies.deltaco_match import proposals
 from lerobot_deltaco.policies.deltaco_match.crops import (
@@ -247,7 +248,7 @@ class FeatureMatching(nn.Module):
                 on a CPU that has it.
 
         Raises:
-            ValueError: No task has two episodes with a grasp, or no proposal is near a grasp.
+            UserError: No task has two episodes with a grasp, or no proposal is near a grasp.
             PretrainedWeightsError: The encoder's weights are missing.
         """
         generator, device = torch.Generator().manual_seed(seed), images.device
@@ -300,7 +301,7 @@ class FeatureMatching(nn.Module):
                     kept.append(some[near.cpu()])
                 progress.update(len(some))
         if not kept:
-            raise ValueError(
+            raise UserError(
                 "Feature matching finds nothing to grasp in the first images where the gripper closes. Check "
                 "that the first camera stands still and shows the objects, or name another with "
                 "--policy.demo_camera."
@@ -542,7 +543,7 @@ class _Pairs:
             rows.setdefault(task, []).append(row)
         self._rows = [torch.tensor(own) for own in rows.values() if len(own) > 1]
         if not self._rows:
-            raise ValueError(
+            raise UserError(
                 "Feature matching needs tasks with at least two episodes in which the gripper closes on "
                 f"an object. The {len(tasks)} such episodes are of {len(rows)} different tasks. Add episodes."
             )

@@ -40,6 +40,7 @@ from lerobot_deltaco.data.grasps import (
 )
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import (
@@ -187,7 +188,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             The loss, () or (batch,), and the scalars to log.
 
         Raises:
-            ValueError: The training data do not fit; the message says why.
+            UserError: The training data do not fit; the message says why.
             TrainingDivergedError: The loss is not finite.
         """
         self._prepare_training()
@@ -392,7 +393,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         attention = last = described = heights = None
         if stacked is None:
             if not bool(by_instruction.all()):
-                raise ValueError("Neither a demonstration nor an instruction is given. Pass one of them.")
+                raise UserError("Neither a demonstration nor an instruction is given. Pass one of them.")
         else:
             n_each = stacked.ends.shape[1]
             ends, states = stacked.ends.flatten(0, 1), stacked.pick_states.flatten(0, 1)
@@ -422,7 +423,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """Stacks the demonstrations of a batch; None if they are left out."""
         counts = {len(own) for own in demonstrations}
         if len(counts) != 1:
-            raise ValueError(
+            raise UserError(
                 f"The samples of a batch must have as many demonstrations each. Got {sorted(counts)}."
             )
         if counts == {0}:
@@ -463,7 +464,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             robot_data: States and actions of the robot in them.
 
         Raises:
-            ValueError: There are too few episodes in which the gripper closes and opens, or no task with two
+            UserError: There are too few episodes in which the gripper closes and opens, or no task with two
                 of them.
             PretrainedWeightsError: The weights that feature matching needs are missing.
         """
@@ -482,7 +483,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         n_grasps = int(keyframes.has_grasp.sum())
         if n_grasps < MIN_EPISODES:
             assert self._meta is not None
-            raise ValueError(
+            raise UserError(
                 f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} episodes "
                 f"in which the gripper closes and opens. Got {n_grasps}. Collect more, or train "
                 "--policy.type=deltaco with --policy.demo_encoder=attention, which needs none. The gripper "
@@ -534,7 +535,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         sizes = (data.states.shape[1], data.actions.shape[1])
         expected = (self.config.state_dim, self.config.action_feature.shape[0])
         if sizes != expected:
-            raise ValueError(
+            raise UserError(
                 f"The demonstrations in {self.config.demo_repo_id} are of another robot: their states and "
                 f"actions have {sizes[0]} and {sizes[1]} numbers, those of the policy {expected[0]} and "
                 f"{expected[1]}. Name a dataset of the policy's robot."
