@@ -79,7 +79,7 @@ class Evaluation:
         """Runs the episodes of a batch, and returns the row of each in the record."""
         batch = self.batches[number]
         demonstrations = [self._demonstrations(episode) for episode in batch]
-        with self._computing(batch):
+        with self._inference(batch):
             infos = run_episodes(
                 self.loaded, self._envs, batch, demonstrations, joint_noise=self.plan.joint_noise
             )
@@ -121,17 +121,17 @@ class Evaluation:
         if isinstance(self._bank, DemonstrationBank) and config.demo_episode is not None:
             return [self._bank.of_episode(config.demo_episode)]
         task = get_task(episode.demonstration_task)
-        known = self._bank.of_task(task.instruction, task.target_object)
-        n_each = self.plan.n_demonstrations
-        if len(known) < n_each:
+        available = self._bank.of_task(task.instruction, task.target_object)
+        count = self.plan.n_demonstrations
+        if len(available) < count:
             raise UserError(
-                f"`n_demonstrations` is {n_each}, but the task {task.instruction!r} has {len(known)}. "
+                f"`n_demonstrations` is {count}, but the task {task.instruction!r} has {len(available)}. "
                 "Collect more and name them with --demo-repo-id and --demo-root."
             )
-        return [known[(episode.trial * n_each + n) % len(known)] for n in range(n_each)]
+        return [available[(episode.trial * count + n) % len(available)] for n in range(count)]
 
     @contextmanager
-    def _computing(self, batch: Sequence[EpisodeSpec]) -> Iterator[None]:
+    def _inference(self, batch: Sequence[EpisodeSpec]) -> Iterator[None]:
         config = self.loaded.policy.config
         n_threads = torch.get_num_threads()
         with ExitStack() as stack:
@@ -180,14 +180,14 @@ def run_episodes(
     policy.reset()
     if hasattr(policy, "set_tasks"):
         policy.set_tasks(instructions, demonstrations)
-    noise = [np.random.default_rng(episode.seed) for episode in episodes]
+    generators = [np.random.default_rng(episode.seed) for episode in episodes]
     for _ in range(envs[0].scene_config.n_steps):
         if callback is not None:
             callback(envs, observations)
-        stacked = _stacked(observations)
+        stacked = _stack(observations)
         if joint_noise:
-            drawn = np.stack([rng.normal(0, np.radians(joint_noise), N_JOINTS) for rng in noise])
-            stacked["agent_pos"][:, :N_JOINTS] += drawn.astype(np.float32)
+            offsets = np.stack([rng.normal(0, np.radians(joint_noise), N_JOINTS) for rng in generators])
+            stacked["agent_pos"][:, :N_JOINTS] += offsets.astype(np.float32)
         batch = {**preprocess_observation(stacked), "task": instructions}
         actions = loaded.postprocessor(policy.select_action(loaded.preprocessor(batch)))
         steps = [env.step(action) for env, action in zip(envs, actions.cpu().numpy(), strict=True)]
@@ -197,11 +197,11 @@ def run_episodes(
     return infos
 
 
-def _stacked(observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _stack(observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns a batch of observations, of which each may contain dictionaries."""
     columns = {name: [each[name] for each in observations] for name in observations[0]}
     return {
-        name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
+        name: _stack(values) if isinstance(values[0], Mapping) else np.stack(values)
         for name, values in columns.items()
     }
 
@@ -226,9 +226,9 @@ def evaluate(loaded: LoadedPolicy, plan: EvaluationPlan, processes: int = 1) -> 
     evaluation = Evaluation(loaded, plan)
     rows: list[dict[str, Any]] = []
     with tqdm(total=sum(map(len, evaluation.batches)), desc="Evaluating", unit="episode") as progress:
-        for found in _run_batches(evaluation, min(processes, len(evaluation.batches))):
-            rows += found
-            progress.update(len(found))
+        for batch_rows in _run_batches(evaluation, min(processes, len(evaluation.batches))):
+            rows += batch_rows
+            progress.update(len(batch_rows))
     evaluation.close()
     order = {task_id: n for n, task_id in enumerate(plan.task_ids)}
     return pd.DataFrame(sorted(rows, key=lambda row: (order[row["task_id"]], row["trial"])))

@@ -1,8 +1,8 @@
 """Statistics of evaluations: success with intervals, paired differences, and counterfactuals.
 
 Rates are fractions, 0..1. The episodes of a task are alike, and training seeds share the evaluation scenes,
-so neither are independent trials. Therefore, intervals come from a bootstrap over tasks, in which a task is
-drawn with all its episodes of all training seeds.
+so neither are independent trials. Intervals therefore come from a bootstrap over tasks: a resampled task
+keeps all its episodes of all training seeds.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from gym_deltaco.sim.workspace import Quadrant, container_matches
 from gym_deltaco.tasks import COLOR_SHAPE_TASKS, CONTAINER_COLORS, TASKS, Task, get_task
 from lerobot_deltaco.evaluation.records import EvaluationRecord, scene_columns
 
-N_DRAWS = 10_000
+N_RESAMPLES = 10_000
 N_BEST_SETS = 10  # evaluation sets that the paper averages
 _SEED = 0  # of the bootstrap, so that a report is a function of its records
-_FEW = 5  # successes; with fewer, the bootstrap's interval is too narrow
+_MIN_SUCCESSES = 5  # with fewer, the bootstrap's interval is too narrow
 _TASK_OF_INSTRUCTION = {task.instruction: task for task in (*TASKS, *COLOR_SHAPE_TASKS)}
 
 
@@ -42,7 +42,7 @@ def bootstrap(values: ArrayLike) -> Estimate:
     if len(values) == 1:  # nothing to resample
         return Estimate(mean, mean, mean)
     interval = stats.bootstrap(
-        (values,), np.mean, n_resamples=N_DRAWS, method="percentile", rng=_SEED
+        (values,), np.mean, n_resamples=N_RESAMPLES, method="percentile", rng=_SEED
     ).confidence_interval
     return Estimate(mean, float(interval.low), float(interval.high))
 
@@ -55,7 +55,7 @@ def task_rates(episodes: pd.DataFrame) -> pd.Series:
 def success_interval(episodes: pd.DataFrame) -> Estimate:
     """Returns the success rate with its 95 % interval: Wilson's if few succeed, else by bootstrap."""
     count, total = int(episodes["success"].sum()), len(episodes)
-    if count < _FEW:
+    if count < _MIN_SUCCESSES:
         interval = stats.binomtest(count, total).proportion_ci(method="wilson")
         return Estimate(count / total, float(interval.low), float(interval.high))
     return bootstrap(task_rates(episodes))
@@ -107,15 +107,15 @@ def followed(records: Iterable[EvaluationRecord]) -> pd.DataFrame:
         for row in record.episodes.join(scene_columns(record)).itertuples():
             demonstrated = get_task(row.demonstration_task) if row.demonstration_task >= 0 else None
             instructed = _task_of_instruction(row, record.plan.counterfactual == "instruction")
-            by_demonstration = _asked_for(row, demonstrated, is_demonstration=True)
-            by_instruction = _asked_for(row, instructed, is_demonstration=False)
+            demonstration = _asked_for(row, demonstrated, is_demonstration=True)
+            instruction = _asked_for(row, instructed, is_demonstration=False)
             filled = set(row.object_containers) - {-1}
-            chosen = {"object": row.grasped_object, "container": filled.pop() if len(filled) == 1 else -1}
-            for aspect, choice in chosen.items():
-                shown, said = by_demonstration[aspect], by_instruction[aspect]
-                if shown and said and not shown & said:
-                    in_neither = "instruction" if choice in said else "neither"
-                    counts[aspect]["demonstration" if choice in shown else in_neither] += 1
+            choices = {"object": row.grasped_object, "container": filled.pop() if len(filled) == 1 else -1}
+            for aspect, choice in choices.items():
+                by_source = {"demonstration": demonstration[aspect], "instruction": instruction[aspect]}
+                if all(by_source.values()) and not set.intersection(*by_source.values()):
+                    followed_source = (source for source, numbers in by_source.items() if choice in numbers)
+                    counts[aspect][next(followed_source, "neither")] += 1
     table = pd.DataFrame.from_dict(counts, orient="index")
     return table.assign(episodes=table.sum(axis=1)).rename_axis("aspect").reset_index()
 

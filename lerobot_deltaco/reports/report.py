@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 RowsOf = Callable[[Result, Sequence[Result]], Iterator[dict[str, Any]]]
 _MAX_CALIBRATED = 4  # experiments in the figure
 PAGE, FIGURE, CALIBRATION = "report.md", "success.png", "calibration.png"
-_SURE = (0, 0.5, 0.7, 0.9, 0.97, 1)  # bounds of a policy's probability of what it picks
+_CONFIDENCE_BOUNDS = (0, 0.5, 0.7, 0.9, 0.97, 1)  # of the probability of what a policy picks
 KINDS = ("name", "color", "shape", "color_shape", "foreign")
 # Options of a policy that may differ between the training runs of an experiment.
 _OPTIONS_OF_A_RUN = {"seed", "device", "pretrained_path", "demo_root", "repo_id", "push_to_hub"}
@@ -184,7 +184,9 @@ def calibration_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, 
     if result.settings["counterfactual"] != "none":
         return
     grasps = result.episodes[result.episodes["grasped_object"] >= 0]
-    for sure, some in grasps.groupby(pd.cut(grasps["p_pick"], _SURE, include_lowest=True), observed=True):
+    for sure, some in grasps.groupby(
+        pd.cut(grasps["p_pick"], _CONFIDENCE_BOUNDS, include_lowest=True), observed=True
+    ):
         yield {
             "sure": f"{100 * max(sure.left, 0):.0f} to {100 * sure.right:.0f} %",
             "grasps": len(some),
