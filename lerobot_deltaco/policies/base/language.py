@@ -58,7 +58,7 @@ _L3_MAX_TOKENS = 128  # of a sentence, as the model was published
 _WEIGHT_PREFIX, _NODE_PREFIX = "model.0.auto_model.", "/model/model.0/auto_model/"
 
 
-class LanguageEncoderError(RuntimeError):
+class LanguageEncoderError(UserError):
     """Raised when a sentence encoder cannot be loaded; the message says what to do."""
 
 

@@ -61,7 +61,7 @@ _ABSURD_ACTION = 100.0
 DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
 
 
-class TrainingDivergedError(FloatingPointError):
+class TrainingDivergedError(UserError):
     """Raised when the loss or a weight is not finite; the message names the likely cause."""
 
 
