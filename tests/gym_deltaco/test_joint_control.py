@@ -11,8 +11,8 @@ from lerobot.envs.utils import preprocess_observation
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import Stage, expert_episode
 from gym_deltaco.scene_config import SceneConfig
-from lerobot_deltaco.collection.dataset_card import dataset_card
 from lerobot_deltaco.collection.collect import CollectionPlan, collect
+from lerobot_deltaco.collection.dataset_card import dataset_card
 from lerobot_deltaco.lerobot_env import DeltacoEnv
 
 SCENE = SceneConfig(control="joints", image_size=16)
