@@ -7,7 +7,9 @@ without squeeze-and-excitation. The network is timm's.
 from __future__ import annotations
 
 import importlib.util
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -43,7 +45,7 @@ class EfficientNetLite0(nn.Module):
         from timm import create_model  # takes seconds where wandb is installed
 
         with torch.device("meta"):
-            self.network = create_model("tf_efficientnet_lite0", num_classes=0).eval()
+            self.network: Any = create_model("tf_efficientnet_lite0", num_classes=0).eval()
         # Names differ, but the layers have the same order.
         weights = list(_published_weights().values())[:-_N_CLASSIFIER_WEIGHTS]
         names = self.network.state_dict()
@@ -80,11 +82,7 @@ def _published_weights() -> dict[str, Tensor]:
 
 def _fuse_batch_norms(parent: nn.Module) -> None:
     """Makes the batch norms of a module part of the convolutions before them; activations stay."""
-    convolution = ""
-    for name, child in list(parent.named_children()):
-        if isinstance(child, nn.Conv2d):
-            convolution = name
-        elif isinstance(child, nn.BatchNorm2d):
-            fused = fuse_conv_bn_eval(parent.get_submodule(convolution), child)
-            setattr(parent, convolution, fused)
+    for (convolution_name, convolution), (name, child) in pairwise(list(parent.named_children())):
+        if isinstance(convolution, nn.Conv2d) and isinstance(child, nn.BatchNorm2d):
+            setattr(parent, convolution_name, fuse_conv_bn_eval(convolution, child))
             setattr(parent, name, child.act)
