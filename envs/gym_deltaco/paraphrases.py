@@ -7,6 +7,7 @@ mistakes included. Their license is not stated, so the project does not ship the
 
 from __future__ import annotations
 
+import argparse
 import csv
 from collections.abc import Iterable, Sequence
 from functools import cache
@@ -16,7 +17,7 @@ from typing import get_args
 import numpy as np
 
 from gym_deltaco.phrases import PhraseSplit, paraphrase
-from gym_deltaco.tasks import ALL_TASKS, find_task, get_task
+from gym_deltaco.tasks import ALL_TASKS, get_task, select_tasks
 
 PARAPHRASES_SPLITS = ("all", "train", "held_out")
 GRAMMAR = "grammar"  # in place of a file: sentences from `gym_deltaco.phrases`
@@ -69,25 +70,24 @@ def read_paraphrases(
     return sentences
 
 
-def training_sentences(
-    source: str | Path, task_strings: Iterable[str], split: str = "train"
-) -> dict[str, list[str]]:
-    """Returns sentences by task string, as the training of a policy takes them.
+def write_training_sentences(path: Path, source: str | Path, task_ids: Iterable[int]) -> None:
+    """Writes the sentences of the split "train" by task string, as `--policy.paraphrases` takes them.
 
     Args:
+        path: CSV file with the columns `task` and `instruction`.
         source: "grammar", or a CSV file, as `read_paraphrases` takes it.
-        task_strings: Task strings of a dataset. Those that are no template of the benchmark are left out.
-        split: Split of the sentences: "train", "held_out" or "all".
-
-    Returns:
-        Sentences of each task string that has some.
+        task_ids: Indices of the tasks; those without a sentence are left out.
 
     Raises:
-        ValueError: The split is unknown, or the file is missing or invalid.
+        ValueError: `source` is missing or invalid.
     """
-    tasks = {text: task for text in task_strings if (task := find_task(text)) is not None}
-    sentences = read_paraphrases(source, split, [task.index for task in tasks.values()])
-    return {text: list(sentences[task.index]) for text, task in tasks.items() if task.index in sentences}
+    sentences = read_paraphrases(source, "train", task_ids)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["task", "instruction"])
+        for task_id in task_ids:
+            for sentence in sentences.get(task_id, ()):
+                writer.writerow([get_task(task_id).instruction, sentence])
 
 
 def choose_instructions(
@@ -171,3 +171,12 @@ def _read_rows(path: str | Path) -> list[tuple[int, str]]:
     if not rows:
         raise ValueError(f"{path} has no instructions.")
     return rows
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Write sentences for training, for --policy.paraphrases.")
+    parser.add_argument("tasks", help="tasks, such as scenario_a_train")
+    parser.add_argument("path", type=Path, help="CSV file to write")
+    parser.add_argument("--source", default=GRAMMAR, help="grammar, or a CSV file of sentences by task index")
+    arguments = parser.parse_args()
+    write_training_sentences(arguments.path, arguments.source, select_tasks(arguments.tasks))

@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from gym_deltaco.atomic_files import read_json, write_json
+from gym_deltaco.paraphrases import write_training_sentences
+from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.collection.collect import CollectionPlan, collect, is_finished
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import find_checkpoints
@@ -150,6 +152,8 @@ class TrainingRun:
             "demo_repo_id": "deltaco/demonstrations",
             "demo_root": str(self.dataset(self.recipe.demonstrations)),
         }
+        if options.get("paraphrases") is not None:
+            options["paraphrases"] = str(self._write_sentences(options["paraphrases"]))
         start = None if self.recipe.start_from is None else last_checkpoint(self.best_start())
         return TrainPipelineConfig(
             dataset=DatasetConfig("deltaco/training", root=str(self.dataset(self.recipe.data))),
@@ -159,6 +163,13 @@ class TrainingRun:
             seed=self.seed,
             **asdict(self.recipe.training),
         )
+
+    def _write_sentences(self, source: str) -> Path:
+        """Writes other sentences for the training tasks as a policy reads them, and returns the file."""
+        path = self.folder.with_name(f"{self.folder.name}_sentences.csv")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_training_sentences(path, source, select_tasks(self.recipe.data.tasks))
+        return path
 
     def check_settings(self) -> None:
         """Checks that the run, if it has a checkpoint, began with the same settings.

@@ -4,8 +4,9 @@ import difflib
 
 import pytest
 
-from gym_deltaco.paraphrases import GRAMMAR, choose_instructions, read_paraphrases, training_sentences
+from gym_deltaco.paraphrases import GRAMMAR, choose_instructions, read_paraphrases, write_training_sentences
 from gym_deltaco.tasks import COLOR_SHAPE_TASKS, TASKS, get_task
+from lerobot_deltaco.policies.base.sentences import read_sentences
 
 OURS = """task_id,instruction
 4,move the speckled hourglass into the green box
@@ -77,13 +78,17 @@ def test_instructions_are_templates_a_file_or_one_sentence(tmp_path):
 
 
 def test_training_takes_sentences_by_task_string(tmp_path):
-    path = write(tmp_path / "shared.csv", SHARED)
-    strings = [get_task(task_id).instruction for task_id in (1, 4)]
-    mine = [*strings, "Stack the cups.", "Put thing in green bin."]
-    assert training_sentences(path, mine) == {strings[0]: ["d"]}
-    assert training_sentences(path, mine, "held_out") == {strings[0]: ["e"]}
-    assert list(training_sentences(GRAMMAR, mine)) == strings
-    assert training_sentences(GRAMMAR, mine)[strings[1]] == list(read_paraphrases(GRAMMAR, "train", [4])[4])
+    instructions = [get_task(task_id).instruction for task_id in (0, 1, 4)]
+
+    def written(source):
+        write_training_sentences(tmp_path / "sentences.csv", source, (0, 1, 4))
+        return read_sentences(tmp_path / "sentences.csv")
+
+    shared = written(write(tmp_path / "shared.csv", SHARED))
+    assert shared == {instructions[0]: ("a", "b"), instructions[1]: ("d",)}
+    grammar = written(GRAMMAR)
+    assert list(grammar) == instructions
+    assert grammar[instructions[2]] == read_paraphrases(GRAMMAR, "train", [4])[4]
 
 
 # The grammar

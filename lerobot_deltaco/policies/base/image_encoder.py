@@ -7,6 +7,7 @@ without squeeze-and-excitation. The network is timm's.
 from __future__ import annotations
 
 import importlib.util
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -82,13 +83,7 @@ def _published_weights() -> dict[str, Tensor]:
 
 def _fuse_batch_norms(parent: nn.Module) -> None:
     """Makes the batch norms of a module part of the convolutions before them; activations stay."""
-    convolution = ""
-    for name, child in list(parent.named_children()):
-        if isinstance(child, nn.Conv2d):
-            convolution = name
-        elif isinstance(child, nn.BatchNorm2d):
-            before = parent.get_submodule(convolution)
-            assert isinstance(before, nn.Conv2d)
-            fused = fuse_conv_bn_eval(before, child)
-            setattr(parent, convolution, fused)
+    for (convolution_name, convolution), (name, child) in pairwise(list(parent.named_children())):
+        if isinstance(convolution, nn.Conv2d) and isinstance(child, nn.BatchNorm2d):
+            setattr(parent, convolution_name, fuse_conv_bn_eval(convolution, child))
             setattr(parent, name, child.act)
