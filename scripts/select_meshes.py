@@ -9,13 +9,13 @@ import json
 import sys
 from contextlib import closing
 
-from gym_deltaco.atomic_files import write_text
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.objects.labels import EXPERT_MESHES_FILE, FIRST_MESH_INDEX, MESHES
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import MESH_TASKS
+from lerobot_deltaco.atomic_files import write_text
 
 CONTAINERS = ("green", "front", "left")
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from gym_deltaco.atomic_files import write_text
 from gym_deltaco.tasks import get_task
+from lerobot_deltaco.atomic_files import write_text
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records
 from lerobot_deltaco.reports.leaderboard import PAPER, Result, collect_results, paper_row

@@ -29,13 +29,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gym_deltaco import ENV_ID, EXPERT_NOISE
-from gym_deltaco.atomic_files import read_json, write_json
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.expert import expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.sim.simulation import check_simulator
 from gym_deltaco.tasks import HELD_OUT, get_task, select_tasks
+from lerobot_deltaco.atomic_files import read_json, write_json
 from lerobot_deltaco.collection import writer as dataset_writer
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.processes import end_with_parent

@@ -12,8 +12,8 @@ import numpy as np
 import pyarrow.parquet as pq
 from PIL import Image
 
-from gym_deltaco.atomic_files import read_json, write_text
 from gym_deltaco.tasks import SCENARIOS, get_task
+from lerobot_deltaco.atomic_files import read_json, write_text
 from lerobot_deltaco.collection.collect import read_description, read_plan
 from lerobot_deltaco.collection.writer import INFO_FILE
 

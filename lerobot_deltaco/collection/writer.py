@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from PIL import Image
 
-from gym_deltaco.atomic_files import atomic_write, write_json
+from lerobot_deltaco.atomic_files import atomic_write, write_json
 
 CODEBASE_VERSION = "v3.0"
 FILES_PER_CHUNK = 1000

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gym_deltaco.atomic_files import read_json
 from gym_deltaco.control import control_of
+from lerobot_deltaco.atomic_files import read_json
 from lerobot_deltaco.errors import UserError
 
 if TYPE_CHECKING:

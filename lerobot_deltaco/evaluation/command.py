@@ -19,8 +19,8 @@ from typing import Annotated, Any
 import tyro
 
 from gym_deltaco import ENV_ID
-from gym_deltaco.atomic_files import parse_json
 from gym_deltaco.scene_config import SceneConfig
+from lerobot_deltaco.atomic_files import parse_json
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import OWN_TYPES, Checkpoint, find_checkpoints, load_policy
 from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord, read_records, write_records

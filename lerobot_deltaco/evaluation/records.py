@@ -21,12 +21,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from gymnasium.utils import seeding
 
-from gym_deltaco.atomic_files import atomic_write
 from gym_deltaco.layout import sample_layout
 from gym_deltaco.paraphrases import GRAMMAR
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
+from lerobot_deltaco.atomic_files import atomic_write
 from lerobot_deltaco.errors import UserError
 
 SCHEMA = pa.schema(

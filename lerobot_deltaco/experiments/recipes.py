@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import draccus
 import yaml
 
-from gym_deltaco.atomic_files import read_json
+from lerobot_deltaco.atomic_files import read_json
 from lerobot_deltaco.collection.collect import CollectionPlan
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.records import EvaluationPlan

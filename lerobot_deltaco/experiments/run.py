@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from gym_deltaco.atomic_files import read_json, write_json
 from gym_deltaco.paraphrases import write_training_sentences
 from gym_deltaco.tasks import select_tasks
+from lerobot_deltaco.atomic_files import read_json, write_json
 from lerobot_deltaco.collection.collect import CollectionPlan, collect, is_finished
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import find_checkpoints

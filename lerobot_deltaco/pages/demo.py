@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from gym_deltaco.atomic_files import read_json, write_json
+from lerobot_deltaco.atomic_files import read_json, write_json
 from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord
 from lerobot_deltaco.experiments.recipes import read_recipe
 from lerobot_deltaco.experiments.run import TrainingRun, last_checkpoint, last_step, read_run_records

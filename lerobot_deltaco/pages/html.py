@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gym_deltaco.atomic_files import write_text
+from lerobot_deltaco.atomic_files import write_text
 
 TEMPLATES = Path(__file__).with_name("templates")
 

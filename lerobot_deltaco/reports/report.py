@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 import tyro
 
-from gym_deltaco.atomic_files import write_text
 from gym_deltaco.tasks import get_task, task_kinds
+from lerobot_deltaco.atomic_files import write_text
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.records import read_records
 from lerobot_deltaco.reports.leaderboard import CHANCE, Result, collect_results, settings_text
