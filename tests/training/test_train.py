@@ -269,7 +269,7 @@ MISTAKES = {
 def test_a_mistake_ends_the_command_in_one_line(benchmark, tmp_path, monkeypatch, message):
     monkeypatch.chdir(tmp_path)
     train = lambda *_: run_training(benchmark, tmp_path / "run", MISTAKES[message])  # noqa: E731
-    monkeypatch.setattr(cli, "_run", train)
+    monkeypatch.setattr(cli, "_train", train)
     monkeypatch.setattr(sys, "argv", ["deltaco", "train"])
     with pytest.raises(SystemExit, match=f"^deltaco train: .*{message}") as error:
         cli.main()
