@@ -18,6 +18,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 GYM_FILES = sorted((ROOT / "envs" / "gym_deltaco").rglob("*.py"))
+BASE = "lerobot_deltaco.policies.base"
 LEROBOT_FILES = [*sorted((ROOT / "lerobot_deltaco").rglob("*.py")), ROOT / "lerobot_policy_deltaco.py"]
 
 
@@ -32,27 +33,42 @@ def imported_modules(path):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
+def files_of(folder):
+    return sorted((ROOT / "lerobot_deltaco" / folder).rglob("*.py"))
+
+
 def test_imports_go_one_way():
+    above = {f"lerobot_deltaco.{name}" for name in ("collection", "training", "evaluation", "reports")}
+    above |= {"lerobot_deltaco.experiments", "lerobot_deltaco.pages", "lerobot_deltaco.lerobot_env"}
     plain = [ROOT / "lerobot_deltaco" / "policies" / "base" / name for name in ("networks.py", "losses.py")]
     for files, forbidden in (
         (GYM_FILES, {"torch", "lerobot", "lerobot_deltaco", "lerobot_policy_deltaco"}),
         ([*GYM_FILES, *LEROBOT_FILES], {"lerobot_deltaco.cli"}),
-        (LEROBOT_FILES, {"pybullet"}),
+        (LEROBOT_FILES, {"pybullet", "unittest"}),
+        # A policy knows neither the benchmark nor what trains or evaluates it.
+        (files_of("policies"), {"gym_deltaco", *above}),
+        (files_of("data"), {"gym_deltaco", "lerobot_deltaco.policies", *above}),
+        (files_of("policies/deltaco"), {"lerobot_deltaco.policies.deltaco_match"}),
+        (files_of("policies/deltaco_match"), {"lerobot_deltaco.policies.deltaco"}),
+        (files_of("collection"), {"torch", "lerobot_deltaco.evaluation", "lerobot_deltaco.pages"}),
         # Networks and losses take plain numbers.
-        (
-            plain,
-            {
-                "lerobot",
-                "lerobot_deltaco.policies.base.configuration",
-                "lerobot_deltaco.policies.base.modeling",
-            },
-        ),
+        (plain, {"lerobot", f"{BASE}.configuration", f"{BASE}.modeling"}),
     ):
         assert files
         for path in files:
             for name in imported_modules(path):
                 parents = {".".join(name.split(".")[:n]) for n in range(1, name.count(".") + 2)}
                 assert parents.isdisjoint(forbidden), f"{path} imports {name}"
+
+
+def test_a_policy_loads_neither_the_benchmark_nor_encoders_of_language():
+    result = run_python(
+        "import sys, lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match; print(*sys.modules)"
+    )
+    assert result.returncode == 0, result.stderr
+    assert not {"gym_deltaco", "pybullet", "sentence_transformers", "onnxruntime"} & set(
+        result.stdout.split()
+    )
 
 
 def test_lerobot_finds_the_distribution_and_its_types():
