@@ -35,7 +35,8 @@ from lerobot_deltaco.data.demonstrations import (
     resize_images,
 )
 from lerobot_deltaco.data.frames import memory_for_frames
-from lerobot_deltaco.data.grasps import Grasp, find_grasps, follows_gripper
+from lerobot_deltaco.data.grasps import Grasp, find_grasps
+from lerobot_deltaco.data.gripper_states import GripperStates, find_gripper_states
 from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.pages.html import picture_uri, render
@@ -68,7 +69,7 @@ class TrainingStart:
         policy: The policy; None if the configuration does not fit the dataset.
         bank: The episodes as demonstrations; None if they were not read.
         grasps: The grasp of each episode, or why there is none; empty if unknown.
-        gripper_states: Dimensions of the state that tell how far the gripper is open.
+        gripper_states: Dimensions of the state that tell how far the gripper is open; None if unknown.
     """
 
     def __init__(self, dataset: LeRobotDataset, config: DeltacoMatchConfig) -> None:
@@ -78,7 +79,7 @@ class TrainingStart:
         self.policy: DeltacoMatchPolicy | None = None
         self.bank: DemonstrationBank | None = None
         self.grasps: list[Grasp | str] = []
-        self.gripper_states: list[int] = []
+        self.gripper_states: GripperStates | None = None
         with _warnings() as self.warnings:
             try:
                 self._begin()
@@ -93,8 +94,9 @@ class TrainingStart:
         self.policy.feature_matching.fitted.fill_(True)  # the fit takes minutes, and is left out
         data = read_robot_data(dataset, range(dataset.meta.total_episodes), config.cameras[0])
         opening = config.gripper_opening(data.actions)
-        self.grasps = find_grasps(opening, data.spans)
-        self.gripper_states = follows_gripper(data.states, opening, data.spans).nonzero().flatten().tolist()
+        self.grasps = find_grasps(opening, data.spans, states=data.states)
+        names = dimension_names(dataset.meta.features[OBS_STATE])
+        self.gripper_states = find_gripper_states(data.states, opening, data.spans, names)
         self.bank = read_demonstrations(dataset, config.cameras[0], config.image_size, config.n_demo_frames)
         self.policy.set_training_data(self.bank, data)
         with_grasp = zip(self.bank.tasks, self.grasps, strict=True)
@@ -286,10 +288,13 @@ def _facts(
         n_found = sum(isinstance(grasp, Grasp) for grasp in start.grasps)
         closing = f"{config.name_gripper(meta.features)}; {config.gripper_closed} values close it"
         facts.append(("gripper", closing))
-        names = ((n, dimensions[OBS_STATE][n][0]) for n in start.gripper_states)
+    if start.gripper_states is not None:
+        chosen = start.gripper_states.is_gripper.nonzero().flatten().tolist()
+        names = ((n, dimensions[OBS_STATE][n][0]) for n in chosen)
         states = ", ".join(f"{n}" if name == str(n) else f"{n} ({name})" for n, name in names)
-        follow = f"dimension {states} of the state" if states else "nothing in the state"
-        facts.append(("its state", f"{follow} follows these commands; the rest is taken for the arm's"))
+        which = f"dimension {states} of the state" if states else "nothing in the state"
+        facts.append(("its state", f"{which}, {start.gripper_states.reason}; the rest is the arm's"))
+    if start.grasps:
         facts.append(("grasps", f"in {n_found} of {len(start.grasps)} episodes; others are left out"))
     for feature, rows in dimensions.items():
         arm = [ends for name, *ends in rows if "gripper" not in name.lower()] or [[0.0, 0.0]]

@@ -16,7 +16,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
@@ -139,7 +139,8 @@ def _until_release(frames: FramesInMemory, policy: TaskConditionedConfig) -> NDA
     spans = list(frames.spans.values())
     gripper = policy.gripper_opening(frames.columns[ACTION])
     n_after = round(n_after * frames.fps / CONTROL_FPS)
-    for grasp, (_, last) in zip(find_grasps(gripper, spans), spans, strict=True):
+    grasps = find_grasps(gripper, spans, states=frames.columns.get(OBS_STATE))
+    for grasp, (_, last) in zip(grasps, spans, strict=True):
         if isinstance(grasp, Grasp):
             use[grasp.opened + 1 + n_after : last + 1] = False
     return use

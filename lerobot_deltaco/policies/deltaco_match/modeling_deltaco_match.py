@@ -35,11 +35,12 @@ from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
 from lerobot_deltaco.data.grasps import (
     Keyframes,
     find_keyframes,
-    follows_gripper,
     warn_of_missing,
 )
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
+from lerobot_deltaco.data.gripper_states import find_gripper_states
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
+from lerobot_deltaco.policies.base.configuration import dimension_names
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import (
@@ -478,10 +479,12 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         warn_if_inverted(gripper, robot_data, config.gripper_closed)
         zero_and_one = torch.stack([torch.zeros(states.shape[1]), torch.ones(states.shape[1])])
         shift, end = self._normalized(zero_and_one).to(device)
-        is_arm = ~follows_gripper(states, gripper, robot_data.spans)
+        assert self._meta is not None
+        names = dimension_names(self._meta.features.get(OBS_STATE, {}))
+        gripper_states = find_gripper_states(states, gripper, robot_data.spans, names)
+        gripper_states.warn()
         n_grasps = int(keyframes.has_grasp.sum())
         if n_grasps < MIN_EPISODES:
-            assert self._meta is not None
             raise ValueError(
                 f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} episodes "
                 f"in which the gripper closes and opens. Got {n_grasps}. Collect more, or train "
@@ -491,7 +494,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             )
         carried = robot_data.images_at(keyframes.carried.tolist(), config.image_size).to(device)
         images = (frames[:, 0], carried, frames[:, -1])
-        located = self.robot_states.fit(keyframes, *images, end - shift, shift, is_arm)
+        located = self.robot_states.fit(keyframes, *images, end - shift, shift, ~gripper_states.is_gripper)
         self.training_locations = located
         self.training_bank.pick_states = keyframes.pick_states
         if not bool(self.feature_matching.fitted):
