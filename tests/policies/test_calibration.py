@@ -5,7 +5,7 @@ import pytest
 import torch
 from small_policies import TABLE_SIZE, draw_table, random_moves, state_at
 
-from lerobot_deltaco.policies.deltaco_match.calibration import StateToImage
+from lerobot_deltaco.policies.deltaco_match.calibration import ImageProjection
 
 
 def stacked_images(images):
@@ -22,7 +22,7 @@ def test_changes_alone_tell_where_states_are_in_the_image():
     velocities = 0.05 * torch.randn(len(states), 5, generator=torch.Generator().manual_seed(0))
     scale = torch.cat([1 / states.std(dim=0), torch.ones(5)])
     states = torch.cat([states, velocities], dim=1)
-    to_image = StateToImage(states.shape[1])
+    to_image = ImageProjection(states.shape[1])
     to_image.fit(first, last, last, states, scale)
     errors = (to_image(states) - torch.from_numpy(starts).float()).norm(dim=1) * TABLE_SIZE / 2  # px
     assert errors.median() < 1
@@ -45,7 +45,7 @@ def test_a_robot_that_ends_where_the_object_tells_is_not_taken_for_the_object(ca
     last = stacked_images([with_robot(task, other, -start) for task, start, other, _ in moves])
     on_the_way = [with_robot(task, other, rng.uniform(-0.9, 0.9, 2)) for task, _, other, _ in moves]
     states = torch.from_numpy(np.stack([state_at(start) for start in starts])).float()
-    to_image = StateToImage(states.shape[1])
+    to_image = ImageProjection(states.shape[1])
     carried = stacked_images(on_the_way) if carried_elsewhere else last
     to_image.fit(first, carried, last, states, 1 / states.std(dim=0).clamp_min(1e-3))
     errors = (to_image(states) - torch.from_numpy(starts).float()).norm(dim=1) * TABLE_SIZE / 2  # px
@@ -57,5 +57,5 @@ def test_states_that_tell_nothing_of_the_image_are_warned_of(caplog):
     first = stacked_images([draw_table(task, start, other) for task, start, other, _ in moves])
     last = stacked_images([draw_table(task, end, other) for task, _, other, end in moves])
     states = torch.randn(len(moves), 3, generator=torch.Generator().manual_seed(0))
-    StateToImage(3).fit(first, last, last, states, torch.ones(3))
+    ImageProjection(3).fit(first, last, last, states, torch.ones(3))
     assert "the locations are probably wrong" in caplog.text

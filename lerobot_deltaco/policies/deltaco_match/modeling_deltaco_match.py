@@ -59,7 +59,7 @@ from lerobot_deltaco.policies.deltaco_match.place import (
     PlaceNetwork,
     peak_locations,
 )
-from lerobot_deltaco.policies.deltaco_match.states import N_LOCATIONS, RobotStates, TrainingLocations
+from lerobot_deltaco.policies.deltaco_match.states import N_LOCATIONS, StateRegressor, TrainingLocations
 from lerobot_deltaco.policies.deltaco_match.words import (
     INSTRUCTION_DIM,
     InstructionEncoder,
@@ -162,7 +162,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             chunk_size=config.chunk_size or 1,
             n_locations=N_LOCATIONS,
         )
-        self.robot_states = RobotStates(config.state_dim)
+        self.robot_states = StateRegressor(config.state_dim)
         self.feature_matching = FeatureMatching(config.known_words, config.crop_size)
         self.attention = DemonstrationAttention()
         self.place = PlaceNetwork(INSTRUCTION_DIM)
