@@ -256,12 +256,14 @@ class RobotData(NamedTuple):
         spans: First and last frame of each episode.
         images: Returns the images of some frames by the camera of demonstrations, (n, 3, H, W) uint8; None
             if there are only states and actions.
+        state_names: Name of each dimension of the state; empty if the dataset has none.
     """
 
     states: Tensor
     actions: Tensor
     spans: list[tuple[int, int]]
     images: Callable[[list[int]], Tensor] | None = None
+    state_names: Sequence[str] = ()
 
     def images_at(self, frames: Sequence[int]) -> Tensor:
         """Returns the images of some frames, (n, 3, H, W) uint8."""

@@ -18,6 +18,7 @@ from lerobot_deltaco.data.images import read_images, resize_images
 from lerobot_deltaco.data.reading import (
     check_dataset,
     column,
+    dimension_names,
     episode_spans,
 )
 from lerobot_deltaco.errors import UserError
@@ -149,6 +150,10 @@ class FramesInMemory(torch.utils.data.Dataset):
     def values(self, feature: str) -> Tensor | None:
         """Returns the numbers of a feature in all rows, (rows, ...); None without that feature."""
         return self.columns.get(self._source(feature))
+
+    def names(self, feature: str) -> list[str]:
+        """Returns the names of a feature's dimensions; none if the dataset does not name them."""
+        return dimension_names(self.meta.features.get(self._source(feature), {}), feature)
 
     def images(self, camera: str, rows: Sequence[int], size: int | None) -> Tensor:
         """Returns images of a camera, (images, 3, H, W) uint8. See `Episodes.images`."""

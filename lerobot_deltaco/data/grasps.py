@@ -1,8 +1,9 @@
-"""Keyframes of an episode: where the gripper closes around an object, and where it opens again.
+"""Grasps of episodes: where the gripper closes around an object, and where it opens again.
 
-The gripper's commands over an episode are its course. Each episode is judged on its own, since a gripper may
-rest open or closed, and open by different amounts. A grasp is a valley of the course between two openings; a
-gripper that rests closed at either end is not a grasp.
+A grasp is a closed interval of the gripper trajectory between two openings, in which the arm travels. Each
+episode is judged on its own, since a gripper may rest open or closed, and open by different amounts. A
+gripper that rests closed at either end of an episode is no grasp; nor is a blip, in which it closes and opens
+again while the arm stands still.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +19,9 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
+
+from lerobot_deltaco.data.gripper_states import find_gripper_states
+from lerobot_deltaco.data.gripper_trajectories import gripper_trajectories
 
 logger = logging.getLogger(__name__)
 
@@ -29,11 +34,14 @@ _NOISE = 4.0  # ranges of less than so many standard deviations are noise
 _CLOSED = 0.2  # fraction of the way up from the valley to an opening below which the gripper counts as closed
 _APPROACH = 30  # the state before a grasp is a 30th of the episode before the gripper begins to close
 _N_REASONS = 3  # that a warning names
-_GRIPPER_CORRELATION = 0.8  # of a state with the gripper's command, above which it is the gripper's
-_MAX_LAG = 8  # of such a state behind the command: an eighth of an episode
-_N_LAGS = 8  # that are tried, at most
-# Commands that mean close, stay, open, as LeRobot's gamepads and keyboards give them; and inverted.
-_THREE_STATES = ({0.0, 1.0, 2.0}, {-1.0, 0.0, 1.0}, {-2.0, -1.0, 0.0})
+# Travels of the arm, as fractions of the range of that dimension of the state which moves farthest.
+_AT_REST = 0.03  # less is no travel
+_MIN_CARRY = 0.1  # usual with a closed gripper
+_MIN_APPROACH = 0.05  # usual with an open gripper, on the way to an object and away from it
+_MIN_RELATIVE_TRAVEL = 0.3  # of a grasp that counts, as a fraction of the farthest travel in the episode
+_AT_HOME = 0.15  # distance from the first state of the episode within which the arm has returned to it
+_RANGE_QUANTILE = 0.01  # of a dimension's values at either end that do not count for its range
+_MIN_STATE_RANGE = 0.25  # of a dimension, as a fraction of the median of all
 
 
 class Grasp(NamedTuple):
@@ -50,6 +58,14 @@ class Grasp(NamedTuple):
     grasp: int
     release: int
     opened: int
+
+
+class _ClosedInterval(NamedTuple):
+    """A grasp, or a blip of the gripper: the frames from which it was open before, and until which after."""
+
+    grasp: Grasp
+    open_since: int
+    open_until: int
 
 
 class Keyframes(NamedTuple):
@@ -92,7 +108,7 @@ def find_keyframes(
     spans: Sequence[tuple[int, int]],
     usual: float | None = None,
 ) -> Keyframes:
-    """Finds the grasp and the release of episodes. If an object slips, the last grasp counts.
+    """Finds the states of the robot at the grasp and the release of episodes; see `find_grasps`.
 
     Args:
         states: Robot states of all frames, (frames, state).
@@ -100,7 +116,7 @@ def find_keyframes(
         spans: First and last frame of each episode.
         usual: As for `find_grasps`.
     """
-    grasps, frames = find_grasps(gripper, spans, usual), []
+    grasps, frames = find_grasps(gripper, spans, usual, states), []
     for (first, last), grasp in zip(spans, grasps, strict=True):
         if isinstance(grasp, str):
             frames.append((first,) * 4)
@@ -144,69 +160,111 @@ def warn_of_missing(keyframes: Keyframes, episodes: Sequence[int], consequence: 
 
 
 def find_grasps(
-    gripper: Tensor, spans: Sequence[tuple[int, int]], usual: float | None = None
+    gripper: Tensor,
+    spans: Sequence[tuple[int, int]],
+    usual: float | None = None,
+    states: Tensor | None = None,
 ) -> list[Grasp | str]:
-    """Finds the last grasp of each episode that is released.
+    """Finds the grasp of each episode that carried the object to its goal.
+
+    Of several grasps that the arm travels with, the last one counts, since an object may slip.
 
     Args:
-        gripper: Commands to the gripper in all frames, greater for more open, (frames,). Of commands that
-            mean close, stay and open (0, 1, 2 or -1, 0, 1), the last one before "stay" holds.
+        gripper: Commands to the gripper in all frames, as for `gripper_trajectories`, (frames,).
         spans: First and last frame of each episode.
         usual: Range of the commands in a usual episode, of which a fifth is needed for a grasp; by default,
             the median of these episodes.
+        states: Robot states of all frames, (frames, state), which tell whether the arm travels with a grasp;
+            without them, the last grasp that is released counts.
 
     Returns:
         The grasp of each episode, or the reason why there is none.
     """
-    courses = _courses(gripper, spans)
-    smooth = [_without_outliers(course) for course in courses]
-    ranges = [float(np.ptp(course)) for course in smooth]
+    trajectories = gripper_trajectories(gripper, spans)
+    smooth = [_without_outliers(trajectory) for trajectory in trajectories]
+    ranges = [float(np.ptp(trajectory)) for trajectory in smooth]
     if usual is None:
         usual = float(np.nanmedian(ranges)) if np.isfinite(ranges).any() else 0.0
+    arm = None if states is None else _arm_positions(states, gripper, spans)
     grasps: list[Grasp | str] = []
-    for (first, _), raw, course, size in zip(spans, courses, smooth, ranges, strict=True):
-        grasp = _last_valley(raw, course, size, usual)
+    for (first, last), raw, trajectory, size in zip(spans, trajectories, smooth, ranges, strict=True):
+        intervals = _closed_intervals(raw, trajectory, size, usual)
+        if isinstance(intervals, str):
+            grasps.append(intervals)
+            continue
+        grasp = intervals[-1].grasp if arm is None else _carrying(intervals, arm[first : last + 1])
         grasps.append(grasp if isinstance(grasp, str) else Grasp(*(first + frame for frame in grasp)))
     return grasps
 
 
-def _courses(gripper: Tensor, spans: Sequence[tuple[int, int]]) -> list[NDArray[np.float64]]:
-    """Returns the course of each episode; commands to stay are replaced by the last state."""
-    commands = gripper.cpu().double().numpy()
-    courses = [commands[first : last + 1] for first, last in spans]
-    values = np.unique(np.concatenate(courses)) if courses else commands
-    if set(values.tolist()) in _THREE_STATES:
-        courses = [_held(course, *values) for course in courses]
-    return courses
+def _arm_positions(
+    states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]
+) -> NDArray[np.float64] | None:
+    """Returns the states without the gripper's opening, (frames, dims) in units of each dimension's range.
+
+    None if no dimension moves.
+    """
+    is_arm = ~find_gripper_states(states, gripper, spans).is_gripper.cpu()
+    values = states.cpu().double()[:, is_arm].numpy()
+    ends = [_RANGE_QUANTILE, 1 - _RANGE_QUANTILE]
+    ranges = np.diff(np.quantile(values, ends, axis=0), axis=0)[0] if values.size else np.zeros(1)
+    if not ranges.any():
+        return None
+    return values / np.maximum(ranges, _MIN_STATE_RANGE * np.median(ranges[ranges > 0]))
 
 
-def _held(course: NDArray[np.float64], closed: float, stay: float, opened: float) -> NDArray[np.float64]:
-    """Returns a course in which the last state holds while it should stay."""
-    given = np.flatnonzero(course != stay)
-    if not len(given):
-        return course
-    # Before the first command, the gripper is in the other state.
-    before = closed if course[given[0]] == opened else opened
-    last = np.searchsorted(given, np.arange(len(course)), side="right") - 1
-    return np.where(last < 0, before, course[given[np.maximum(last, 0)]])
-
-
-def _without_outliers(course: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns a course without glitches of a few frames, and without the extremes of its range."""
-    if len(np.unique(course)) > 2:  # binary commands have no glitches
-        reach = min(max(1, len(course) // _GLITCH), _MAX_GLITCH)
-        course = np.median(sliding_window_view(np.pad(course, reach, "edge"), 2 * reach + 1), axis=1)
-    return np.clip(course, *np.quantile(course, [_OUTLIERS, 1 - _OUTLIERS]))
-
-
-def _last_valley(
-    raw: NDArray[np.float64], course: NDArray[np.float64], size: float, usual: float
-) -> tuple[int, int, int, int] | str:
-    """Returns the frames of a `Grasp` at the last valley between two openings, or why there is none.
+def _carrying(intervals: Sequence[_ClosedInterval], arm: NDArray[np.float64]) -> Grasp | str:
+    """Returns the grasp of an episode that carried the object to its goal, or why there is none.
 
     Args:
-        raw: The course as recorded.
-        course: The course without outliers.
+        intervals: In the order of time, with frames of the episode.
+        arm: Positions of the arm in the episode, from `_arm_positions`.
+    """
+
+    def travel(first: int, last: int) -> float:
+        return float(np.abs(arm[first : last + 1] - arm[first]).max())
+
+    distances = np.array([travel(grasp.grasp, grasp.release) for grasp, *_ in intervals])
+    if distances.max() < _AT_REST:
+        return "the arm stands still while the gripper is closed"
+    (moving,) = np.nonzero(distances >= min(_MIN_CARRY, distances.max()))
+    grasps, distances = [intervals[n].grasp for n in moving], distances[moving]
+    # An arm comes to an object and leaves it with an open gripper. One that opens at rest releases nothing.
+    opens = [(one.opened, max(one.opened, two.closing)) for one, two in pairwise(grasps)]
+    opens = [
+        (intervals[0].open_since, grasps[0].closing),
+        *opens,
+        (grasps[-1].opened, intervals[-1].open_until),
+    ]
+    comes = [
+        first == 0 or last == len(arm) - 1 or travel(first, last) >= _MIN_APPROACH for first, last in opens
+    ]
+    is_grasp = np.array(comes[:-1]) & np.array(comes[1:])
+    # A gripper that closes after the release and opens at home has put nothing down there.
+    is_away = np.array([np.abs(arm[grasp.release] - arm[0]).max() >= _AT_HOME for grasp in grasps])
+    for counts in (is_grasp & is_away, is_away, is_grasp, distances > 0):
+        counts = counts & (distances >= _MIN_RELATIVE_TRAVEL * distances.max())
+        if counts.any():
+            break
+    return grasps[np.flatnonzero(counts)[-1]]
+
+
+def _without_outliers(trajectory: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns a trajectory without glitches of a few frames, and without the extremes of its range."""
+    if len(np.unique(trajectory)) > 2:  # binary commands have no glitches
+        reach = min(max(1, len(trajectory) // _GLITCH), _MAX_GLITCH)
+        trajectory = np.median(sliding_window_view(np.pad(trajectory, reach, "edge"), 2 * reach + 1), axis=1)
+    return np.clip(trajectory, *np.quantile(trajectory, [_OUTLIERS, 1 - _OUTLIERS]))
+
+
+def _closed_intervals(
+    raw: NDArray[np.float64], trajectory: NDArray[np.float64], size: float, usual: float
+) -> list[_ClosedInterval] | str:
+    """Returns the closed intervals of an episode between openings, in order, or why there are none.
+
+    Args:
+        raw: The gripper trajectory as recorded.
+        trajectory: The trajectory without outliers.
         size: Its range.
         usual: Range of the usual episode.
     """
@@ -218,65 +276,62 @@ def _last_valley(
     noise = 0.0 if is_binary else 1.48 * float(np.median(np.abs(np.diff(raw)))) / np.sqrt(2)
     if size <= max(_MIN_RANGE * usual, _NOISE * noise):
         return "the gripper only trembles"
-    sides = np.minimum(np.maximum.accumulate(course), np.maximum.accumulate(course[::-1])[::-1])
-    depth = max(_MIN_DEPTH * size, _MIN_RELATIVE_DEPTH * float((sides - course).max()), _NOISE * noise)
-    # Backwards: from the last opening down into the valley, and up to the opening before it.
-    after, bottom, level = course[-1], 0, None
-    for frame in range(len(course) - 1, -1, -1):
-        if level is None and course[frame] > after:
-            after = course[frame]
-        elif (level is None and after - course[frame] >= depth) or (
-            level is not None and course[frame] < level
-        ):
-            level, bottom = course[frame], frame
-        elif level is not None and course[frame] - level >= depth:
-            break
-    else:
-        return _why_no_valley(course, depth)
-    before = _opening(course[frame::-1], level + depth / 2)
+    ends = np.maximum.accumulate(trajectory), np.maximum.accumulate(trajectory[::-1])[::-1]
+    depth_below = float((np.minimum(*ends) - trajectory).max())
+    depth = max(_MIN_DEPTH * size, _MIN_RELATIVE_DEPTH * depth_below, _NOISE * noise)
+    # Backwards: from an opening down into a valley, and up to the opening before it.
+    intervals: list[_ClosedInterval] = []
+    after, bottom, level = trajectory[-1], 0, None
+    for frame in range(len(trajectory) - 1, -1, -1):
+        if level is None:
+            after = max(after, trajectory[frame])
+            if after - trajectory[frame] >= depth:
+                level, bottom = trajectory[frame], frame
+        elif trajectory[frame] < level:
+            level, bottom = trajectory[frame], frame
+        elif trajectory[frame] - level >= depth:
+            intervals.append(_interval_at(trajectory, frame, bottom, depth))
+            after, level = trajectory[frame], None
+    return intervals[::-1] or _why_not_closed(trajectory, depth)
+
+
+def _interval_at(trajectory: NDArray[np.float64], frame: int, bottom: int, depth: float) -> _ClosedInterval:
+    """Returns the closed interval around the lowest point of a valley.
+
+    Args:
+        trajectory: The gripper trajectory of an episode.
+        frame: The last frame before the valley in which the gripper is open.
+        bottom: The frame in which it is closed farthest.
+        depth: How far it is open at least, above that.
+    """
+    level = trajectory[bottom]
+    before = _opening(trajectory[frame::-1], level + depth / 2)
     # The opening that ends the valley need not be the last one.
-    rise = bottom + int(np.argmax(course[bottom:] - level >= depth))
-    after = _opening(course[rise:], level + depth / 2)
-    grasp = frame + int(np.argmax(course[frame:] <= level + _CLOSED * (before - level)))
-    closing = np.flatnonzero(course[:grasp] > (level + before) / 2)[-1]
-    is_closed = course[: rise + 1] <= level + _CLOSED * (after - level)
+    rise = bottom + int(np.argmax(trajectory[bottom:] - level >= depth))
+    after = _opening(trajectory[rise:], level + depth / 2)
+    grasp = frame + int(np.argmax(trajectory[frame:] <= level + _CLOSED * (before - level)))
+    closing = np.flatnonzero(trajectory[:grasp] > (level + before) / 2)[-1]
+    is_closed = trajectory[: rise + 1] <= level + _CLOSED * (after - level)
     release = int(np.flatnonzero(is_closed)[-1]) + 1
-    opened = release + int(np.argmax(course[release:] >= after - _CLOSED * (after - level)))
-    return int(closing), grasp, release, opened
+    opened = release + int(np.argmax(trajectory[release:] >= after - _CLOSED * (after - level)))
+    was_closed = np.flatnonzero(trajectory[:closing] <= (level + before) / 2)
+    closes = np.flatnonzero(trajectory[opened:] <= (level + after) / 2)
+    return _ClosedInterval(
+        Grasp(int(closing), grasp, release, opened),
+        int(was_closed[-1]) + 1 if len(was_closed) else 0,
+        opened + int(closes[0]) - 1 if len(closes) else len(trajectory) - 1,
+    )
 
 
-def _why_no_valley(course: NDArray[np.float64], depth: float) -> str:
-    """Returns why a course that moves has no valley between two openings."""
-    opens, closes = (course.max() - end >= depth for end in (course[0], course[-1]))
+def _why_not_closed(trajectory: NDArray[np.float64], depth: float) -> str:
+    """Returns why a trajectory that moves has no valley between two openings."""
+    opens, closes = (trajectory.max() - end >= depth for end in (trajectory[0], trajectory[-1]))
     if opens and closes:
         return "the gripper opens and closes, but does not open again"
     return "the gripper opens, but does not close before" if opens else "the gripper does not open again"
 
 
-def _opening(course: NDArray[np.float64], least: float) -> float:
-    """Returns the greatest value before a course falls to a level for the first time."""
-    ends = np.flatnonzero(course <= least)
-    return float(course[: ends[0] if len(ends) else None].max())
-
-
-def follows_gripper(states: Tensor, gripper: Tensor, spans: Sequence[tuple[int, int]]) -> Tensor:
-    """Returns which dimensions of the robot's state tell how far the gripper is open, (state,) bool.
-
-    These are the dimensions that follow the gripper's commands, within an eighth of an episode.
-
-    Args:
-        states: Robot states of all frames, (frames, state).
-        gripper: Commands to the gripper in all frames, as for `find_grasps`, (frames,).
-        spans: First and last frame of each episode.
-    """
-    courses, follows = _courses(gripper, spans), torch.zeros(states.shape[1], dtype=torch.bool)
-    longest = max(1, int(np.median([len(course) for course in courses])) // _MAX_LAG)
-    for lag in np.unique(np.linspace(1, longest, min(longest, _N_LAGS)).astype(int)).tolist():
-        frames = torch.cat([torch.arange(first, last + 1)[lag:] for first, last in spans]).to(states.device)
-        held = torch.from_numpy(np.concatenate([course[:-lag] for course in courses])).to(states.device)
-        after, command = states[frames].double(), held[:, None]
-        after, command = after - after.mean(dim=0), command - command.mean()
-        covariance = (after * command).mean(dim=0)
-        scale = after.square().mean(dim=0).sqrt() * command.square().mean().sqrt()
-        follows |= (covariance.abs() > _GRIPPER_CORRELATION * scale.clamp_min(1e-12)).cpu()
-    return follows.to(states.device)
+def _opening(trajectory: NDArray[np.float64], least: float) -> float:
+    """Returns the greatest value before a trajectory falls to a level for the first time."""
+    ends = np.flatnonzero(trajectory <= least)
+    return float(trajectory[: ends[0] if len(ends) else None].max())

@@ -1,7 +1,7 @@
 """Whether low or high values close a gripper: objects move while it is closed, and rest while it is open.
 
-The course of its values often does not tell. One that is low, high, low, high, low may rest closed and grasp
-in the middle, or rest open and grasp twice. So the images decide.
+The gripper trajectory alone often does not tell. One that is low, high, low, high, low may rest closed and
+grasp in the middle, or rest open and grasp twice. So the images decide.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def is_inverted(gripper: Tensor, data: RobotData) -> bool | None:
         gripper: Commands to the gripper in all frames, (frames,).
         data: The episodes, and their images.
     """
-    readings = [find_grasps(commands, data.spans) for commands in (gripper, -gripper)]
+    readings = [find_grasps(commands, data.spans, states=data.states) for commands in (gripper, -gripper)]
     n_grasps, n_inverted = (sum(isinstance(grasp, Grasp) for grasp in reading) for reading in readings)
     if 2 * n_inverted < len(data.spans):
         return False if n_grasps > n_inverted else None
@@ -91,7 +91,9 @@ def warn_if_inverted(gripper: Tensor, data: RobotData, closed: str) -> None:
             other,
             other,
         )
-    elif inverted is None and not any(isinstance(grasp, Grasp) for grasp in find_grasps(gripper, data.spans)):
+    elif inverted is None and not any(
+        isinstance(grasp, Grasp) for grasp in find_grasps(gripper, data.spans, states=data.states)
+    ):
         logger.warning(
             "No episode has a grasp if %s values of the gripper mean closed (--policy.gripper_closed), and "
             "the images do not show whether they do. Look at a recording: if %s values mean closed, set "

@@ -7,7 +7,7 @@ have a table of episodes, statistics or tasks that do not belong to the frames.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -212,6 +212,36 @@ def decoding(dataset: LeRobotDataset, row: int, camera: str) -> Iterator[None]:
             f"The image {camera} in {frame_name(dataset, row, camera)} cannot be decoded: {error}. Record "
             "the episode again, or leave it out with --dataset.episodes."
         ) from error
+
+
+def dimension_names(feature: Mapping[str, Any], name: str = ACTION) -> list[str]:
+    """Returns the names of a feature's dimensions, in any of the forms that converters and robots write.
+
+    These are a list, lists in a list or under names of groups, and a dictionary from name to index.
+
+    Raises:
+        ValueError: The names cannot be read, or are not as many as the dimensions.
+    """
+    names, shape = feature.get("names"), feature.get("shape", ())
+    if names is None:
+        return []
+    found = _flat_names(names)
+    if not all(isinstance(name, str) for name in found) or (len(shape) == 1 and len(found) != shape[0]):
+        raise UserError(
+            f"The `names` of {name!r} in meta/info.json must name each of its {shape[0] if shape else '?'} "
+            f"dimensions. Got {names}. Correct them, or set them to null."
+        )
+    return found
+
+
+def _flat_names(names: Any) -> list[Any]:
+    if isinstance(names, dict):
+        if all(isinstance(index, int) for index in names.values()):
+            return sorted(names, key=names.__getitem__)
+        names = list(names.values())
+    if not isinstance(names, (list, tuple)):
+        return [names]
+    return [name for part in names for name in _flat_names(part)]
 
 
 # Checks

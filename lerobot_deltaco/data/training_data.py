@@ -24,7 +24,7 @@ from lerobot_deltaco.data.demonstrations import DemonstrationBank, RobotData, ke
 from lerobot_deltaco.data.grasps import Keyframes, find_keyframes
 from lerobot_deltaco.data.gripper import Gripper
 from lerobot_deltaco.data.images import read_images, resize_images
-from lerobot_deltaco.data.reading import check_episode_numbers, column, episode_spans
+from lerobot_deltaco.data.reading import check_episode_numbers, column, dimension_names, episode_spans
 from lerobot_deltaco.errors import UserError
 
 # Index of the object that an episode moves, in datasets of the benchmark.
@@ -48,6 +48,9 @@ class Episodes(Protocol):
 
     def values(self, feature: str) -> Tensor | None:
         """Returns the numbers of a feature in all rows, (rows, ...); None without that feature."""
+
+    def names(self, feature: str) -> list[str]:
+        """Returns the names of a feature's dimensions; none if the dataset does not name them."""
 
     def images(self, camera: str, rows: Sequence[int], size: int | None) -> Tensor:
         """Returns images of a camera, (images, 3, H, W) uint8.
@@ -100,6 +103,11 @@ class DatasetEpisodes:
         if name not in self._dataset.hf_dataset.column_names:
             return None
         return torch.from_numpy(column(self._dataset, name))
+
+    def names(self, feature: str) -> list[str]:
+        """Returns the names of a feature's dimensions; none if the dataset does not name them."""
+        features = self._dataset.meta.features
+        return dimension_names(features.get(self._source(feature, list(features)), {}), feature)
 
     def images(self, camera: str, rows: Sequence[int], size: int | None) -> Tensor:
         """Returns images of a camera, (images, 3, H, W) uint8. See `Episodes.images`."""
@@ -208,7 +216,13 @@ def read_robot_data(episodes: Episodes, form: DemonstrationFormat) -> RobotData 
         return None
     states, actions = states.float(), actions.float()
     spans = list(episodes.spans.values())
-    return RobotData(states, actions, spans, lambda rows: episodes.images(form.camera, rows, form.image_size))
+    return RobotData(
+        states,
+        actions,
+        spans,
+        lambda rows: episodes.images(form.camera, rows, form.image_size),
+        episodes.names(OBS_STATE),
+    )
 
 
 def read_demonstrations(episodes: Episodes, form: DemonstrationFormat) -> DemonstrationBank:

@@ -27,16 +27,16 @@ from tqdm import tqdm
 
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.data.frames import memory_for_frames
-from lerobot_deltaco.data.grasps import Grasp, find_grasps, follows_gripper
+from lerobot_deltaco.data.grasps import Grasp, find_grasps
+from lerobot_deltaco.data.gripper_states import GripperStates, find_gripper_states
 from lerobot_deltaco.data.images import as_uint8, resize_images
 from lerobot_deltaco.data.pauses import paused_frames
-from lerobot_deltaco.data.reading import open_folder_or_hub
+from lerobot_deltaco.data.reading import dimension_names, open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
-from lerobot_deltaco.policies.base.configuration import dimension_names
 from lerobot_deltaco.policies.deltaco_match import matching as feature_matching
 from lerobot_deltaco.policies.deltaco_match import proposals
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
@@ -64,7 +64,7 @@ class TrainingStart:
         policy: The policy; None if the configuration does not fit the dataset.
         bank: The episodes as demonstrations; None if they were not read.
         grasps: The grasp of each episode, or why there is none; empty if unknown.
-        gripper_states: Dimensions of the state that tell how far the gripper is open.
+        gripper_states: Dimensions of the state that tell how far the gripper is open; None if unknown.
     """
 
     def __init__(self, dataset: LeRobotDataset, config: DeltacoMatchConfig) -> None:
@@ -74,7 +74,7 @@ class TrainingStart:
         self.policy: DeltacoMatchPolicy | None = None
         self.bank: DemonstrationBank | None = None
         self.grasps: list[Grasp | str] = []
-        self.gripper_states: list[int] = []
+        self.gripper_states: GripperStates | None = None
         with _warnings() as self.warnings:
             try:
                 self._begin()
@@ -91,8 +91,8 @@ class TrainingStart:
         assert robot is not None
         assert command is not None
         opening = command.opening(robot.actions)
-        self.grasps = find_grasps(opening, robot.spans, command.usual_range)
-        self.gripper_states = follows_gripper(robot.states, opening, robot.spans).nonzero().flatten().tolist()
+        self.grasps = find_grasps(opening, robot.spans, command.usual_range, robot.states)
+        self.gripper_states = find_gripper_states(robot.states, opening, robot.spans, robot.state_names)
         self.policy.fit_locations(data.to(self.policy.step.device))
         with_grasp = zip(self.bank.tasks, self.grasps, strict=True)
         feature_matching._Pairs([task for task, grasp in with_grasp if isinstance(grasp, Grasp)])
@@ -260,7 +260,7 @@ def _dimensions(start: TrainingStart) -> dict[str, list[tuple[str, float, float]
         if feature in meta.features and feature in meta.stats:
             low, high = (np.ravel(meta.stats[feature][end]).tolist() for end in ("min", "max"))
             # Names that cannot be read are an error of the policy.
-            names = dimension_names(meta.features[feature]) if start.policy is not None else []
+            names = dimension_names(meta.features[feature], feature) if start.policy is not None else []
             found[feature] = list(zip(names or map(str, range(len(low))), low, high, strict=True))
     return found
 
@@ -282,10 +282,13 @@ def _facts(
         n_found = sum(isinstance(grasp, Grasp) for grasp in start.grasps)
         closing = f"{config.name_gripper(meta.features)}; {config.gripper_closed} values close it"
         facts.append(("gripper", closing))
-        names = ((n, dimensions[OBS_STATE][n][0]) for n in start.gripper_states)
+    if start.gripper_states is not None:
+        chosen = start.gripper_states.is_gripper.nonzero().flatten().tolist()
+        names = ((n, dimensions[OBS_STATE][n][0]) for n in chosen)
         states = ", ".join(f"{n}" if name == str(n) else f"{n} ({name})" for n, name in names)
-        follow = f"dimension {states} of the state" if states else "nothing in the state"
-        facts.append(("its state", f"{follow} follows these commands; the rest is taken for the arm's"))
+        which = f"dimension {states} of the state" if states else "nothing in the state"
+        facts.append(("its state", f"{which}, {start.gripper_states.reason}; the rest is the arm's"))
+    if start.grasps:
         facts.append(("grasps", f"in {n_found} of {len(start.grasps)} episodes; others are left out"))
     for feature, rows in dimensions.items():
         arm = [ends for name, *ends in rows if "gripper" not in name.lower()] or [[0.0, 0.0]]

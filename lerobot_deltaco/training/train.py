@@ -176,7 +176,8 @@ def _until_release(frames: FramesInMemory, policy: TaskConditionedConfig) -> NDA
     spans = list(frames.spans.values())
     gripper = policy.gripper_command.opening(frames.columns[ACTION])
     n_after = round(n_after * frames.fps / _FPS_OF_OPTION)
-    for grasp, (_, last) in zip(find_grasps(gripper, spans), spans, strict=True):
+    grasps = find_grasps(gripper, spans, policy.gripper_command.usual_range, frames.columns.get(OBS_STATE))
+    for grasp, (_, last) in zip(grasps, spans, strict=True):
         if isinstance(grasp, Grasp):
             use[grasp.opened + 1 + n_after : last + 1] = False
     return use

@@ -1,7 +1,9 @@
 """`deltaco check`: its report agrees with the training."""
 
+import shutil
 import sys
 from itertools import islice
+from pathlib import Path
 
 import pytest
 import torch
@@ -39,7 +41,7 @@ def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path):
     assert "Training would refuse" not in report
     assert "demo camera:    observation.image stands still" in report
     assert "dimension 2 of the action (gripper); low values close it" in report
-    assert "its state:      nothing in the state follows these commands" in report
+    assert "its state:      nothing in the state, since none is named like the gripper" in report
     assert "in 48 of 48 episodes" in report
     assert all(f"24 episodes, 24 with a grasp: {task}" in report for task in TABLE_TASKS)
     assert "for 100 steps of 4" in report
@@ -49,13 +51,14 @@ def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path):
     assert "would refuse" not in page
 
 
-def test_the_direction_of_the_gripper_is_the_one_given(table, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "lerobot_deltaco.pages.check.follows_gripper", lambda states, *_: torch.arange(states.shape[1]) == 1
-    )
-    report, _ = checked(table.root, tmp_path, gripper_closed="high")
+def test_the_direction_of_the_gripper_is_the_one_given(table, tmp_path):
+    root = Path(shutil.copytree(table.root, tmp_path / "data"))
+    info = root / "meta" / "info.json"
+    info.write_text(info.read_text().replace('"b"', '"gripper_b"', 1))
+    report, _ = checked(root, tmp_path, gripper_closed="high")
     assert "high values close it" in report
-    assert "dimension 1 (b) of the state follows these commands" in report
+    assert "dimension 1 (gripper_b) of the state, by name; the rest is the arm's" in report
+    assert "`gripper_b` is named like the gripper, but does not follow its commands" in report
     assert "in 0 of 48 episodes" in report
     assert report.count("left out:       episode") == 48
     assert "Set --policy.gripper_closed=low" in report

@@ -17,6 +17,7 @@ from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig, LRSchedulerConfig
 
 from lerobot_deltaco.data.gripper import Gripper
+from lerobot_deltaco.data.reading import dimension_names
 from lerobot_deltaco.data.training_data import DemonstrationFormat
 from lerobot_deltaco.errors import UserError
 
@@ -323,37 +324,6 @@ class TaskConditionedConfig(PreTrainedConfig):
     def reward_delta_indices(self) -> None:
         """Rewards are not used."""
         return
-
-
-def dimension_names(feature: dict[str, Any]) -> list[str]:
-    """Returns the names of a feature's dimensions, in any of the forms that converters and robots write.
-
-    These are a list, lists in a list or under names of groups, and a dictionary from name to index.
-
-    Raises:
-        ValueError: The names cannot be read, or are not as many as the dimensions.
-    """
-    names, shape = feature.get("names"), feature.get("shape", ())
-    if names is None:
-        return []
-    found = _flat_names(names)
-    if not all(isinstance(name, str) for name in found) or (len(shape) == 1 and len(found) != shape[0]):
-        raise UserError(
-            f"The `names` of 'action' in meta/info.json must name each of its {shape[0] if shape else '?'} "
-            f"dimensions. Got {names}. Correct them, or set --policy.gripper to the gripper's dimension, or "
-            "to none."
-        )
-    return found
-
-
-def _flat_names(names: Any) -> list[Any]:
-    if isinstance(names, dict):
-        if all(isinstance(index, int) for index in names.values()):
-            return sorted(names, key=names.__getitem__)
-        names = list(names.values())
-    if not isinstance(names, (list, tuple)):
-        return [names]
-    return [name for part in names for name in _flat_names(part)]
 
 
 def check_image_shapes(shapes: dict[str, Sequence[int]]) -> None:

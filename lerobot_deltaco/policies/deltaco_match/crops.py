@@ -19,7 +19,7 @@ from lerobot_deltaco.policies.base.image_encoder import (
     EfficientNetLite0,
 )
 from lerobot_deltaco.policies.base.networks import cell_centers
-from lerobot_deltaco.policies.deltaco_match.calibration import robust_fit
+from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
 
 _RESOLUTION = 128  # px, of crops as the encoder sees them
 # Maps that describe a crop: at stride 16, as 4 x 4 cells, and at stride 32, as their mean.
@@ -28,6 +28,7 @@ _FINE_CHANNELS, _FINE_CELLS, _COARSE_CHANNELS = 112, 4, 320
 # and width by which images blur an object (px).
 _CHANGE, _REACH, _BLUR = 0.1, 1 / 3, 1.0
 _MIN_SEEN, _MAX_SLOPE = 24, 1.5
+_LEAST_ERROR = 0.02  # of the log of a size, below which errors are all alike
 _COLOR_CELLS = 8  # of a row and of a column, whose mean colors are features
 COLOR_DIM = 3 * _COLOR_CELLS**2
 FEATURE_DIM = _FINE_CHANNELS * _FINE_CELLS**2 + _COARSE_CHANNELS + HEAD_CHANNELS + COLOR_DIM
@@ -107,7 +108,9 @@ def fit_perspective(first: Tensor, last: Tensor, locations: Tensor) -> Tensor:
     if int(seen.sum()) < _MIN_SEEN:
         return torch.zeros(2, device=first.device)
     features = torch.cat([torch.ones_like(locations[:, :1]), locations], dim=1)[seen]
-    return robust_fit(features, side[seen].log()[:, None])[1:, 0].clamp(-_MAX_SLOPE, _MAX_SLOPE)
+    degrees = torch.tensor([0, 1, 1], device=first.device)
+    weights = robust_regression(features, side[seen].log()[:, None], degrees, _LEAST_ERROR)
+    return weights[1:, 0].clamp(-_MAX_SLOPE, _MAX_SLOPE)
 
 
 @cache

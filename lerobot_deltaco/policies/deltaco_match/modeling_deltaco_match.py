@@ -30,8 +30,9 @@ from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_tra
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.data.grasps import follows_gripper, warn_of_missing
+from lerobot_deltaco.data.grasps import warn_of_missing
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
+from lerobot_deltaco.data.gripper_states import find_gripper_states
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
 from lerobot_deltaco.errors import UserError
@@ -48,7 +49,7 @@ from lerobot_deltaco.policies.deltaco_match.place import (
     PlaceNetwork,
     peak_locations,
 )
-from lerobot_deltaco.policies.deltaco_match.states import N_LOCATIONS, RobotStates, TrainingLocations
+from lerobot_deltaco.policies.deltaco_match.states import N_LOCATIONS, StateRegressor, TrainingLocations
 from lerobot_deltaco.policies.deltaco_match.words import (
     INSTRUCTION_DIM,
     InstructionEncoder,
@@ -152,7 +153,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             chunk_size=config.chunk_size or 1,
             n_locations=N_LOCATIONS,
         )
-        self.robot_states = RobotStates(config.state_dim)
+        self.robot_states = StateRegressor(config.state_dim)
         self.feature_matching = FeatureMatching(config.known_words, config.crop_size)
         self.attention = DemonstrationAttention()
         self.place = PlaceNetwork(INSTRUCTION_DIM)
@@ -447,6 +448,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         opening = self.config.gripper_command.opening(robot.actions)
         warn_of_missing(grasps, bank.episodes.tolist(), "are not trained on")
         warn_if_inverted(opening, robot, self.config.gripper_closed)
+        gripper_states = find_gripper_states(robot.states, opening, robot.spans, robot.state_names)
+        gripper_states.warn()
         n_grasps = int(grasps.has_grasp.sum())
         if n_grasps < MIN_EPISODES:
             raise UserError(
@@ -466,7 +469,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             bank.frames[:, -1],
             end - shift,
             shift,
-            ~follows_gripper(robot.states, opening, robot.spans),
+            ~gripper_states.is_gripper,
         )
 
     def fit_matching(self) -> None:

@@ -1,31 +1,37 @@
 """The robot's states at the pick and place locations, and the height offset of a grasp.
 
-A location in an image leaves one number open: how far along the camera's ray it is. At a grasp, that depends
-on the object, and an unknown flat object looks like a tall one farther away. A demonstration resolves this,
-through the robot's state when its gripper closed.
+An image location fixes a point only up to its depth along the camera's ray. At a grasp, the depth depends on
+the object: a flat object looks like a tall one farther away. A demonstration resolves this, through the
+robot's state when its gripper closed.
 
-Grasp height offset: how far the state at a grasp is along the robot's direction of approach, beyond what the
-location predicts; in standard deviations over the training episodes, 0 on average. In the benchmark, larger
-is lower.
+Grasp height offset: how far along the camera's ray the state at a grasp is from what the location predicts,
+measured along the robot's direction of approach. It is in standard deviations over the training episodes, 0
+on average, and larger farther along the approach: in the benchmark, lower.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from lerobot_deltaco.data.grasps import Keyframes
-from lerobot_deltaco.policies.deltaco_match.calibration import StateToImage
+from lerobot_deltaco.policies.deltaco_match.calibration import ImageProjection
+from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
 
 N_LOCATIONS = 2  # pick and place
 _N_LOCATION_FEATURES = 10
 _N_HEIGHT_FEATURES = 3  # of the first of those: 1, x, y
-_RIDGE = 1e-5
+_DEGREES = (0, 1, 1, 2, 2, 2, 3, 3, 3, 3)  # of these features
+_COVARIANCE_RIDGE = 1e-4
+_HEIGHT_ROUNDS = 3  # of estimating heights, and the direction in which they move states
+_LEAST_ERROR = 0.02  # of a normalized state, below which errors are all alike
+_CHANCE = 2.0  # standard errors of a correlation that are taken for chance
+_LEAST_UNEXPLAINED = 0.2  # of a dimension's residual by a height; less is taken for chance
 # Spread of a normalized state around what locations predict, below which it does not count.
 _MIN_SPREAD = 1e-3
-_MAX_REST = 4.0  # beyond which, in that spread, it is an accident
+_MAX_REST = 4.0  # in that spread; more is an accident
 
 
 class TrainingLocations(NamedTuple):
@@ -42,14 +48,14 @@ class TrainingLocations(NamedTuple):
     has_grasp: Tensor
 
 
-class RobotStates(nn.Module):
-    """The state of the robot at a location, by regression over the training episodes.
+class StateRegressor(nn.Module):
+    """Predicts the state of the robot at a location, by regression over the training episodes.
 
     Args:
         state_dim: Size of the robot's state.
 
     Attributes:
-        to_image: Map from states to locations in the image.
+        to_image: Projects states to locations in the image.
     """
 
     location_to_state: Tensor
@@ -57,16 +63,20 @@ class RobotStates(nn.Module):
     state_scale: Tensor
     state_shift: Tensor
     rest_scale: Tensor
+    location_covariance: Tensor
 
     def __init__(self, state_dim: int) -> None:
         super().__init__()
-        self.to_image = StateToImage(state_dim)
+        self.to_image = ImageProjection(state_dim)
         self.register_buffer("location_to_state", torch.zeros(N_LOCATIONS, _N_LOCATION_FEATURES, state_dim))
         self.register_buffer("height_to_state", torch.zeros(_N_HEIGHT_FEATURES, state_dim))
         # A state as the policy gets it is state_scale * state + state_shift.
         self.register_buffer("state_scale", torch.ones(state_dim))
         self.register_buffer("state_shift", torch.zeros(state_dim))
         self.register_buffer("rest_scale", torch.zeros(state_dim))
+        # Of `location_to_state`, for residuals with a standard deviation of 1; NaN if it is not known.
+        covariance = torch.full((N_LOCATIONS, _N_LOCATION_FEATURES, _N_LOCATION_FEATURES), torch.nan)
+        self.register_buffer("location_covariance", covariance)
 
     def fit(
         self,
@@ -99,12 +109,18 @@ class RobotStates(nn.Module):
         locations = self.to_image(keyframes.states).clamp(-1, 1)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
-        states = keyframes.states * scale + shift  # (episodes, 2, state)
+        states = (keyframes.states * scale + shift)[has_grasp]  # (episodes, 2, state)
+        last_moves = states[:, 0] - (keyframes.approach * scale + shift)[has_grasp]
+        features = _location_features(locations[has_grasp])
+        degrees = torch.tensor(_DEGREES, device=states.device)
         for n in range(N_LOCATIONS):
-            features = _location_features(locations[has_grasp, n])
-            self.location_to_state[n].copy_(_ridge_regression(features, states[has_grasp, n]))
-        last_moves = (states[:, 0] - (keyframes.approach * scale + shift))[has_grasp]
-        self._fit_heights(locations[has_grasp, 0], states[has_grasp, 0], last_moves, is_arm)
+            self.location_to_state[n].copy_(
+                robust_regression(features[:, n], states[:, n], degrees, _LEAST_ERROR, is_arm.float())
+            )
+            gram = features[:, n].T @ features[:, n]
+            ridge = _COVARIANCE_RIDGE * len(gram) * torch.eye(len(gram), device=gram.device)
+            self.location_covariance[n].copy_(torch.linalg.inv(gram + ridge))
+        self._fit_heights(features[:, 0], states[:, 0], last_moves, is_arm)
         return self.locate(keyframes)
 
     def locate(self, keyframes: Keyframes) -> TrainingLocations:
@@ -118,14 +134,77 @@ class RobotStates(nn.Module):
             has_grasp,
         )
 
-    def _fit_heights(self, locations: Tensor, states: Tensor, last_moves: Tensor, is_arm: Tensor) -> None:
-        features = _location_features(locations)
+    def _fit_heights(self, features: Tensor, states: Tensor, last_moves: Tensor, is_arm: Tensor) -> None:
+        """Learns how an unknown height moves the state at a grasp, and what a location predicts without it.
+
+        The height begins as what the location leaves open of the state along the approach. States move with
+        it along the camera's ray, which may lean away from the approach.
+
+        Args:
+            features: Features of the locations of grasps, (episodes, features).
+            states: States there, normalized, (episodes, state).
+            last_moves: How they moved before, (episodes, state).
+            is_arm: Dimensions other than the gripper's opening, (state,) bool.
+        """
         rest = states - features @ self.location_to_state[0]  # (episodes, state)
-        spread = 1.4826 * rest.abs().median(dim=0).values
-        # A joint that only vibrates counts no more than one that reaches.
-        self.rest_scale.copy_(torch.where(is_arm & (spread > _MIN_SPREAD), 1 / spread.clamp_min(1e-12), 0.0))
-        self.height_to_state.copy_(_ridge_regression(features[:, :_N_HEIGHT_FEATURES], last_moves * is_arm))
-        self.height_to_state.mul_(self._project(rest, features).std())
+        is_open = is_arm & (_spread(rest) > _MIN_SPREAD)
+        self._weigh(rest, rest, is_open)
+        linear, degrees = features[:, :_N_HEIGHT_FEATURES], torch.tensor(_DEGREES, device=states.device)
+        approach = robust_regression(linear, last_moves * is_arm, degrees[:_N_HEIGHT_FEATURES], _LEAST_ERROR)
+        self.height_to_state.copy_(approach)
+        degrees = torch.cat([degrees, torch.tensor([0, 2, 2], device=states.device)])
+        scale = self.rest_scale + 1e-6 * is_arm
+        for _ in range(_HEIGHT_ROUNDS):
+            heights = self._project(rest, features)
+            std = heights.std()
+            if not std > 0:
+                self.height_to_state.zero_()
+                return
+            heights = (heights - heights.mean()) / std
+            both = torch.cat([features, linear * heights[:, None]], dim=1)
+            weights = robust_regression(both, states, degrees, _LEAST_ERROR, scale)
+            self.location_to_state[0].copy_(weights[:_N_LOCATION_FEATURES])
+            rest = states - features @ self.location_to_state[0]
+            # With few episodes, a height seems to move dimensions that have nothing to do with it.
+            clipped = rest.clamp(-_MAX_REST * _spread(rest), _MAX_REST * _spread(rest))
+            correlation = (clipped * heights[:, None]).mean(dim=0) / clipped.square().mean(dim=0).sqrt()
+            kept = (1 - (_CHANCE / correlation).square() / len(rest)).nan_to_num(0, 0, 0).clamp_min(0)
+            self.height_to_state.copy_(weights[_N_LOCATION_FEATURES:] * is_arm * kept)
+            unexplained = rest - heights[:, None] * (linear @ self.height_to_state)
+            self._weigh(rest, unexplained, is_open)
+
+    def _weigh(self, rest: Tensor, unexplained: Tensor, is_open: Tensor) -> None:
+        """Weighs dimensions by how well a height explains what locations leave open of them.
+
+        Args:
+            rest: Residuals of states given locations, (episodes, state).
+            unexplained: Those given heights, too, (episodes, state).
+            is_open: Dimensions that count, (state,) bool.
+        """
+        spread = _spread(rest).clamp_min(1e-12)
+        ratio = (_spread(unexplained) / spread).clamp(_LEAST_UNEXPLAINED, 1)
+        # Relative to the best one, which must not be cut at less than `_MAX_REST`.
+        ratio = ratio / torch.where(is_open, ratio, 1.0).min()
+        self.rest_scale.copy_(torch.where(is_open, 1 / (spread * ratio), 0.0))
+
+    def uncertainty(self, locations: Tensor) -> Tensor:
+        """Returns how far locations are outside of those in training, (..., 2).
+
+        It is the standard error of the predicted state, as a multiple of what locations leave open of a
+        state: small amid the training locations; from about 1 on, the prediction is an extrapolation. NaN for
+        a policy whose checkpoint does not have it.
+
+        Args:
+            locations: Pick and place, (..., 2, 2) in -1..1.
+        """
+        features = _location_features(locations)
+        variance = torch.einsum("...gf,gfe,...ge->...g", features, self.location_covariance, features)
+        return variance.sqrt()
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        name = f"{prefix}location_covariance"
+        state_dict.setdefault(name, torch.full_like(self.location_covariance, torch.nan))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def heights(self, pick_states: Tensor) -> Tensor:
         """Returns the height offsets of grasps, (grasps,); NaN for a grasp that is not known.
@@ -164,10 +243,9 @@ class RobotStates(nn.Module):
         return torch.cat([states[:, :1] + further[:, None], states[:, 1:]], dim=1)
 
 
-def _ridge_regression(features: Tensor, targets: Tensor) -> Tensor:
-    """Returns weights (features, targets) that predict targets (n, targets) from features (n, features)."""
-    ridge = _RIDGE * len(features) * torch.eye(features.shape[1], device=features.device)
-    return torch.linalg.solve(features.T @ features + ridge, features.T @ targets)
+def _spread(values: Tensor) -> Tensor:
+    """Returns the standard deviations of values (n, dims) around 0, (dims,), without outliers."""
+    return 1.4826 * values.abs().median(dim=0).values
 
 
 def _location_features(locations: Tensor) -> Tensor:

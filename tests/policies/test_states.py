@@ -1,0 +1,215 @@
+"""The robot's states at locations, and the height offsets of grasps."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from gym_deltaco.robot.kinematics import forward, inverse
+from lerobot_deltaco.data.grasps import Keyframes
+from lerobot_deltaco.policies.deltaco_match.states import StateRegressor
+
+
+class ExactLocations(torch.nn.Module):
+    """Inverts how `grasps` makes states from locations."""
+
+    def fit(self, *_): ...
+
+    def forward(self, states):
+        x, y, z = states[..., 0] - 2, states[..., 1], states[..., 2]
+        return torch.stack([x, (y - z * 0.2 / 3) / (5 - x * 0.2 / 3)], dim=-1)
+
+
+def grasps(heights):
+    """Keyframes whose states are of a location, a height and the gripper's width; and the locations."""
+    generator = torch.Generator().manual_seed(0)
+    locations = torch.rand(200, 2, 2, generator=generator) * 1.6 - 0.8
+    x, y = locations.unbind(dim=2)
+    height = torch.stack([heights, torch.zeros(200)], dim=1)  # of grasps alone
+    width = torch.rand(200, 2, generator=generator) * 40
+    states = torch.stack([2 + x, 5 * y + 0.2 * height, 3 * height + x * y, width], dim=2)
+    approach = states[:, 0] - torch.tensor([0, 0.2, 3, 0])
+    has_grasp = torch.arange(200) % 10 > 0
+    return Keyframes(
+        states, approach, torch.zeros(200, dtype=torch.long), has_grasp, (None,) * 200
+    ), locations
+
+
+def fitted_states(keyframes):
+    robot_states = StateRegressor(4)
+    robot_states.to_image = ExactLocations()
+    images = torch.zeros(200, 3, 2, 2, dtype=torch.uint8)
+    scale, shift = torch.tensor([0.5, 2, 0.1, 1]), torch.tensor([1.0, 0, -1, 0])
+    is_arm = torch.tensor([True, True, True, False])
+    return (
+        robot_states,
+        robot_states.fit(keyframes, images, images, images, scale, shift, is_arm),
+        (scale, shift),
+    )
+
+
+def test_how_far_the_gripper_is_open_says_nothing_about_locations():
+    generator = torch.Generator().manual_seed(0)
+    keyframes, _ = grasps(torch.zeros(200))
+    images = torch.randint(256, (3, 200, 3, 8, 8), generator=generator).to(torch.uint8)
+    robot_states = StateRegressor(4)
+    robot_states.fit(keyframes, *images, torch.ones(4), torch.zeros(4), torch.arange(4) < 3)
+    states = keyframes.states[:, 0]
+    other = states + torch.tensor([0.0, 0, 0, 5])
+    assert torch.equal(robot_states.to_image(other), robot_states.to_image(states))
+
+
+def test_heights_are_what_locations_do_not_tell_of_states():
+    heights = torch.randn(200, generator=torch.Generator().manual_seed(1))
+    keyframes, locations = grasps(heights)
+    robot_states, known, (scale, shift) = fitted_states(keyframes)
+    found = keyframes.has_grasp
+    torch.testing.assert_close(known.locations[found, 0], locations[found, 0], atol=0.1, rtol=0)
+    assert not known.locations[~found].any()
+    assert torch.corrcoef(torch.stack([known.heights[found], heights[found]]))[0, 1] > 0.98
+    assert known.heights[found].std() == pytest.approx(1, abs=0.05)
+    # Locations and heights give the states; without the heights, that of the grasp is not known.
+    true = keyframes.states * scale + shift
+    predicted = robot_states(known.locations, known.heights)
+    torch.testing.assert_close(predicted[found, 0, :3], true[found, 0, :3], atol=0.1, rtol=0)
+    error = (robot_states(known.locations, torch.zeros(200)) - predicted)[found, 0].abs().mean(dim=0)
+    assert error[2] > 0.1
+    assert error[0] < 0.02
+    assert robot_states.heights(torch.full((1, 4), torch.nan)).isnan().all()
+    # All heights are zero if all grasps have the same.
+    keyframes, locations = grasps(torch.zeros(200))
+    flat = keyframes.states.clone()
+    flat[..., 1], flat[..., 2], flat[..., 3] = 5 * locations[..., 1], 0, 1
+    robot_states, known, _ = fitted_states(keyframes._replace(states=flat))
+    assert not robot_states.height_to_state.any()
+    assert not known.heights.any()
+
+
+# A camera that looks down at 45 degrees on objects of different heights. m, and rad for joints
+
+EYE, DOWN = np.array([0.6, 0.9, 0.4]), np.sqrt(0.5)
+FORWARD, RIGHT = np.array([0, -DOWN, -DOWN]), np.array([-1.0, 0, 0])
+
+
+def project(points):
+    """Projects points (..., 3) to the image of a pinhole camera, (..., 2) in -1..1."""
+    away = points - EYE
+    depth = away @ FORWARD
+    return 2.4 * np.stack([away @ RIGHT, -away @ np.cross(RIGHT, FORWARD)], axis=-1) / depth[..., None]
+
+
+class Recording(NamedTuple):
+    """Episodes with objects of 10 heights: first, carried and last images, and the robot's states."""
+
+    images: tuple[torch.Tensor, ...]
+    keyframes: Keyframes
+    positions: np.ndarray  # at the grasps, (episodes, 3)
+
+
+def record(n_episodes, seed, joints=False, accidents=0):
+    rng = np.random.default_rng(seed)
+    heights = np.linspace(0, 0.08, 10)[rng.integers(10, size=n_episodes)]
+    picks, places = rng.uniform([0.45, 0.12], [0.75, 0.34], (2, n_episodes, 2))
+    tables, images = rng.uniform(-0.9, 0.9, (n_episodes, 2)), ([], [], [])
+    for height, pick, place, arm in zip(heights, picks, places, tables, strict=True):
+        size, color = 2 + 25 * height, rng.integers(0, 256, 3)
+        before, after = (project(np.array([*spot, height / 2 - 0.34])) for spot in (pick, place))
+        for image, center, robot in zip(images, (before, None, after), ((1, -1), arm, (-1, -1)), strict=True):
+            pixels = np.full((64, 64, 3), 120, np.uint8)
+            y, x = np.mgrid[:64, :64]
+            for spot, side, shade in ((center, size, color), (robot, 4, (255, 255, 255))):
+                if spot is not None:
+                    column, row = (np.asarray(spot) + 1) * 32 - 0.5
+                    pixels[(abs(x - column) < side) & (abs(y - row) < side)] = shade
+            image.append(pixels)
+    grasps = np.column_stack([picks, heights - 0.34]) + rng.normal(0, 0.002, (n_episodes, 3))
+    releases = np.column_stack([places, heights - 0.3]) + rng.normal(0, 0.002, (n_episodes, 3))
+    approach = grasps + [0, 0, 0.05] + rng.normal(0, 0.003, (n_episodes, 3))
+    grasps[:accidents] += rng.normal(0, 0.05, (accidents, 3))
+    width = rng.uniform(0.2, 0.8, n_episodes)
+
+    def states(positions):
+        if joints:
+            angles = [inverse(position) + rng.normal(0, 0.003, 6) for position in positions]
+            return np.column_stack([angles, width])
+        turns = rng.normal(0, 0.4, (n_episodes, 3))  # the wrist's, as the object lies
+        return np.column_stack([positions, turns, width])
+
+    pick_states = states(grasps)
+    both = torch.from_numpy(np.stack([pick_states, states(releases)], axis=1)).float()
+    positions = np.stack([forward(state[:6])[0] for state in pick_states]) if joints else grasps
+    keyframes = Keyframes(
+        both,
+        torch.from_numpy(states(approach)).float(),
+        torch.zeros(n_episodes, dtype=torch.long),
+        torch.ones(n_episodes, dtype=torch.bool),
+        (None,) * n_episodes,
+    )
+    stacks = (torch.from_numpy(np.stack(image)).permute(0, 3, 1, 2).contiguous() for image in images)
+    return Recording(tuple(stacks), keyframes, positions)
+
+
+def fit_to(recording):
+    """Fits a state regressor; returns it, and the scale and shift of states."""
+    states = recording.keyframes.states
+    scale = 1 / states.flatten(0, 1).std(dim=0)
+    shift = -states.flatten(0, 1).mean(dim=0) * scale
+    regressor = StateRegressor(states.shape[2])
+    is_arm = torch.arange(states.shape[2]) < states.shape[2] - 1
+    regressor.fit(recording.keyframes, *recording.images, scale, shift, is_arm)
+    return regressor, scale, shift
+
+
+def errors_at_the_pick(regressor, scale, shift, recording, joints=False):
+    """Errors of the state at the pick, from the location and the height, (episodes, 3) in mm."""
+    located = regressor.locate(recording.keyframes)
+    states = ((regressor(located.locations, located.heights) - shift) / scale)[:, 0].numpy()
+    predicted = np.stack([forward(state[:6])[0] for state in states]) if joints else states[:, :3]
+    return 1000 * np.abs(predicted - recording.positions)
+
+
+@pytest.mark.parametrize(
+    ("joints", "n_episodes", "accidents", "median", "p90"),  # mm
+    [
+        (False, 30, 0, 8, 25),
+        (False, 60, 3, 4, 10),
+        (False, 120, 6, 4, 10),
+        (True, 60, 0, 4, 20),
+        (True, 120, 6, 4, 15),
+    ],
+)
+def test_location_and_height_give_the_state_at_the_pick(joints, n_episodes, accidents, median, p90):
+    fitted = fit_to(record(n_episodes, 0, joints, accidents))
+    errors = errors_at_the_pick(*fitted, record(100, 1, joints), joints)
+    assert (np.median(errors, axis=0) < median).all()
+    assert (np.quantile(errors, 0.9, axis=0) < p90).all()
+
+
+def test_heights_are_larger_along_the_approach():
+    recording = record(60, 0)
+    regressor, scale, shift = fit_to(recording)
+    heights = regressor.heights(recording.keyframes.states[:, 0])
+    assert np.corrcoef(heights, recording.positions[:, 2])[0, 1] < -0.85
+    # An unknown height moves the object's middle, half as high as the grasp, along the camera's ray.
+    located = regressor.locate(recording.keyframes)
+    moved = (regressor(located.locations, heights + 1) - regressor(located.locations, heights)) / scale
+    middle = recording.positions * [1, 1, 0.5] - [0, 0, 0.17]
+    ray = (middle - EYE) * [1, 1, 2]
+    direction = moved[:, 0, :3].numpy()
+    cosines = (direction * ray).sum(axis=1) / np.linalg.norm(direction, axis=1) / np.linalg.norm(ray, axis=1)
+    assert np.median(cosines) > 0.99
+
+
+def test_a_location_outside_of_the_training_scenes_is_uncertain():
+    recording = record(60, 0)
+    regressor, *_ = fit_to(recording)
+    inside = regressor.uncertainty(regressor.locate(recording.keyframes).locations)
+    assert inside.median() < 0.5
+    assert (regressor.uncertainty(torch.tensor([[[0.95, 0.95]] * 2, [[-0.95, -0.95]] * 2])) > 1).all()
+    # A checkpoint that lacks it does not know.
+    state_dict = regressor.state_dict()
+    del state_dict["location_covariance"]
+    other = StateRegressor(7)
+    other.load_state_dict(state_dict)
+    assert other.uncertainty(torch.zeros(2, 2)).isnan().all()
