@@ -178,10 +178,13 @@ def find_grasps(
     arm = None if states is None else _arm_positions(states, gripper, spans)
     grasps = []
     for (first, last), raw, trajectory, size in zip(spans, trajectories, smooth, ranges, strict=True):
-        found = _closed_intervals(raw, trajectory, size, usual)
-        if not isinstance(found, str):
-            found = found[-1].grasp if arm is None else _carrying(found, arm[first : last + 1])
-        grasps.append(found if isinstance(found, str) else Grasp(*(first + n for n in found)))
+        intervals = _closed_intervals(raw, trajectory, size, usual)
+        grasp: Grasp | str
+        if isinstance(intervals, str):
+            grasp = intervals
+        else:
+            grasp = intervals[-1].grasp if arm is None else _carrying(intervals, arm[first : last + 1])
+        grasps.append(grasp if isinstance(grasp, str) else Grasp(*(first + n for n in grasp)))
     return grasps
 
 
