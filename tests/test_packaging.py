@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 from fresh_python import run_python
-from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 from lerobot.policies import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins

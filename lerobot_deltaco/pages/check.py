@@ -41,9 +41,9 @@ from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.pages.html import picture_uri, render
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.policies.base.configuration import dimension_names
-from lerobot_deltaco.policies.deltaco_match import matching as feature_matching
 from lerobot_deltaco.policies.deltaco_match import proposals
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.training.train import image_size_in_memory
 
@@ -98,7 +98,7 @@ class TrainingStart:
         self.bank = read_demonstrations(dataset, config.cameras[0], config.image_size, config.n_demo_frames)
         self.policy.set_training_data(self.bank, data)
         with_grasp = zip(self.bank.tasks, self.grasps, strict=True)
-        feature_matching._Pairs([task for task, grasp in with_grasp if isinstance(grasp, Grasp)])
+        EpisodePairs([task for task, grasp in with_grasp if isinstance(grasp, Grasp)])
 
     @property
     def locations(self) -> Tensor | None:
@@ -360,7 +360,7 @@ def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[
     began = time.perf_counter()
     policy.feature_matching.describe(images.float() / 255, native, middle, middle)
     per_crop = (time.perf_counter() - began) / len(images)
-    fit = min(len(bank), feature_matching.MAX_EPISODES) * proposals.N_PROPOSALS * per_crop
+    fit = min(len(bank), policy.feature_matching.settings.max_episodes) * proposals.N_PROPOSALS * per_crop
     total = reading + fit + steps * per_step
     memory = start.bytes + psutil.Process().memory_info().rss
     return [

@@ -17,15 +17,16 @@ from lerobot_deltaco.data.gripper_direction import is_inverted, warn_if_inverted
 from lerobot_deltaco.policies.base.configuration import has_bfloat16
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.networks import gaussian_maps
-from lerobot_deltaco.policies.deltaco_match import matching as feature_matching
-from lerobot_deltaco.policies.deltaco_match import proposals
+from lerobot_deltaco.policies.deltaco_match import fit, proposals
 from lerobot_deltaco.policies.deltaco_match.calibration import StateToImage
 from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.crops import FEATURE_DIM, cut_crops, fit_perspective
+from lerobot_deltaco.policies.deltaco_match.fit import fit_matching_head
 from lerobot_deltaco.policies.deltaco_match.grasp_height import GraspHeightEstimator
-from lerobot_deltaco.policies.deltaco_match.matching import Candidates, FeatureMatching
+from lerobot_deltaco.policies.deltaco_match.localization import Candidates, FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
 from lerobot_deltaco.policies.deltaco_match.proposals import N_PROPOSALS, peaks
+from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.states import RobotStates
 from lerobot_deltaco.policies.deltaco_match.words import encode_words, understand, vocabulary_of
 
@@ -436,21 +437,22 @@ NEEDS_BFLOAT16 = pytest.mark.skipif(not has_bfloat16(), reason="emulated bfloat1
 def matching(shapes, request):
     """A feature matching that is fitted to 24 of the episodes."""
     images, locations, tasks = (part[:24] for part in shapes)
-    matching = FeatureMatching(vocabulary_of(SHAPE_TASKS), 0.25)
+    short = MatchingSettings(
+        proposal_steps=120,
+        min_proposal_batch=16,
+        max_proposal_batch=16,
+        min_matching_steps=60,
+        matching_batch=32,
+    )
+    matching = FeatureMatching(vocabulary_of(SHAPE_TASKS), 0.25, short)
     sentences, heights = {task: [task] for task in tasks}, torch.zeros(24)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proposals, "_MIN_SCENES", 16)
-        patch.setattr(proposals, "_MAX_SCENES", 16)
-        patch.setattr(proposals, "FIT_STEPS", 120)
-        patch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
-        patch.setattr(feature_matching, "_MIN_STEPS", 60)
-        # As in the first step of a policy's training.
-        with torch.autocast("cpu", torch.bfloat16), torch.autocast("cpu", enabled=False):
-            matching.fit(
-                *(images, images, images, locations, heights, tasks, sentences),
-                seed=0,
-                in_bfloat16=request.param,
-            )
+    # As in the first step of a policy's training.
+    with torch.autocast("cpu", torch.bfloat16), torch.autocast("cpu", enabled=False):
+        matching.fit(
+            *(images, images, images, locations, heights, tasks, sentences),
+            seed=0,
+            in_bfloat16=request.param,
+        )
     assert matching.fitted
     return matching
 
@@ -515,7 +517,6 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes, sho
 
 @pytest.mark.parametrize(("n_images", "n_scenes"), [(3, 24), (20, 40), (100, 48)])
 def test_a_step_of_the_proposals_fit_has_more_scenes_if_there_are_more(n_images, n_scenes, monkeypatch):
-    monkeypatch.setattr(proposals, "FIT_STEPS", 5)
     seen = []
 
     def loss(maps, locations):
@@ -525,33 +526,31 @@ def test_a_step_of_the_proposals_fit_has_more_scenes_if_there_are_more(n_images,
     monkeypatch.setattr(proposals, "location_loss", loss)
     images = torch.zeros(n_images, 3, 16, 16, dtype=torch.uint8)
     autocast = torch.autocast("cpu", enabled=False)
-    proposals.ProposalNetwork().fit(images, torch.zeros(n_images, 2), torch.Generator(), autocast)
+    proposals.ProposalNetwork().fit(
+        images, torch.zeros(n_images, 2), torch.Generator(), autocast, MatchingSettings(proposal_steps=5)
+    )
     assert seen == [n_scenes] * 5
 
 
 @pytest.mark.parametrize(("n_scenes", "steps"), [(8, 2), (24, 6), (80, 9)])
-def test_steps_of_the_fit_follow_the_number_of_scenes(n_scenes, steps, monkeypatch):
-    monkeypatch.setattr(feature_matching, "_SCENES_PER_STEP", 64)
-    monkeypatch.setattr(feature_matching, "_MIN_STEPS", 2)
-    monkeypatch.setattr(feature_matching, "_MAX_STEPS", 9)
-    fitted = []
-    monkeypatch.setattr(proposals.ProposalNetwork, "fit", lambda *_: None)
-    found = (torch.zeros(0), torch.zeros(0), torch.arange(n_scenes))
-    monkeypatch.setattr(FeatureMatching, "_crops_of_proposals", lambda *_: found)
-    monkeypatch.setattr(FeatureMatching, "_fit_comparison", lambda *arguments: fitted.append(arguments[-2]))
+def test_steps_of_the_fit_follow_the_number_of_scenes(n_scenes, steps, monkeypatch, short_fit):
+    losses = []
+    monkeypatch.setattr(fit.F, "nll_loss", lambda *_: losses.append(1) or torch.zeros(()))
+    settings = MatchingSettings(
+        proposal_steps=1, grasp_radius=9.0, min_matching_steps=2, max_matching_steps=9
+    )
+    matching = FeatureMatching(["task"], 0.25, settings)
     images = torch.zeros(n_scenes, 3, 16, 16, dtype=torch.uint8)
-    locations = torch.zeros(n_scenes, 2)
-    tasks = ["task"] * n_scenes
-    FeatureMatching([], 0.25).fit(images, images, images, locations, torch.zeros(n_scenes), tasks, {}, 0)
-    assert fitted == [steps]
+    tasks, sentences = ["task"] * n_scenes, {"task": ["task"]}
+    matching.fit(*[images] * 3, torch.zeros(n_scenes, 2), torch.zeros(n_scenes), tasks, sentences, 0)
+    assert len(losses) == steps
 
 
-def test_words_that_describe_the_container_do_not_count(monkeypatch):
+def test_words_that_describe_the_container_do_not_count():
     """The color of an object and that of its container vary independently."""
     tasks = [f"put the {color} cube in the {bin} bin" for color in ("red", "blue") for bin in ("red", "blue")]
     generator = torch.Generator().manual_seed(0)
-    monkeypatch.setattr(feature_matching, "_SCENES_PER_STEP", 32)
-    matching = FeatureMatching(vocabulary_of(tasks), 0.25)
+    matching = FeatureMatching(vocabulary_of(tasks), 0.25, MatchingSettings(matching_batch=32))
     # Crops in which only the color can be seen, of two proposals.
     n_scenes = 64
     task = torch.arange(n_scenes) % 4
@@ -563,8 +562,9 @@ def test_words_that_describe_the_container_do_not_count(monkeypatch):
     sentences = {text: [text] for text in tasks}
     drawn = [tasks[n] for n in task]
     autocast = torch.autocast("cpu", enabled=False)
-    matching._fit_comparison(
-        features, target, torch.zeros(n_scenes), drawn, sentences, generator, 150, autocast
+    fit_matching_head(
+        *(matching, features, target, torch.zeros(n_scenes)),
+        *(drawn, sentences, generator, 150, autocast),
     )
     sentence = "Putt the red cubee in the red bin"
     weights = matching.word_weights(encode_words([sentence], matching.vocabulary))[0]
