@@ -66,10 +66,10 @@ TOY = Case(4, 32, _front_camera(0.62), (160, 120), people=False, pixel_noise=2.0
 CASES = {
     "toy": TOY,
     **{f"gym-{n}-{m}": Case(n, m) for n in (4, 8, 24) for m in (30, 100, 300)},
-    # The object is 3 to 30 % of the picture's side.
+    # The object is 3 to 13 % of the side of the picture.
     **{
         f"size-{d}": replace(TOY, n_episodes=64, camera=_front_camera(d / 100), size=(240, 240))
-        for d in (20, 40, 80, 160)
+        for d in (30, 45, 80, 130)
     },
     "home": Case(0, 600),
 }
@@ -261,6 +261,7 @@ def small(images: Tensor) -> Tensor:
 
 def fit(data: Data, seed: int, crop_size: float = 0.17, **options: Any) -> Any:
     """Fits feature matching to the training episodes of a case."""
+    from lerobot_deltaco.policies.base.configuration import has_bfloat16
     from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
     from lerobot_deltaco.policies.deltaco_match.words import vocabulary_of
 
@@ -275,7 +276,7 @@ def fit(data: Data, seed: int, crop_size: float = 0.17, **options: Any) -> Any:
     tasks = [e.task for e in train]
     matching.fit(
         *(small(first), small(last), first, picks, torch.zeros(len(train)), tasks, sentences, seed),
-        in_bfloat16=True,
+        in_bfloat16=has_bfloat16(),
     )
     return matching
 

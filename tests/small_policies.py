@@ -24,7 +24,7 @@ from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.policies.base import language
-from lerobot_deltaco.policies.deltaco_match import localization
+from lerobot_deltaco.policies.deltaco_match import fit, localization
 from lerobot_deltaco.policies.deltaco_match import settings as matching_settings
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.policies.deltaco_match.crops import FEATURE_DIM, cut_crops
@@ -93,7 +93,8 @@ def use_short_fit(monkeypatch, steps=2, **settings):
         min_matching_steps=steps,
         max_matching_steps=steps,
     )
-    monkeypatch.setattr(localization, "crop_features", colors)
+    for module in (fit, localization):
+        monkeypatch.setattr(module, "crop_features", colors)
     monkeypatch.setattr(matching_settings, "DEFAULT_SETTINGS", replace(short, **settings))
 
 

@@ -24,14 +24,16 @@ class Crops(NamedTuple):
     """Descriptions of crops.
 
     Attributes:
-        descriptors: Instance and category descriptor, two unit vectors one after the other,
-            (batch, n, 2 descriptor).
+        descriptors: Instance and category descriptor, two unit vectors, and behind them the normalized
+            features as a third, unless these do not count, (batch, n, descriptor).
         words: Log probabilities of the words of the vocabulary, (batch, n, words).
+        objectness: Log odds that a crop shows something to grasp, up to a constant, (batch, n).
         hidden: Features of a crop's appearance, (batch, n, hidden).
     """
 
     descriptors: Tensor
     words: Tensor
+    objectness: Tensor
     hidden: Tensor
 
     def among(self, chosen: slice) -> Crops:
@@ -44,19 +46,27 @@ class MatchingHead(nn.Module):
 
     Args:
         n_words: Size of the vocabulary.
+
+    Attributes:
+        feature_weight: Weight of the features' own cosine beside that of the learned descriptors, 0..1, ().
     """
 
     mean: Tensor
     std: Tensor
+    feature_weight: Tensor
 
     def __init__(self, n_words: int) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(FEATURE_DIM))
         self.register_buffer("std", torch.ones(FEATURE_DIM))
+        self.register_buffer("feature_weight", torch.zeros(()))
         self.hidden = nn.Linear(FEATURE_DIM, HIDDEN_DIM)
         self.linear = nn.Linear(FEATURE_DIM, 2 * _DESCRIPTOR_DIM)
         self.from_hidden = nn.Linear(HIDDEN_DIM, 2 * _DESCRIPTOR_DIM)
         self.words = nn.Linear(HIDDEN_DIM, n_words)
+        self.objectness = nn.Linear(HIDDEN_DIM, 1)
+        nn.init.zeros_(self.objectness.weight)
+        nn.init.zeros_(self.objectness.bias)
         self.log_scale = nn.Parameter(torch.full((2,), math.log(_INITIAL_SCALE)))
         self.gate = nn.Parameter(torch.tensor(_INITIAL_GATE))
 
@@ -82,11 +92,14 @@ class MatchingHead(nn.Module):
             inputs: Normalized features, (batch, n, FEATURE_DIM).
             generator: Source of dropout's draws, on the CPU; None for no dropout.
         """
-        inputs = _dropout(inputs, generator)
+        features, inputs = inputs, _dropout(inputs, generator)
         hidden = _dropout(F.relu(self.hidden(inputs)), generator)
         descriptors = self.linear(inputs) + self.from_hidden(hidden)
+        if bool(self.feature_weight > 0):
+            descriptors = torch.cat([descriptors.float(), features.float()], dim=-1)
         words = self.words(hidden).float().log_softmax(dim=-1)
-        return Crops(_unit(descriptors.float()), words, hidden.float())
+        objectness = self.objectness(hidden)[..., 0].float()
+        return Crops(_unit(descriptors.float()), words, objectness, hidden.float())
 
     def match(
         self,
@@ -99,15 +112,21 @@ class MatchingHead(nn.Module):
 
         Args:
             crops: Crops of the proposals.
-            described: Descriptors of the demonstrated objects, (batch, 2 descriptor).
+            described: Descriptors of the demonstrated objects, (batch, descriptor).
             sharpness: Factor of the similarities.
             p_other: Probability that a demonstration shows another object, if no crop matches it, (batch,).
 
         Returns:
             Log probabilities that the crops are meant, and cosines of the instance descriptors, (batch, n).
         """
-        each, wanted = crops.descriptors.unflatten(-1, (2, -1)), _unit(described).unflatten(-1, (2, -1))
-        cosines = torch.einsum("bnkd,bkd->kbn", each, wanted)
+        wanted, n_learned = _unit(described), 2 * _DESCRIPTOR_DIM
+        learned = (part[..., :n_learned].unflatten(-1, (2, -1)) for part in (crops.descriptors, wanted))
+        cosines = torch.einsum("bnkd,bkd->kbn", *learned)
+        if bool(self.feature_weight > 0):
+            of_features = torch.einsum(
+                "bnd,bd->bn", crops.descriptors[..., n_learned:], wanted[..., n_learned:]
+            )
+            cosines = torch.lerp(cosines, of_features.expand_as(cosines), self.feature_weight)
         is_instance, is_category = (
             (sharpness * self.log_scale.exp()[:, None, None] * cosines).softmax(dim=2).unbind()
         )
@@ -120,8 +139,9 @@ class MatchingHead(nn.Module):
 
 
 def _unit(descriptors: Tensor) -> Tensor:
-    """Scales both descriptors (..., 2 descriptor) to unit length."""
-    return F.normalize(descriptors.unflatten(-1, (2, -1)), dim=-1).flatten(-2)
+    """Scales each part of descriptors (..., descriptor) to unit length."""
+    parts = descriptors.tensor_split((_DESCRIPTOR_DIM, 2 * _DESCRIPTOR_DIM), dim=-1)
+    return torch.cat([F.normalize(part, dim=-1) for part in parts], dim=-1)
 
 
 def word_scores(words: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
