@@ -2,8 +2,9 @@
 
     python benchmarks/finding.py --cases toy gym-8-100 --seeds 0 1 2
 
-Each case fits feature matching to first and last images of episodes, and looks for objects in scenes that were
-not fitted: of the same tasks, and with new objects. No test object of the benchmark is used.
+Each case fits feature matching to first and last images of episodes, and looks for objects in scenes that
+were not fitted: of the same tasks, and with new objects. No test object of the benchmark is used. A choice is
+right if it lies on the object. A fit takes one to two minutes on a core.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.sim.camera import Camera
 from gym_deltaco.sim.simulation import Simulation, camera_matrices
 from gym_deltaco.sim.workspace import CAMERA, QUADRANTS, TRAY_FLOOR
-from gym_deltaco.tasks import CONTAINER_COLORS, FOLDS, OBJECTS, get_task, select_tasks
+from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, get_task, select_tasks
 
 N_TEST_SCENES = 60
 POLICY_SIZE = 48  # px, of the images of the policy
@@ -249,7 +250,6 @@ def _draw_home(case: Case, rng: np.random.Generator) -> Data:
         task = int(tasks[n * 7 % len(tasks)])
         fresh.append((episode(task, config), episode(task, config)))
     scenes.simulation.close()
-    assert FOLDS
     return Data(train, {"same": same, "new": fresh})
 
 

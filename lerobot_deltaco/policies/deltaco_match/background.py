@@ -37,13 +37,15 @@ class Background(nn.Module):
     """Proposes objects by their difference from the first images of other episodes.
 
     Attributes:
-        images: First images of training episodes, (n, 3, 128, 128) uint8; of no episode before the fit.
+        images: First images of training episodes, (48, 3, 128, 128) uint8.
+        n_images: Number of them, ().
         contrast: Difference from which a pixel counts as an object's, ().
         object_size: Diameter of a typical object in the middle of the image, as a fraction of its side, ().
         perspective: How the log of the apparent size of objects changes along x and y in the image, (2,).
     """
 
     images: Tensor
+    n_images: Tensor
     contrast: Tensor
     object_size: Tensor
     perspective: Tensor

@@ -98,8 +98,15 @@ def fit_feature_matching(
         matching.sharpness.fill_(1.0)
         matching.error_rate.zero_()
         fit_matching_head(
-            *(matching, features, target, heights[kept.to(heights.device)]),
-            *([tasks[row] for row in kept.tolist()], sentences, generator, steps, autocast),
+            matching,
+            features,
+            target,
+            heights[kept.to(heights.device)],
+            [tasks[row] for row in kept.tolist()],
+            sentences,
+            generator,
+            steps,
+            autocast,
             held_out=held_out[is_kept],
         )
     matching.requires_grad_(False)
@@ -439,7 +446,8 @@ class HeldOut:
         self._inputs = features[self._scenes]
         self._shown = features[shown, target[shown]][:, None]
         self._words = encoded[texts]
-        self._best, self._state = math.inf, {}
+        self._best = math.inf
+        self._state: dict[str, Tensor] = {}
 
     @torch.no_grad()
     def _scores(self) -> Tensor:
