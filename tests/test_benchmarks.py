@@ -5,7 +5,9 @@ from pathlib import Path
 
 import benchmark
 import draw_docs
+import finding
 import pytest
+import torch
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
@@ -36,3 +38,16 @@ def test_the_images_of_the_documentation_are_drawn(tmp_path, monkeypatch):
     drawn = {path.name for path in tmp_path.iterdir()}
     assert len(drawn) == 7
     assert drawn <= {path.name for path in (ROOT / "docs/images").iterdir()}
+
+
+def test_episodes_of_the_track_show_their_targets_move(monkeypatch):
+    monkeypatch.setattr(finding, "N_TEST_SCENES", 4)
+    data = finding.draw_data(finding.Case(4, 8, size=(160, 120)), seed=0)
+    episodes = [*data.train, *(scene for pairs in data.tests.values() for scene, _ in pairs)]
+    assert len(data.train) == 8
+    for episode in episodes:
+        assert episode.first.shape == (3, 120, 160)
+        x, y = ((episode.locations[0] + 1) / 2 * torch.tensor([160, 120])).int().tolist()
+        changed = (episode.first.int() - episode.last.int()).abs().amax(dim=0)
+        assert changed[y - 2 : y + 3, x - 2 : x + 3].max() > 20
+    assert {scene.task for scene, _ in data.tests["new"]}.isdisjoint(episode.task for episode in data.train)

@@ -37,9 +37,9 @@ from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
-from lerobot_deltaco.policies.deltaco_match import matching as feature_matching
 from lerobot_deltaco.policies.deltaco_match import proposals
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.training.train import image_size_in_memory
 
@@ -95,7 +95,7 @@ class TrainingStart:
         self.gripper_states = find_gripper_states(robot.states, opening, robot.spans, robot.state_names)
         self.policy.fit_locations(data.to(self.policy.step.device))
         with_grasp = zip(self.bank.tasks, self.grasps, strict=True)
-        feature_matching._Pairs([task for task, grasp in with_grasp if isinstance(grasp, Grasp)])
+        EpisodePairs([task for task, grasp in with_grasp if isinstance(grasp, Grasp)])
 
     @property
     def locations(self) -> Tensor | None:
@@ -361,7 +361,7 @@ def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[
     began = time.perf_counter()
     policy.feature_matching.describe(images.float() / 255, native, middle, middle)
     per_crop = (time.perf_counter() - began) / len(images)
-    fit = min(len(bank), feature_matching.MAX_EPISODES) * proposals.N_PROPOSALS * per_crop
+    fit = min(len(bank), policy.feature_matching.settings.max_episodes) * proposals.N_PROPOSALS * per_crop
     total = reading + fit + steps * per_step
     memory = start.bytes + psutil.Process().memory_info().rss
     return [

@@ -42,7 +42,7 @@ from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork, ran
 from lerobot_deltaco.policies.deltaco_match.calibration import MIN_EPISODES
 from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.matching import FeatureMatching
+from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.place import (
     TARGET_DIM,
     DemonstrationAttention,

@@ -8,16 +8,13 @@ from tqdm import tqdm
 
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu, grid_of_centers
+from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
 
 N_PROPOSALS = 5
 _CHANNELS = 32
 _MIN_DISTANCE = 1 / 6  # between two proposals, where an image's edges are at -1 and 1
 _PEAK_RADIUS = 1.6  # of the cells around a peak whose mean is a proposal
-FIT_STEPS = 800
-_DRAWS = 10  # of each scene, as far as these bounds of the scenes in a step allow
-_MIN_SCENES, _MAX_SCENES = 24, 48
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
-GRASP_RADIUS = 0.19  # around a grasp: a proposal within it stands for the grasped object; 4.5 px of 48
 
 
 class ProposalNetwork(nn.Module):
@@ -45,6 +42,7 @@ class ProposalNetwork(nn.Module):
         locations: Tensor,
         generator: torch.Generator,
         autocast: torch.autocast,
+        settings: MatchingSettings,
     ) -> None:
         """Fits the network.
 
@@ -53,16 +51,19 @@ class ProposalNetwork(nn.Module):
             locations: Locations of their grasps, (episodes, 2) in -1..1.
             generator: Source of the draws, on the CPU.
             autocast: Context of the forward pass.
+            settings: Number of steps, and size of the batches.
         """
+        steps = settings.proposal_steps
         self.layers.train()
         optimizer = torch.optim.AdamW(
             self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, fused=True
         )
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, _LEARNING_RATE, FIT_STEPS, pct_start=_WARMUP_FRACTION
+            optimizer, _LEARNING_RATE, steps, pct_start=_WARMUP_FRACTION
         )
-        n_scenes = min(max(_DRAWS * len(images) // FIT_STEPS, _MIN_SCENES), _MAX_SCENES)
-        for _ in tqdm(range(FIT_STEPS), desc="Fitting the proposals", unit="step", leave=False):
+        n_scenes = settings.proposal_draws * len(images) // steps
+        n_scenes = min(max(n_scenes, settings.min_proposal_batch), settings.max_proposal_batch)
+        for _ in tqdm(range(steps), desc="Fitting the proposals", unit="step", leave=False):
             rows = torch.randint(len(images), (n_scenes,), generator=generator).to(images.device)
             with autocast:
                 maps = self.layers(channels_last(images[rows].float() / 255)).float()
@@ -97,3 +98,9 @@ def peaks(maps: Tensor, n_peaks: int) -> Tensor:
         locations.append((weights[..., None] * centers).sum(dim=1) / weights.sum(dim=1, keepdim=True))
         left = left.masked_fill(away.norm(dim=2) < _MIN_DISTANCE, -1e9)
     return torch.stack(locations, dim=1)
+
+
+def nearest_proposals(proposed: Tensor, locations: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """Returns the nearest proposal to locations (batch, 2), and whether it is near, (batch,) each."""
+    distance, nearest = (proposed - locations[:, None]).norm(dim=2).min(dim=1)
+    return nearest, distance < radius

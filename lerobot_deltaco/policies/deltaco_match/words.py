@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import unicodedata
 from collections.abc import Iterable, Sequence
 from functools import cache
 
@@ -24,12 +25,14 @@ _MIN_SIMILARITY, _MIN_LENGTH = 0.8, 4
 
 # Chinese, Japanese and Korean have no spaces between words: each character is one.
 _CHARACTER = "[\u3040-\u30ff\u3400-\u9fff\uac00-\ud7af]"
-_WORD = re.compile(rf"{_CHARACTER}|(?:(?!{_CHARACTER})[^\W\d_])+|\d+")
+# Marks that combine with the letter before them belong to its word.
+_MARKS = "".join(chr(n) for n in range(0x300, 0x10000) if unicodedata.category(chr(n)).startswith("M"))
+_WORD = re.compile(rf"{_CHARACTER}|(?:(?!{_CHARACTER})[^\W\d_][{_MARKS}]*)+|\d+")
 
 
 def words_of(sentence: str) -> list[str]:
     """Returns the words and numbers of a sentence in their order, in lower case, without punctuation."""
-    return _WORD.findall(sentence.lower())
+    return _WORD.findall(unicodedata.normalize("NFC", sentence).lower())
 
 
 def vocabulary_of(sentences: Iterable[str]) -> list[str]:

@@ -1,0 +1,185 @@
+r"""What stands in a scene: what differs from the first images of other episodes.
+
+The camera is fixed, so a pixel shows the same surface in most scenes, and now and then an object. A pixel
+stands out if few of the remembered images have its color there. That needs no training, and holds for objects
+that were never grasped.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from lerobot_deltaco.policies.base.networks import grid_of_centers
+from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
+
+N_OBJECTS = 6  # proposed in a scene
+_SIDE = 128  # px, of the images as they are compared
+_N_IMAGES = 48  # remembered
+_MIN_IMAGES = 8
+# Fraction of the images that may show a pixel's color while it still stands out. It is more than an object
+# takes, and less than a container that stands in one of four places.
+_COMMON = 0.17
+_MIN_CONTRAST = 0.02  # of colors in 0..1
+_NOISE_FACTOR = 4.0  # by which a contrast exceeds the median of a scene
+_BLUR = 0.6  # standard deviation of the smoothing, in diameters of an object divided by two
+_NEIGHBOR = 1.6  # least distance between two proposals, in the same unit
+_SEED_RADIUS, _GROWING_STEPS = 0.12, 40  # around a grasp, in -1..1; px by which an object's region grows
+_EDGE = 1.0  # px, by which images blur an object
+_SIZE_LIMITS = (0.02, 0.4)  # of an object's diameter, as a fraction of the image's side
+_MAX_SLOPE = 1.5
+_LEAST_ERROR = 0.02  # of the log of a size, below which errors are all alike
+_DEFAULT_SIZE = 0.12
+_AT_A_TIME = 16
+
+
+class Background(nn.Module):
+    """Proposes objects by their difference from the first images of other episodes.
+
+    Attributes:
+        images: First images of training episodes, (48, 3, 128, 128) uint8.
+        n_images: Number of them, ().
+        contrast: Difference from which a pixel counts as an object's, ().
+        object_size: Diameter of a typical object in the middle of the image, as a fraction of its side, ().
+        perspective: How the log of the apparent size of objects changes along x and y in the image, (2,).
+    """
+
+    images: Tensor
+    n_images: Tensor
+    contrast: Tensor
+    object_size: Tensor
+    perspective: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("images", torch.zeros(_N_IMAGES, 3, _SIDE, _SIDE, dtype=torch.uint8))
+        self.register_buffer("n_images", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("contrast", torch.tensor(_MIN_CONTRAST))
+        self.register_buffer("object_size", torch.tensor(_DEFAULT_SIZE))
+        self.register_buffer("perspective", torch.zeros(2))
+
+    def forward(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
+        """Proposes objects, those that stand out most first.
+
+        Args:
+            scenes: First images, (batch, 3, H, W), uint8 or in 0..1, at full resolution.
+            remembered: Row of each scene among the remembered images, which is left out, (batch,); -1 for a
+                scene that is not among them.
+
+        Returns:
+            Locations in -1..1, (batch, N_OBJECTS, 2).
+        """
+        found = [
+            self._peaks(self.mask(some, None if remembered is None else remembered[n : n + _AT_A_TIME]))
+            for n, some in zip(range(0, len(scenes), _AT_A_TIME), scenes.split(_AT_A_TIME), strict=True)
+        ]
+        return torch.cat(found)
+
+    def mask(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
+        """Returns how clearly each pixel stands out, (batch, 128, 128) in 0..1. See `forward`."""
+        return ((self._differences(scenes, remembered) - self.contrast) / self.contrast).clamp(0, 1)
+
+    def fit(self, images: Tensor, locations: Tensor, generator: torch.Generator) -> Tensor:
+        """Remembers images, and measures objects.
+
+        Args:
+            images: First images of episodes, (episodes, 3, H, W) uint8, at full resolution.
+            locations: Locations of their grasps, (episodes, 2) in -1..1.
+            generator: Source of the choice of images, on the CPU.
+
+        Returns:
+            Row of each episode among the remembered images, (episodes,) int64; -1 for the others.
+        """
+        chosen = torch.randperm(len(images), generator=generator)[:_N_IMAGES].sort().values
+        device = self.images.device
+        remembered = torch.full((len(images),), -1)
+        remembered[chosen] = torch.arange(len(chosen))
+        self.images.zero_()
+        self.images[: len(chosen)] = (
+            _scaled(images[chosen.to(images.device)]).mul(255).round().to(self.images)
+        )
+        self.n_images.fill_(len(chosen))
+        scenes, at = images[chosen.to(images.device)], locations[chosen.to(locations.device)].to(device)
+        rows = torch.arange(len(chosen))
+        differences = torch.cat(
+            [
+                self._differences(some, own)
+                for some, own in zip(scenes.split(_AT_A_TIME), rows.split(_AT_A_TIME), strict=True)
+            ]
+        )
+        noise = _NOISE_FACTOR * differences.flatten(1).median(dim=1).values.median()
+        self.contrast.copy_(noise.clamp_min(_MIN_CONTRAST))
+        self._measure(differences > 1.5 * self.contrast, at)
+        return remembered
+
+    def _measure(self, stands_out: Tensor, locations: Tensor) -> None:
+        """Measures the regions around grasps."""
+        centers = grid_of_centers(_SIDE, _SIDE, locations.device)  # (cells, 2)
+        near = (centers - locations[:, None]).norm(dim=2).view(-1, _SIDE, _SIDE) < _SEED_RADIUS
+        allowed = stands_out.float()[:, None]
+        region = near.float()[:, None] * allowed
+        for _ in range(_GROWING_STEPS):
+            region = F.max_pool2d(region, 3, 1, 1) * allowed
+        diameter = ((region.sum(dim=(1, 2, 3)) * 4 / torch.pi).sqrt() - _EDGE) / _SIDE
+        low, high = _SIZE_LIMITS
+        seen = (diameter > low) & (diameter < high)
+        self.perspective.zero_()
+        self.object_size.fill_(_DEFAULT_SIZE)
+        if int(seen.sum()) >= _MIN_IMAGES:
+            logs = diameter[seen].log()
+            self.object_size.copy_(logs.median().exp())
+            if int(seen.sum()) >= 3 * _MIN_IMAGES:
+                features = torch.cat([torch.ones_like(locations[:, :1]), locations], dim=1)[seen]
+                degrees = torch.tensor([0, 1, 1], device=features.device)
+                fitted = robust_regression(features, logs[:, None], degrees, _LEAST_ERROR)[:, 0]
+                self.perspective.copy_(fitted[1:].clamp(-_MAX_SLOPE, _MAX_SLOPE))
+                self.object_size.copy_(fitted[0].exp().clamp(*_SIZE_LIMITS))
+
+    def _differences(self, scenes: Tensor, remembered: Tensor | None) -> Tensor:
+        """Returns the difference of each pixel from the colors that are common there, (batch, 128, 128)."""
+        images = self.images[: int(self.n_images)].float() / 255
+        # A pixel may lie between two of the image: its neighbors count.
+        low, high = -F.max_pool2d(-images, 3, 1, 1), F.max_pool2d(images, 3, 1, 1)
+        n_common = max(2, round(_COMMON * len(images)))
+        results = []
+        for n, scene in enumerate(_scaled(scenes).to(images.device)):
+            away = torch.maximum(low - scene, scene - high).amax(dim=1)  # (images, 128, 128)
+            if remembered is not None and remembered[n] >= 0:
+                away[remembered[n]] = 2.0
+            results.append(away.kthvalue(min(n_common, len(away)), dim=0).values)
+        return torch.stack(results).clamp_min(0)
+
+    def _peaks(self, masks: Tensor) -> Tensor:
+        """Returns the middles of the regions of objects' size that stand out most, (batch, N_OBJECTS, 2)."""
+        size = self.object_size
+        centers = grid_of_centers(_SIDE, _SIDE, masks.device)
+        smooth = _blurred(masks, float(_BLUR * size * _SIDE / 2)).flatten(1)
+        weights, found = masks.flatten(1), []
+        for _ in range(N_OBJECTS):
+            peak = centers[smooth.argmax(dim=1)]  # (batch, 2)
+            away = (centers - peak[:, None]).norm(dim=2)  # (batch, cells)
+            inside = weights * (away < size) + 1e-6 * (away < size / 4)
+            found.append((inside[..., None] * centers).sum(dim=1) / inside.sum(dim=1, keepdim=True))
+            smooth = smooth.masked_fill(away < _NEIGHBOR * size, -1.0)
+        return torch.stack(found, dim=1)
+
+
+def _scaled(images: Tensor) -> Tensor:
+    """Scales images to 128 x 128 px, in 0..1."""
+    images = images.float() / 255 if images.dtype == torch.uint8 else images
+    if images.shape[-2:] == (_SIDE, _SIDE):
+        return images
+    if min(images.shape[-2:]) >= _SIDE:
+        return F.interpolate(images, (_SIDE, _SIDE), mode="area")
+    return F.interpolate(images, (_SIDE, _SIDE), mode="bilinear", align_corners=False)
+
+
+def _blurred(maps: Tensor, std: float) -> Tensor:
+    """Smooths maps (batch, h, w) by a Gaussian of a standard deviation in px."""
+    half = max(1, round(3 * std))
+    offsets = torch.arange(-half, half + 1, device=maps.device)
+    weights = torch.exp(-0.5 * (offsets / std) ** 2)
+    weights = weights / weights.sum()
+    across = F.conv2d(maps[:, None], weights[None, None, None], padding=(0, half))
+    return F.conv2d(across, weights[None, None, :, None], padding=(half, 0))[:, 0]

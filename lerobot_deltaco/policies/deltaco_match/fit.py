@@ -1,0 +1,522 @@
+"""The fit: everything that feature matching learns before the first step of a policy's training."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
+from lerobot_deltaco.policies.deltaco_match.crops import crop_features, fit_perspective
+from lerobot_deltaco.policies.deltaco_match.matching import Crops, MatchingHead, word_scores
+from lerobot_deltaco.policies.deltaco_match.proposals import nearest_proposals
+from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.words import UNKNOWN_WORD, encode_words
+
+if TYPE_CHECKING:
+    from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
+
+logger = logging.getLogger(__name__)
+
+_SCENES_AT_A_TIME, _NORMALIZED_AT_A_TIME = 16, 256
+# Logit between the median right and the median wrong cosine, and their least difference, before the fit.
+_SEPARATION, _MIN_SEPARATED = 6.0, 0.1
+_COMMON = 0.8  # fraction of the sentences from which on a word is penalized
+_LOOKS = 2  # at each held-out episode
+_SHARPNESSES = (0.4, 0.55, 0.7, 0.85, 1.0)  # of scores, among which held-out episodes choose
+
+
+def fit_feature_matching(
+    matching: FeatureMatching,
+    images: Tensor,
+    last: Tensor,
+    native: Tensor,
+    locations: Tensor,
+    heights: Tensor,
+    tasks: Sequence[str],
+    sentences: Mapping[str, Sequence[str]],
+    seed: int,
+    *,
+    in_bfloat16: bool = False,
+) -> None:
+    """Fits the proposals, and then the matching head.
+
+    The head learns to tell the object grasped in one episode of a task from the other proposals in the scene
+    of another episode, by the demonstration and by words.
+
+    Args:
+        matching: What is fitted.
+        images: First images of episodes, (episodes, 3, H, W) uint8, as small as the policy's.
+        last: Last images of the same episodes.
+        native: The first images at full resolution, (episodes, 3, H', W') uint8.
+        locations: Locations of their grasps, (episodes, 2) in -1..1; NaN where there is none.
+        heights: Height offsets of their grasps, (episodes,).
+        tasks: Task of each episode.
+        sentences: Instructions of each task, one of which is drawn for an episode in each step.
+        seed: Seed of the initial weights and of the draws.
+        in_bfloat16: Whether convolutions and linear layers compute in bfloat16, which takes half the time on
+            a CPU that has it.
+
+    Raises:
+        ValueError: No task has two episodes with a grasp, or no proposal is near a grasp.
+        PretrainedWeightsError: The encoder's weights are missing.
+    """
+    settings = matching.settings
+    generator, device = torch.Generator().manual_seed(seed), images.device
+    # Without its cache, which would keep the weights of the first step: it is only emptied at the end of the
+    # outermost context, here the one in which the policy is trained.
+    autocast = torch.autocast(device.type, torch.bfloat16, enabled=in_bfloat16, cache_enabled=False)
+    grasps = (~locations.isnan().any(dim=1)).nonzero().flatten().cpu()
+    drawn = grasps[torch.randperm(len(grasps), generator=generator)[: settings.max_episodes]].sort().values
+    EpisodePairs([tasks[row] for row in drawn.tolist()])  # fails before the slow part
+    steps = settings.matching_draws * len(drawn) // settings.matching_batch
+    steps = min(max(settings.min_matching_steps, steps), settings.max_matching_steps)
+    with torch.random.fork_rng(devices=[]), torch.enable_grad():
+        torch.manual_seed(seed)
+        for layer in matching.modules():
+            if isinstance(layer, (nn.Conv2d, nn.Linear, nn.BatchNorm2d)):
+                layer.reset_parameters()
+        matching.requires_grad_(True)
+        proposed = _fit_proposals(matching, images, native, locations, drawn, generator, autocast)
+        if not bool(matching.uses_background):
+            rows = grasps.to(device)
+            matching.perspective.copy_(fit_perspective(images[rows], last[rows], locations[rows]))
+        matching.compare.feature_weight.fill_(settings.feature_weight)
+        features, target, kept = _crops_of_proposals(
+            *(matching, native, locations, drawn, proposed, generator, autocast)
+        )
+        held_out = _held_out([tasks[row] for row in drawn.tolist()], settings)
+        is_kept = torch.isin(drawn, kept)
+        matching.held_out.copy_(torch.tensor([0, int(held_out.sum())]))
+        matching.sharpness.fill_(1.0)
+        matching.error_rate.zero_()
+        fit_matching_head(
+            matching,
+            features,
+            target,
+            heights[kept.to(heights.device)],
+            [tasks[row] for row in kept.tolist()],
+            sentences,
+            generator,
+            steps,
+            autocast,
+            held_out=held_out[is_kept],
+        )
+    matching.requires_grad_(False)
+    for weights in matching.parameters():
+        weights.grad = None
+    matching.eval()
+    matching.fitted.fill_(True)
+    if int(matching.held_out[1]):
+        logger.info("Feature matching: %s.", matching.report)
+
+
+@torch.no_grad()
+def _background_proposals(
+    matching: FeatureMatching, native: Tensor, rows: Tensor, remembered: Tensor
+) -> Tensor:
+    """Returns what stands out in scenes, (rows, n, 2), each without its own image among the remembered."""
+    found = []
+    with tqdm(total=len(rows), desc="Looking for objects", unit="scene", leave=False) as progress:
+        for some, own in zip(rows.split(_SCENES_AT_A_TIME), remembered.split(_SCENES_AT_A_TIME), strict=True):
+            found.append(matching.background(native[some.to(native.device)], own))
+            progress.update(len(some))
+    return torch.cat(found)
+
+
+def _fit_proposals(
+    matching: FeatureMatching,
+    images: Tensor,
+    native: Tensor,
+    locations: Tensor,
+    drawn: Tensor,
+    generator: torch.Generator,
+    autocast: torch.autocast,
+) -> Tensor:
+    """Fits the proposals, and returns those in the drawn scenes, (drawn, n, 2).
+
+    Where objects do not stand out from the background, as if the camera was moved, a network learns where
+    grippers closed, and is used if it finds more of the grasps.
+    """
+    settings, rows = matching.settings, drawn.to(images.device)
+    with torch.no_grad():
+        remembered = matching.background.fit(native[drawn.to(native.device)], locations[rows], generator)
+    proposed = _background_proposals(matching, native, drawn, remembered).to(images.device)
+    matching.uses_background.fill_(True)
+    matching.perspective.copy_(matching.background.perspective)
+    _, stands_out = nearest_proposals(proposed, locations[rows], matching.grasp_radius)
+    if bool(stands_out.float().mean() >= settings.min_coverage):
+        return proposed
+    held_out = torch.arange(len(rows), device=rows.device) % settings.held_out_every == 0
+    fitted = rows[~held_out]
+    matching.propose.fit(images[fitted], locations[fitted], generator, autocast, settings)
+    with torch.no_grad():
+        learned = torch.cat([matching.propose(images[some].float() / 255) for some in rows.split(256)])
+    _, is_found = nearest_proposals(learned, locations[rows], settings.grasp_radius)
+    if bool(is_found[held_out].float().mean() <= stands_out[held_out].float().mean()):
+        return proposed
+    matching.uses_background.fill_(False)
+    return learned
+
+
+def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:
+    """Chooses episodes that are held out, evenly spaced and no task's last but one, (episodes,) bool."""
+    held_out, left = torch.zeros(len(tasks), dtype=torch.bool), Counter(tasks)
+    n_wanted = max(settings.min_held_out, len(tasks) // settings.held_out_every)
+    if len(tasks) < settings.held_out_every * settings.min_held_out * 0.75:
+        return held_out
+    order = torch.arange(len(tasks)).roll(-settings.held_out_every + 1).tolist()
+    order = sorted(order, key=lambda row: (row % settings.held_out_every, row))
+    for row in order:
+        if int(held_out.sum()) < n_wanted and left[tasks[row]] > 2:
+            held_out[row] = True
+            left[tasks[row]] -= 1
+    return held_out
+
+
+@torch.no_grad()
+def _crops_of_proposals(
+    matching: FeatureMatching,
+    native: Tensor,
+    locations: Tensor,
+    drawn: Tensor,
+    proposed: Tensor,
+    generator: torch.Generator,
+    autocast: torch.autocast,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns features of the proposals in scenes, which of them was grasped, and the scenes' rows.
+
+    A scene in which no proposal is near the grasp is left out. Few scenes have variants: crops that are a
+    little off, and of every second variant from the third on, of other colors, as of new objects.
+
+    Returns:
+        (variants, scenes, n, FEATURE_DIM), (scenes,) and (scenes,).
+    """
+    settings = matching.settings
+    n_variants = min(max(settings.variant_scenes // len(drawn), 1), settings.max_variants)
+    changes = random_color_changes(n_variants, 1.0, generator)
+    features, targets, kept = [], [], []
+    with tqdm(total=len(drawn), desc="Encoding crops", unit="scene", leave=False) as progress:
+        for some, of_some in zip(
+            drawn.split(_SCENES_AT_A_TIME), proposed.split(_SCENES_AT_A_TIME), strict=True
+        ):
+            rows = some.to(locations.device)
+            nearest, near = nearest_proposals(of_some, locations[rows], matching.grasp_radius)
+            if bool(near.any()):
+                scenes = native[rows[near].to(native.device)]
+                variants = []
+                for n in range(n_variants):
+                    images, at = scenes, of_some[near]
+                    sizes = matching.crop_sizes(at)
+                    if n > 0:
+                        noise = torch.randn((*at.shape[:2], 3), generator=generator).to(at.device)
+                        sizes = sizes * (settings.variant_log_scale * noise[..., 2]).exp()
+                        at = at + 2 * settings.variant_offset * sizes[..., None] * noise[..., :2]
+                    if has_other_colors(n):
+                        change = changes[n].expand(len(images), 3, 3)
+                        images = change_colors(images.float() / 255, change)
+                    with autocast:
+                        variants.append(crop_features(images, at, sizes).half())
+                features.append(torch.stack(variants))
+                targets.append(nearest[near])
+                kept.append(some[near.cpu()])
+            progress.update(len(some))
+    if not kept:
+        raise UserError(
+            "Feature matching finds nothing to grasp in the first images where the gripper closes. Check "
+            "that the first camera stands still and shows the objects, or name another with "
+            "--policy.demo_camera."
+        )
+    return torch.cat(features, dim=1), torch.cat(targets), torch.cat(kept)
+
+
+def has_other_colors(variant: int) -> bool:
+    """Returns whether the colors of a variant of scenes are changed."""
+    return variant > 0 and variant % 2 == 0
+
+
+def fit_matching_head(
+    matching: FeatureMatching,
+    features: Tensor,
+    target: Tensor,
+    heights: Tensor,
+    tasks: Sequence[str],
+    sentences: Mapping[str, Sequence[str]],
+    generator: torch.Generator,
+    steps: int,
+    autocast: torch.autocast,
+    held_out: Tensor | None = None,
+) -> None:
+    """Fits the matching head, the word weights and the grasp heights to crops.
+
+    Args:
+        matching: What is fitted.
+        features: Features of the crops of the proposals, (variants, scenes, n, FEATURE_DIM); they are
+            overwritten. Every second variant from the third on has other colors.
+        target: The proposal that was grasped in each scene, (scenes,).
+        heights: Height offsets of the grasps, (scenes,).
+        tasks: Task of each scene.
+        sentences: Instructions of each task.
+        generator: Source of the draws, on the CPU.
+        steps: Number of steps.
+        autocast: Context of the forward pass.
+        held_out: Scenes that are not fitted, but tell when to stop, (scenes,) bool; None for none.
+    """
+    settings, head, device = matching.settings, matching.compare, features.device
+    if held_out is None:
+        held_out = torch.zeros(len(tasks), dtype=torch.bool)
+    pairs = EpisodePairs(tasks, (~held_out).nonzero().flatten().tolist())
+    head.set_statistics(features[0])
+    for some in features.flatten(0, 1).split(_NORMALIZED_AT_A_TIME):  # once and in place: they are large
+        some.copy_(head.inputs(some))
+    encoded, spans = _encode_sentences(matching.vocabulary, tasks, sentences, device)
+    check = (
+        HeldOut(matching, features[0], target, tasks, encoded, spans, held_out) if held_out.any() else None
+    )
+    each_word = torch.arange(int(encoded.max()) + 1, device=device)
+    frequency = (encoded[..., None] == each_word).any(dim=1).float().mean(dim=0)
+    _begin_at_features(head, features[0], target, pairs.draw(settings.max_proposal_batch, generator))
+    rate, decay = settings.learning_rate, settings.weight_decay
+    scales = [head.log_scale, head.gate]
+    groups: list[dict[str, Any]] = [
+        {
+            "params": [own for own in head.parameters() if all(own is not scale for scale in scales)],
+            "lr": rate,
+            "weight_decay": decay,
+        },
+        {"params": scales, "lr": settings.scale_learning_rate, "weight_decay": 0.0},
+        {"params": matching.grasp_height.parameters(), "lr": rate, "weight_decay": decay},
+        {
+            "params": matching.word_weights.parameters(),
+            "lr": settings.word_learning_rate,
+            "weight_decay": 0.0,
+        },
+    ]
+    optimizer = torch.optim.AdamW(groups, fused=True)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, [group["lr"] for group in groups], steps, pct_start=settings.warmup_fraction
+    )
+    for step in tqdm(range(steps), desc="Fitting the matching head", unit="step", leave=False):
+        scenes, others = (rows.to(device) for rows in pairs.draw(settings.matching_batch, generator))
+        variant = torch.randint(len(features), (len(scenes),), generator=generator).to(device)
+        shown = features[variant, others, target[others]]
+        crops = torch.cat([features[variant, scenes], shown[:, None]], dim=1).float()
+        named = torch.tensor([not has_other_colors(n) for n in variant.tolist()], device=device)
+        with autocast:
+            described = head.describe(crops, generator)
+        matches, _ = head.match(described.among(slice(-1)), described.descriptors[:, -1])
+        loss = F.nll_loss(matches, target[scenes])
+        draws = torch.rand(len(scenes), generator=generator)
+        drawn = (spans[scenes.cpu(), 0] + draws * spans[scenes.cpu(), 1]).long()
+        dropped = torch.rand(len(scenes), encoded.shape[1], generator=generator) < settings.p_drop_word
+        sentence = encoded[drawn.to(device)]
+        left = torch.where(dropped.to(device) & (sentence > 0), UNKNOWN_WORD, sentence)
+        proposals = described.among(slice(-1))
+        if named.any():
+            loss = loss + _word_losses(
+                *(matching, Crops(*(part[named] for part in proposals)), left[named], sentence[named]),
+                *(target[scenes][named], frequency),
+            )
+        rows = torch.arange(len(scenes), device=device)
+        with torch.no_grad():  # as similar as they are without dropout
+            both = torch.stack([crops[rows, target[scenes]], crops[:, -1]], dim=1)
+            with autocast:
+                plain = head.describe(both)
+            _, similarity = head.match(plain.among(slice(1)), plain.descriptors[:, 1])
+        height_losses = matching.grasp_height.losses(
+            described.hidden[rows, target[scenes]], similarity[:, 0], heights[others], heights[scenes]
+        )
+        loss = loss + height_losses.mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        if check is not None and (step + 1) % max(1, steps // settings.n_checks) == 0:
+            check.look()
+    if check is not None:
+        check.finish()
+
+
+@torch.no_grad()
+def _begin_at_features(
+    head: MatchingHead, features: Tensor, target: Tensor, pairs: tuple[Tensor, Tensor]
+) -> None:
+    """Sets the scales and the gate to where the features' cosines separate objects from other proposals."""
+    scenes, others = (rows.to(features.device) for rows in pairs)
+    crops = head.describe(features[scenes].float())
+    shown = head.describe(features[others, target[others]][:, None].float())
+    _, cosines = head.match(crops, shown.descriptors[:, 0])
+    right = cosines.gather(1, target[scenes, None])
+    wrong = cosines.scatter(1, target[scenes, None], -1.0).amax(dim=1)
+    high, low = right.median(), wrong.median()
+    slope = (_SEPARATION / (high - low).clamp_min(_MIN_SEPARATED)).clamp_min(1.0)
+    head.log_scale.fill_(float(slope.log()))
+    head.gate.copy_(torch.stack([slope, -slope * (high + low) / 2]))
+
+
+def _word_losses(
+    matching: FeatureMatching,
+    crops: Crops,
+    words: Tensor,
+    sentence: Tensor,
+    target: Tensor,
+    frequency: Tensor,
+) -> Tensor:
+    """Returns the losses of choosing a proposal by words, of naming what was grasped, and of the weights.
+
+    Args:
+        matching: What is fitted.
+        crops: The proposals.
+        words: Indices of the words, of which some are left out, (batch, length).
+        sentence: The same with all words.
+        target: The right proposal, (batch,).
+        frequency: Fraction of the sentences in which each word occurs, (vocabulary and special words,).
+    """
+    settings, weights = matching.settings, matching.word_weights(words)
+    named = crops.words[torch.arange(len(target)), target]  # (batch, vocabulary)
+    loss = F.cross_entropy(word_scores(crops.words, words, weights) + crops.objectness, target)
+    known_weights = weights.detach() * (words > UNKNOWN_WORD)
+    of_words = named.gather(1, (words - UNKNOWN_WORD - 1).clamp_min(0))
+    naming = -(known_weights * of_words).sum(dim=1) / known_weights.sum(dim=1).clamp_min(1e-6)
+    # A word of every sentence, such as "the", tells nothing apart.
+    is_common = ((frequency[words] - _COMMON) / (1 - _COMMON)).clamp_min(0)
+    cost = settings.word_penalty * (1 + settings.common_word_penalty * is_common)
+    penalty = (cost * weights * (words > UNKNOWN_WORD)).sum(dim=1).mean()
+    # What an unknown word is about follows from its neighbors.
+    unknown = (matching.word_weights(sentence).detach() - weights).square() * (words == UNKNOWN_WORD)
+    return loss + naming.mean() + penalty + unknown.sum(dim=1).mean()
+
+
+def _encode_sentences(
+    vocabulary: Sequence[str],
+    tasks: Sequence[str],
+    sentences: Mapping[str, Sequence[str]],
+    device: torch.device,
+) -> tuple[Tensor, Tensor]:
+    """Returns the words of all sentences, and the first row and the number of those of each episode."""
+    spans: dict[str, tuple[int, int]] = {}
+    every: list[str] = []
+    for task in dict.fromkeys(tasks):
+        spans[task] = (len(every), len(sentences[task]))
+        every.extend(sentences[task])
+    return encode_words(every, vocabulary).to(device), torch.tensor([spans[task] for task in tasks])
+
+
+class HeldOut:
+    """Looks for the objects of episodes that are not fitted, keeps the best weights, and calibrates.
+
+    Args:
+        matching: What is fitted.
+        features: Normalized features of the proposals of all scenes, (scenes, n, FEATURE_DIM).
+        target: The right proposals, (scenes,).
+        tasks: Task of each scene.
+        encoded: Words of all sentences.
+        spans: First row and number of the sentences of each scene, (scenes, 2).
+        held_out: Which scenes are held out, (scenes,) bool.
+    """
+
+    def __init__(
+        self,
+        matching: FeatureMatching,
+        features: Tensor,
+        target: Tensor,
+        tasks: Sequence[str],
+        encoded: Tensor,
+        spans: Tensor,
+        held_out: Tensor,
+    ) -> None:
+        fitted = [row for row in range(len(tasks)) if not held_out[row]]
+        of_task: dict[str, list[int]] = {}
+        for row in fitted:
+            of_task.setdefault(tasks[row], []).append(row)
+        scenes = [row for row in held_out.nonzero().flatten().tolist() if tasks[row] in of_task]
+        # Each with two demonstrations and two sentences, for scores that depend less on chance
+        pairs = [(row, n, of_task[tasks[row]]) for row in scenes for n in range(_LOOKS)]
+        self._scenes = torch.tensor([row for row, _, _ in pairs])
+        shown = torch.tensor([own[(n * len(own)) // _LOOKS] for _, n, own in pairs])
+        texts = torch.tensor([int(spans[row, 0]) + (n * int(spans[row, 1])) // _LOOKS for row, n, _ in pairs])
+        self._matching, self._target = matching, target[self._scenes]
+        self._inputs = features[self._scenes]
+        self._shown = features[shown, target[shown]][:, None]
+        self._words = encoded[texts]
+        self._best = math.inf
+        self._state: dict[str, Tensor] = {}
+
+    @torch.no_grad()
+    def _scores(self) -> Tensor:
+        """Returns scores by demonstration, by words and by both, (3, looks, n)."""
+        head = self._matching.compare
+        crops = head.describe(self._inputs.float())
+        described = head.describe(self._shown.float()).descriptors[:, 0]
+        nothing = torch.zeros_like(self._words[:, :1])
+        given = ((nothing, described), (self._words, None), (self._words, described))
+        return torch.stack([self._matching.scores(crops, *each)[0] for each in given])
+
+    def look(self) -> None:
+        """Keeps the weights if they are the best so far."""
+        loss = float(F.cross_entropy(self._scores().flatten(0, 1), self._target.repeat(3)))
+        if loss < self._best:
+            self._best = loss
+            self._state = {name: value.clone() for name, value in self._matching.state_dict().items()}
+
+    @torch.no_grad()
+    def finish(self) -> None:
+        """Restores the best weights, and sets how far they can be trusted."""
+        matching = self._matching
+        if self._state:
+            matching.load_state_dict(self._state)
+        scores = self._scores()
+        is_right = (scores.argmax(dim=2) == self._target).float().mean(dim=1)  # by each, and by both
+        n_seen, n_all = (
+            len(self._target) / _LOOKS,
+            int(matching.held_out[1]),
+        )  # in others, no proposal is near
+        matching.held_out[0] = round(float(is_right[2]) * n_seen)
+        n_wrong = n_all - float(is_right[0] + is_right[2]) / 2 * n_seen
+        error_rate = torch.tensor((n_wrong + 1) / (n_all + 2))  # by Laplace's rule of succession
+        losses = {}
+        for sharpness in _SHARPNESSES:
+            p = (sharpness * scores).softmax(dim=2)
+            p = torch.lerp(p, torch.full_like(p, 1 / p.shape[2]), error_rate.to(p))
+            losses[sharpness] = float(F.nll_loss(p.flatten(0, 1).log(), self._target.repeat(3)))
+        matching.sharpness.fill_(min(losses, key=lambda sharpness: losses[sharpness]))
+        matching.error_rate.copy_(error_rate)
+
+
+class EpisodePairs:
+    """Draws pairs of different episodes of a task.
+
+    Args:
+        tasks: Task of each episode; all have a grasp.
+        fitted: Episodes that are drawn; by default, all.
+    """
+
+    def __init__(self, tasks: Sequence[str], fitted: Iterable[int] | None = None) -> None:
+        rows: dict[str, list[int]] = {}
+        for row in range(len(tasks)) if fitted is None else fitted:
+            rows.setdefault(tasks[row], []).append(row)
+        self._rows = [torch.tensor(own) for own in rows.values() if len(own) > 1]
+        if not self._rows:
+            raise UserError(
+                "Feature matching needs tasks with at least two episodes in which the gripper closes on "
+                f"an object. The {len(tasks)} such episodes are of {len(rows)} different tasks. Add episodes."
+            )
+
+    def draw(self, n_pairs: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draws rows of scenes and demonstrations, (n_pairs,) each, of tasks that are equally likely."""
+        scenes, demonstrations = [], []
+        for task in torch.randint(len(self._rows), (n_pairs,), generator=generator).tolist():
+            rows = self._rows[task]
+            first = int(torch.randint(len(rows), (), generator=generator))
+            further = int(torch.randint(1, len(rows), (), generator=generator))
+            scenes.append(rows[first])
+            demonstrations.append(rows[(first + further) % len(rows)])
+        return torch.stack(scenes), torch.stack(demonstrations)

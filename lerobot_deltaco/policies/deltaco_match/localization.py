@@ -1,0 +1,294 @@
+r"""Finds the object that a task asks for among the objects that could be grasped.
+
+    scene                          demonstration's first image          instruction
+      |                                    |                                |
+    proposals                       where it grasped                  weighted words
+      |                                    |                                |
+    crops -> EfficientNet-Lite0       crop -> EfficientNet-Lite0            |
+      |      (frozen), colors              |                                |
+    descriptors -------- cosines ------ descriptors                         |
+      |                    |                                                |
+    log probability of each word of the vocabulary ------- words of the instruction
+                           |                                                |
+                           +------------ sum: score of a proposal ----------+
+
+There are two descriptors. The instance descriptor tells whether a proposal is the demonstrated object. The
+category descriptor measures similarity of color and shape, which tasks by color or shape need, and is used to
+the extent that the first finds no match.
+
+Called once at the start of an episode. What is learned is fitted before the policy is trained, to the first
+images of the training episodes: see `fit`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_deltaco.policies.base.networks import gaussian_maps
+from lerobot_deltaco.policies.deltaco_match import settings as matching_settings
+from lerobot_deltaco.policies.deltaco_match.background import Background
+from lerobot_deltaco.policies.deltaco_match.crops import crop_features
+from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
+from lerobot_deltaco.policies.deltaco_match.grasp_height import GraspHeightEstimator
+from lerobot_deltaco.policies.deltaco_match.matching import HIDDEN_DIM, Crops, MatchingHead, word_scores
+from lerobot_deltaco.policies.deltaco_match.proposals import ProposalNetwork, nearest_proposals
+from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.words import (
+    UNKNOWN_WORD,
+    WordWeights,
+    encode_words,
+    understand,
+    words_of,
+)
+
+# A proposal stands for a grasp at a distance of this much, in -1..1, and this much of an object's diameter.
+_GRASP_ERROR, _GRASP_SIZE = 0.06, 0.75
+# What checkpoints of earlier fits do not have: they keep their proposals, crops and probabilities.
+_ADDED_STATE = (
+    "background.",
+    "compare.feature_weight",
+    "compare.objectness.",
+    "uses_background",
+    "sharpness",
+    "error_rate",
+    "held_out",
+)
+
+
+class Candidates(NamedTuple):
+    """What could be picked.
+
+    Attributes:
+        locations: The proposals, (batch, n, 2) in -1..1.
+        log_probabilities: How likely each is what the task asks for, (batch, n).
+        heights: Height offset of a grasp of each, (batch, n).
+        map_std: Standard deviation of a candidate in a map, in cells.
+    """
+
+    locations: Tensor
+    log_probabilities: Tensor
+    heights: Tensor
+    map_std: float = MatchingSettings.map_std
+
+    @property
+    def best(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Location (batch, 2), probability (batch,) and height offset (batch,) of the likeliest."""
+        log_p, best = self.log_probabilities.max(dim=1)
+        rows = torch.arange(len(best), device=best.device)
+        return self.locations[rows, best], log_p.exp(), self.heights[rows, best]
+
+    def map(self, shape: Sequence[int]) -> Tensor:
+        """Returns the candidates as maps of a shape (h, w), as logits (batch, h, w)."""
+        height, width = shape
+        std = 2 * self.map_std / torch.tensor([width, height], device=self.locations.device)
+        each = gaussian_maps(self.locations, height, width, std)
+        return (self.log_probabilities.exp()[..., None, None] * each).sum(dim=1).clamp_min(1e-9).log()
+
+
+class FeatureMatching(nn.Module):
+    """Finds what demonstrations moved, and what words describe, in scenes.
+
+    It stays in evaluation mode, and receives no gradient while a policy is trained.
+
+    Args:
+        vocabulary: Known words.
+        crop_size: Side of a crop in the middle of an image, as a fraction of the image's.
+        settings: Constants of the method; by default, `DEFAULT_SETTINGS`.
+
+    Attributes:
+        perspective: How the log of the apparent size of objects changes along x and y in the image, (2,).
+        fitted: Whether it has been fitted, () bool.
+        uses_background: Whether proposals are what stands out from the background, and crops as large as
+            objects there; otherwise, proposals are a network's, and crops of `crop_size`, () bool.
+        sharpness: Factor of the scores, (), and
+        error_rate: the rate of errors that no score excludes, (), by held-out episodes.
+        held_out: Number of held-out episodes in which the object was found, and of all, (2,) int64.
+    """
+
+    perspective: Tensor
+    fitted: Tensor
+    uses_background: Tensor
+    sharpness: Tensor
+    error_rate: Tensor
+    held_out: Tensor
+
+    def __init__(
+        self, vocabulary: Sequence[str], crop_size: float, settings: MatchingSettings | None = None
+    ) -> None:
+        super().__init__()
+        self.vocabulary, self.crop_size = list(vocabulary), crop_size
+        self.settings = settings or matching_settings.DEFAULT_SETTINGS
+        self.propose = ProposalNetwork()
+        self.background = Background()
+        self.compare = MatchingHead(len(vocabulary))
+        self.word_weights = WordWeights(len(vocabulary))
+        self.grasp_height = GraspHeightEstimator(HIDDEN_DIM)
+        self.register_buffer("perspective", torch.zeros(2))
+        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("uses_background", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("sharpness", torch.ones(()))
+        self.register_buffer("error_rate", torch.zeros(()))
+        self.register_buffer("held_out", torch.zeros(2, dtype=torch.int64))
+        self.requires_grad_(False)
+        self.eval()
+        self.register_load_state_dict_pre_hook(self._add_state)
+
+    @staticmethod
+    def _add_state(module: FeatureMatching, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
+        for name, value in module.state_dict().items():
+            if name.startswith(_ADDED_STATE):
+                state_dict.setdefault(prefix + name, value)
+
+    def train(self, mode: bool = True) -> FeatureMatching:
+        """Stays in evaluation mode."""
+        return super().train(False)
+
+    @torch.no_grad()
+    def find(
+        self,
+        scenes: Tensor,
+        native: Tensor,
+        instructions: Sequence[str],
+        described: Tensor | None,
+        demonstrated: Tensor | None,
+    ) -> Candidates:
+        """Finds what tasks ask for.
+
+        Args:
+            scenes: First images of episodes, (batch, 3, H, W) in 0..1, as small as the policy's.
+            native: The same at full resolution, (batch, 3, H', W').
+            instructions: Instruction of each sample, "" for none.
+            described: Descriptors of the demonstrated objects, (batch, descriptor); None without
+                demonstrations.
+            demonstrated: Height offsets of the demonstrated grasps, (batch,), NaN where they are not known;
+                None without demonstrations.
+        """
+        with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
+            locations = self.proposals(scenes, native)
+            crops = self.compare(self.features(native, locations))
+            words = encode_words(instructions, self.vocabulary).to(scenes.device)
+            scores, similarity = self.scores(crops, words, described)
+            if demonstrated is None:
+                demonstrated = torch.full_like(scores[:, 0], torch.nan)
+            heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
+            log_p = (self.sharpness * scores).log_softmax(dim=1)
+            if bool(self.error_rate > 0):
+                uniform = torch.full_like(log_p, 1 / log_p.shape[1])
+                log_p = torch.lerp(log_p.exp(), uniform, self.error_rate).log()
+            return Candidates(locations, log_p, heights, self.settings.map_std)
+
+    def scores(self, crops: Crops, words: Tensor, described: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Scores the crops of proposals by demonstrations and words.
+
+        Args:
+            crops: The crops.
+            words: Indices of the words of the instructions, (batch, length).
+            described: Descriptors of the demonstrated objects, (batch, descriptor); None without
+                demonstrations.
+
+        Returns:
+            Log probabilities, up to a constant, and similarities to the demonstrated objects, (batch, n).
+        """
+        settings, weights = self.settings, self.word_weights(words)
+        scores = word_scores(crops.words, words, weights)
+        matches = similarity = torch.zeros_like(scores)
+        if described is not None:
+            # How well known words describe the object. A new noun leaves the demonstration in charge.
+            p_unknown = (weights * (words == UNKNOWN_WORD)).amax(dim=1)
+            p_described = (1 - p_unknown) * (weights * (words > UNKNOWN_WORD)).amax(dim=1)
+            matches, similarity = self.compare.match(
+                crops, described, settings.sharpness, settings.p_other_object * p_described
+            )
+            scores = (1 - p_unknown)[:, None] * scores
+        by_words = (scores + crops.objectness).softmax(dim=1)
+        p_misdescribed = settings.p_misdescribed
+        by_words = (1 - p_misdescribed) * by_words + p_misdescribed / scores.shape[1]
+        return matches + by_words.log(), similarity
+
+    def proposals(self, scenes: Tensor, native: Tensor) -> Tensor:
+        """Returns where something could be grasped in scenes, (batch, n, 2) in -1..1. See `find`."""
+        return self.background(native) if bool(self.uses_background) else self.propose(scenes)
+
+    @property
+    def report(self) -> str:
+        """How often the object was found where that was not learned."""
+        n_right, n_all = self.held_out.tolist()
+        if not n_all:
+            return "too few episodes to hold some out"
+        return f"object found in {n_right} of {n_all} held-out episodes"
+
+    @property
+    def grasp_radius(self) -> float:
+        """Distance from a grasp within which a proposal stands for the grasped object, in -1..1."""
+        if not bool(self.uses_background):
+            return self.settings.grasp_radius
+        return _GRASP_ERROR + _GRASP_SIZE * float(self.background.object_size)
+
+    @torch.no_grad()
+    def describe(self, images: Tensor, native: Tensor, grasps: Tensor, attended: Tensor) -> Tensor:
+        """Returns descriptors of what was grasped in demonstrations, (batch, descriptor).
+
+        An object that was pushed before it was grasped, as by an attempt that failed, is no longer where it
+        was in the first image: no proposal is near the grasp. The attention then tells where it was.
+
+        Args:
+            images: First images, (batch, 3, H, W) in 0..1, as small as the policy's.
+            native: The same at full resolution, (batch, 3, H', W').
+            grasps: Locations of the grasps, (batch, 2) in -1..1; NaN where they are not known.
+            attended: Locations of what moved, by the attention, (batch, 2) in -1..1.
+        """
+        with torch.autocast(images.device.type, enabled=False):
+            proposed, radius = self.proposals(images, native), self.grasp_radius
+            by_grasp, is_near = nearest_proposals(proposed, grasps, radius)
+            by_attention, is_attended = nearest_proposals(proposed, attended, radius)
+            nearest = torch.where(is_near, by_grasp, by_attention)
+            # A gripper is not always above the middle of an object, but a proposal is.
+            near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
+            locations = torch.where((is_near | is_attended)[:, None], near, attended)
+            return self.compare(self.features(native, locations[:, None])).descriptors[:, 0]
+
+    @torch.no_grad()
+    def understood(self, instruction: str) -> list[tuple[str, str]]:
+        """Returns the words of an instruction that describe the object, and what each is understood as."""
+        words = encode_words([instruction], self.vocabulary).to(self.fitted.device)
+        meanings = zip(words_of(instruction), understand(instruction, self.vocabulary), strict=True)
+        weights = self.word_weights(words)[0].tolist()
+        return [
+            (word, meant)
+            for (word, meant), weight in zip(meanings, weights, strict=False)
+            if meant is not None and weight > self.settings.shown_word_weight
+        ]
+
+    def features(self, native: Tensor, locations: Tensor) -> Tensor:
+        """Returns features of the crops at locations (batch, n, 2), (batch, n, FEATURE_DIM)."""
+        return crop_features(native, locations, self.crop_sizes(locations))
+
+    def crop_sizes(self, locations: Tensor) -> Tensor:
+        """Returns the sides of crops at locations (..., 2), as fractions of the image's, (...)."""
+        # Not as a product of matrices, which autocast would round.
+        side: Tensor | float = self.crop_size
+        if bool(self.uses_background):
+            side = self.settings.crop_factor * self.background.object_size
+        return side * (locations * self.perspective).sum(dim=-1).exp()
+
+    def fit(
+        self,
+        images: Tensor,
+        last: Tensor,
+        native: Tensor,
+        locations: Tensor,
+        heights: Tensor,
+        tasks: Sequence[str],
+        sentences: Mapping[str, Sequence[str]],
+        seed: int,
+        *,
+        in_bfloat16: bool = False,
+    ) -> None:
+        """Fits the proposals, and then the matching head. See `fit_feature_matching`."""
+        fit_feature_matching(
+            *(self, images, last, native, locations, heights, tasks, sentences, seed), in_bfloat16=in_bfloat16
+        )
