@@ -234,11 +234,11 @@ _SMALL = {
 }
 
 
-def small_policy(dataset, policy_type="deltaco", **options):
+def small_policy(dataset, policy_type="deltaco", prepare=True, **options):
     """Makes a small policy and its processors, as LeRobot's training does."""
     config = make_policy_config(policy_type, **{"device": "cpu", **_SMALL[policy_type], **options})
     policy = make_policy(config, ds_meta=dataset.meta)
-    if hasattr(dataset, "frames") and config.uses_demonstrations and config.training_episodes is None:
+    if prepare and hasattr(dataset, "frames") and config.uses_demonstrations and not config.training_episodes:
         policy.prepare_training(dataset.frames)
     before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
     return policy.train(), before, after

@@ -49,7 +49,12 @@ def draw_episodes(
         UserError: There is no other task for a counterfactual demonstration or instruction.
     """
     tasks = [get_task(task_id) for task_id in plan.task_ids]
-    sentences = choose_instructions(plan.task_ids, plan.paraphrases, plan.paraphrases_split, plan.instruction)
+    try:
+        sentences = choose_instructions(
+            plan.task_ids, plan.paraphrases, plan.paraphrases_split, plan.instruction
+        )
+    except ValueError as error:  # of a file
+        raise UserError(str(error)) from error
     candidates = tasks
     if plan.counterfactual == "demonstration" and bank is not None:
         candidates = [task for task in tasks if task.instruction in bank.rows]

@@ -37,7 +37,7 @@ def test_all_recipes_are_valid_and_configure_their_trainings(tmp_path):
         assert [step.name for step in run.steps()] == ["collect", "collect", "train", "evaluate"]
         options = dict(recipe.policy)
         config = make_policy_config(options)
-        options.pop("dtype", None)  # depends on the CPU
+        options.pop("precision", None)  # depends on the CPU
         assert {option: getattr(config, option) for option in options} == options
         if recipe.start_from is None:
             training = run.training_config()
@@ -70,10 +70,14 @@ def test_layers_add_up():
     assert "upsampled_tasks" in read_recipe("scenario_b/deltaco").policy
     assert "upsampled_tasks" not in small.policy  # taken back by a null
     assert read_recipe("ambiguity_object/deltaco").evaluation.scene.ambiguity == "object"
-    settings = ["data.scene.objects=random:200", "policy.optimizer_lr=1.0e-4", "policy.demo_episodes=[1, 2]"]
+    settings = [
+        "data.scene.objects=random:200",
+        "policy.optimizer_lr=1.0e-4",
+        "policy.training_episodes=[1, 2]",
+    ]
     own = read_recipe("random_objects/deltaco_match", settings=settings)
     assert (own.data.scene.objects, own.data.tasks) == ("random:200", "random_train")
-    changed = {"optimizer_lr": 1e-4, "demo_episodes": [1, 2]}
+    changed = {"optimizer_lr": 1e-4, "training_episodes": [1, 2]}
     assert own.policy == {"type": "deltaco_match", "device": "cpu", **changed}
 
 

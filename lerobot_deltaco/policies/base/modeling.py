@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 _ABSURD_ACTION = 100.0
 
 # Options that a policy keeps after its training, and those that only further training may change.
-_TRAINED_OPTIONS = ("image_size", "chunk_size", "num_mixture_components")
+_TRAINED_OPTIONS = ("image_size", "chunk_size", "num_mixture_components", "language_encoder")
 _DATASET_OPTIONS = ("gripper", "gripper_closed", "demo_camera")
 
 DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
@@ -394,6 +394,9 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         Raises:
             ValueError: A file of the checkpoint is damaged, or does not fit the others.
         """
+        if kwargs.get("config") is not None:
+            saved = json.loads(checkpoint_file(pretrained_name_or_path, CONFIG_NAME, **kwargs).read_text())
+            _check_options(kwargs["config"], saved, kwargs.get("dataset_stats") is not None)
         try:
             policy = super().from_pretrained(pretrained_name_or_path, **{**kwargs, "strict": True})
         except RuntimeError as error:
@@ -408,8 +411,6 @@ class TaskConditionedPolicy(PreTrainedPolicy):
                 f"{pretrained_name_or_path} is damaged: the weight {damaged[0]} has numbers that are not "
                 "finite."
             )
-        saved = json.loads(checkpoint_file(pretrained_name_or_path, CONFIG_NAME, **kwargs).read_text())
-        _check_options(policy.config, saved, policy._stats is not None)
         if policy._stats is not None:
             # Training normalizes states by its own dataset, not by that of the weights that it begins with.
             policy.state_limits = StateLimits(policy.config.state_dim, policy._stats).to(policy.step.device)

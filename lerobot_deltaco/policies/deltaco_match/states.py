@@ -74,9 +74,15 @@ class StateRegressor(nn.Module):
         self.register_buffer("state_scale", torch.ones(state_dim))
         self.register_buffer("state_shift", torch.zeros(state_dim))
         self.register_buffer("rest_scale", torch.zeros(state_dim))
-        # Of `location_to_state`, for residuals with a standard deviation of 1; NaN if it is not known.
-        covariance = torch.full((N_LOCATIONS, _N_LOCATION_FEATURES, _N_LOCATION_FEATURES), torch.nan)
+        # Of `location_to_state`, for residuals with a standard deviation of 1; zeros if it is not known.
+        covariance = torch.zeros(N_LOCATIONS, _N_LOCATION_FEATURES, _N_LOCATION_FEATURES)
         self.register_buffer("location_covariance", covariance)
+        self.register_load_state_dict_pre_hook(self._add_covariance)
+
+    @staticmethod
+    def _add_covariance(module: StateRegressor, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
+        """Adds what checkpoints of earlier fits do not have."""
+        state_dict.setdefault(f"{prefix}location_covariance", torch.zeros_like(module.location_covariance))
 
     def fit(
         self,
@@ -199,12 +205,8 @@ class StateRegressor(nn.Module):
         """
         features = _location_features(locations)
         variance = torch.einsum("...gf,gfe,...ge->...g", features, self.location_covariance, features)
-        return variance.sqrt()
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
-        name = f"{prefix}location_covariance"
-        state_dict.setdefault(name, torch.full_like(self.location_covariance, torch.nan))
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        is_known = bool(self.location_covariance.any())
+        return variance.sqrt() if is_known else torch.full_like(variance, torch.nan)
 
     def heights(self, pick_states: Tensor) -> Tensor:
         """Returns the height offsets of grasps, (grasps,); NaN for a grasp that is not known.
