@@ -168,7 +168,10 @@ class TrainingRun:
         """Writes other sentences for the training tasks as a policy reads them, and returns the file."""
         path = self.folder.with_name(f"{self.folder.name}_sentences.csv")
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_training_sentences(path, source, select_tasks(self.recipe.data.tasks))
+        try:
+            write_training_sentences(path, source, select_tasks(self.recipe.data.tasks))
+        except ValueError as error:  # of the file
+            raise UserError(str(error)) from error
         return path
 
     def check_settings(self) -> None:

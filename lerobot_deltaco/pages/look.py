@@ -72,7 +72,11 @@ def look(arguments: LookArguments) -> str:
         pick_color=f"rgb{PICK_COLOR}",
         place_color=f"rgb{PLACE_COLOR}",
     )
-    return "\n".join([*(f"{name}: {n_right} of {n}" for name, n_right, n in rates), f"See {page}."])
+    lines = [f"{name}: {n_right} of {n}" for name, n_right, n in rates]
+    if dataset is not None:
+        lines.append("These say little if the policy was trained on the episodes.")
+        lines.append(f"Its fit: {loaded.policy.feature_matching.report}.")
+    return "\n".join([*lines, f"See {page}."])
 
 
 def _benchmark_episodes(loaded: LoadedPolicy, n_episodes: int) -> Iterator[Judged]:

@@ -30,7 +30,9 @@ def _run(out, *names, settings=SMALL, **options):
     return run_experiments(names or ("scenario_a/deltaco",), out=out, settings=settings, **options)
 
 
-def test_all_recipes_are_valid_and_configure_their_trainings(tmp_path):
+def test_all_recipes_are_valid_and_configure_their_trainings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "human_instructions.csv").write_text("task_id,instruction\n4,first\n4,second\n")
     for name in experiment_names():
         recipe = read_recipe(name)
         run = TrainingRun(recipe, 3, tmp_path)
@@ -78,7 +80,8 @@ def test_layers_add_up():
     own = read_recipe("random_objects/deltaco_match", settings=settings)
     assert (own.data.scene.objects, own.data.tasks) == ("random:200", "random_train")
     changed = {"optimizer_lr": 1e-4, "training_episodes": [1, 2]}
-    assert own.policy == {"type": "deltaco_match", "device": "cpu", **changed}
+    of_type = {"device": "cpu", "paraphrases": "grammar", "grasp_height_bias": 0.5}
+    assert own.policy == {"type": "deltaco_match", **of_type, **changed}
 
 
 def test_a_wrong_setting_is_refused():
