@@ -262,6 +262,7 @@ def small(images: Tensor) -> Tensor:
 def fit(data: Data, seed: int, crop_size: float = 0.17, **options: Any) -> Any:
     """Fits feature matching to the training episodes of a case."""
     from lerobot_deltaco.policies.base.configuration import has_bfloat16
+    from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
     from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
     from lerobot_deltaco.policies.deltaco_match.words import vocabulary_of
 
@@ -274,7 +275,8 @@ def fit(data: Data, seed: int, crop_size: float = 0.17, **options: Any) -> Any:
     vocabulary = vocabulary_of(text for texts in sentences.values() for text in texts)
     matching = FeatureMatching(vocabulary, crop_size, **options)
     tasks = [e.task for e in train]
-    matching.fit(
+    fit_feature_matching(
+        matching,
         *(small(first), small(last), first, picks, torch.zeros(len(train)), tasks, sentences, seed),
         in_bfloat16=has_bfloat16(),
     )

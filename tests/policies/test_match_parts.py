@@ -12,7 +12,7 @@ from lerobot_deltaco.policies.deltaco_match import fit, proposals
 from lerobot_deltaco.policies.deltaco_match.background import N_OBJECTS, Background
 from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.crops import FEATURE_DIM, cut_crops, fit_perspective
-from lerobot_deltaco.policies.deltaco_match.fit import fit_matching_head
+from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching, fit_matching_head
 from lerobot_deltaco.policies.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.policies.deltaco_match.localization import Candidates, FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
@@ -138,7 +138,8 @@ def matching(shapes, request):
     sentences, heights = {task: [task] for task in tasks}, torch.zeros(24)
     # As in the first step of a policy's training.
     with torch.autocast("cpu", torch.bfloat16), torch.autocast("cpu", enabled=False):
-        matching.fit(
+        fit_feature_matching(
+            matching,
             *(images, images, images, locations, heights, tasks, sentences),
             seed=0,
             in_bfloat16=request.param,
@@ -205,7 +206,9 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes, sho
         matching = FeatureMatching(vocabulary_of(tasks), 0.25).train()
         torch.set_rng_state(state)
         sentences = {task: [task] for task in tasks}
-        matching.fit(images, images, images, locations, torch.zeros(8), tasks, sentences, seed)
+        fit_feature_matching(
+            matching, images, images, images, locations, torch.zeros(8), tasks, sentences, seed
+        )
         assert torch.equal(torch.get_rng_state(), state)
         assert not any(weights.requires_grad for weights in matching.parameters())
         assert not any(module.training for module in matching.modules())
@@ -241,7 +244,9 @@ def test_steps_of_the_fit_follow_the_number_of_scenes(n_scenes, steps, monkeypat
     matching = FeatureMatching(["task"], 0.25, settings)
     images = torch.zeros(n_scenes, 3, 16, 16, dtype=torch.uint8)
     tasks, sentences = ["task"] * n_scenes, {"task": ["task"]}
-    matching.fit(*[images] * 3, torch.zeros(n_scenes, 2), torch.zeros(n_scenes), tasks, sentences, 0)
+    fit_feature_matching(
+        matching, *[images] * 3, torch.zeros(n_scenes, 2), torch.zeros(n_scenes), tasks, sentences, 0
+    )
     assert len(draws) == 1 + steps  # the first, for the scales
 
 
@@ -279,7 +284,9 @@ def test_fit_needs_a_task_with_two_grasps(shapes):
     images, locations, tasks = (part[:6] for part in shapes)
     locations = torch.where(torch.arange(6)[:, None] < 2, locations, torch.nan)
     with pytest.raises(ValueError, match="at least two episodes .* 2 such episodes are of 2 different tasks"):
-        FeatureMatching([], 0.25).fit(images, images, images, locations, torch.zeros(6), tasks, {}, 0)
+        fit_feature_matching(
+            FeatureMatching([], 0.25), images, images, images, locations, torch.zeros(6), tasks, {}, 0
+        )
 
 
 def draw_objects(side, locations, shape=(96, 96), seed=0):

@@ -6,7 +6,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -16,13 +16,11 @@ from tqdm import tqdm
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.crops import crop_features, fit_perspective
+from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.matching import Crops, MatchingHead, word_scores
 from lerobot_deltaco.policies.deltaco_match.proposals import nearest_proposals
 from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.words import UNKNOWN_WORD, encode_words
-
-if TYPE_CHECKING:
-    from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
 
 logger = logging.getLogger(__name__)
 

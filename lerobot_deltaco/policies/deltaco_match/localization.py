@@ -22,7 +22,7 @@ images of the training episodes: see `fit`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -32,7 +32,6 @@ from lerobot_deltaco.policies.base.networks import gaussian_maps
 from lerobot_deltaco.policies.deltaco_match import settings as matching_settings
 from lerobot_deltaco.policies.deltaco_match.background import Background
 from lerobot_deltaco.policies.deltaco_match.crops import crop_features
-from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
 from lerobot_deltaco.policies.deltaco_match.grasp_height import GraspHeightEstimator
 from lerobot_deltaco.policies.deltaco_match.matching import HIDDEN_DIM, Crops, MatchingHead, word_scores
 from lerobot_deltaco.policies.deltaco_match.proposals import ProposalNetwork, nearest_proposals
@@ -274,21 +273,3 @@ class FeatureMatching(nn.Module):
         if bool(self.uses_background):
             side = self.settings.crop_factor * self.background.object_size
         return side * (locations * self.perspective).sum(dim=-1).exp()
-
-    def fit(
-        self,
-        images: Tensor,
-        last: Tensor,
-        native: Tensor,
-        locations: Tensor,
-        heights: Tensor,
-        tasks: Sequence[str],
-        sentences: Mapping[str, Sequence[str]],
-        seed: int,
-        *,
-        in_bfloat16: bool = False,
-    ) -> None:
-        """Fits the proposals, and then the matching head. See `fit_feature_matching`."""
-        fit_feature_matching(
-            *(self, images, last, native, locations, heights, tasks, sentences, seed), in_bfloat16=in_bfloat16
-        )

@@ -42,6 +42,7 @@ from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork, ran
 from lerobot_deltaco.policies.deltaco_match.calibration import MIN_EPISODES
 from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
 from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.place import (
     TARGET_DIM,
@@ -482,7 +483,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert self.training_data is not None
         assert self.training_locations is not None
         bank, located = self.training_data.demonstrations, self.training_locations
-        self.feature_matching.fit(
+        fit_feature_matching(
+            self.feature_matching,
             bank.frames[:, 0],
             bank.frames[:, -1],
             bank.frames[:, 0] if bank.first_images is None else bank.first_images,
