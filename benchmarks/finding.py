@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gym_deltaco.layout import MIN_OBJECT_DISTANCE, Layout, PlacedContainer, PlacedObject, sample_layout
-from gym_deltaco.objects.object_sets import find_model
+from gym_deltaco.objects.models import find_model
 from gym_deltaco.phrases import paraphrase
 from gym_deltaco.scene import Scene
 from gym_deltaco.scene_config import SceneConfig

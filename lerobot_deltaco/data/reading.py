@@ -20,10 +20,14 @@ from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_deltaco.data.files import check_files
 from lerobot_deltaco.errors import UserError
 
 logger = logging.getLogger(__name__)
 
+# Of the mean, in standard deviations, and of the standard deviation, as a factor
+_MAX_MEAN_ERROR, _MAX_STD_RATIO = 0.5, 2.0
+_ROUNDING = 1e-3  # of statistics, as a fraction of 1 plus the mean
 _TOLERANCE = 1e-3  # of numbers beyond the range of the statistics, as a fraction of it
 
 
@@ -86,11 +90,17 @@ def open_folder_or_hub(name: str) -> LeRobotDataset:
 def missing_files_named(
     repo_id: str, root: str | Path | None, episodes: Sequence[int] | None = None
 ) -> Iterator[None]:
-    """While a local dataset is opened, names the file that is missing, rather than the Hub."""
+    """Checks the files of a local dataset, and names one that is missing while it is opened, not the Hub.
+
+    Raises:
+        UserError: A file cannot be read, or contradicts another one.
+        FileNotFoundError: A file is missing.
+    """
+    folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+    check_files(folder, episodes)
     try:
         yield
     except Exception as error:
-        folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
         if (folder / "meta/info.json").exists():
             for owner, path in _needed_files(repo_id, folder, episodes):
                 if not path.exists():
@@ -265,6 +275,9 @@ def check_dataset(dataset: LeRobotDataset) -> None:
     for name, feature in dataset.meta.features.items():
         if name not in dataset.meta.camera_keys and str(feature["dtype"]).startswith("float"):
             _check_numbers(dataset, name, stats.get(name, {}))
+    for name in (ACTION, OBS_STATE):
+        if name in dataset.meta.features:
+            _check_statistics(dataset, name, stats[name])
 
 
 def _check_tasks(meta: LeRobotDatasetMetadata) -> None:
@@ -334,6 +347,37 @@ def _check_numbers(dataset: LeRobotDataset, name: str, stats: dict[str, Any]) ->
             f"`{name}` {problem}: dimension {dimension} is {values[row, dimension]:g} in "
             f"{frame_name(dataset, int(row))}. {int(wrong.any(axis=1).sum())} frames are such. Leave out "
             "damaged episodes with --dataset.episodes; compute wrong statistics again."
+        )
+
+
+def _check_statistics(dataset: LeRobotDataset, name: str, stats: Mapping[str, Any]) -> None:
+    """Checks the mean and the standard deviation of a feature, by which a policy normalizes it.
+
+    Wrong ones make it blind to the feature. Some episodes alone may differ from all of them, though not as
+    much as all can.
+    """
+    values = column(dataset, name).reshape(len(dataset.hf_dataset), -1).astype(np.float64)
+    mean, std, least, most = (
+        np.asarray(stats[key], np.float64).reshape(-1) for key in ("mean", "std", "min", "max")
+    )
+    if len(mean) != values.shape[1] or len(std) != values.shape[1]:
+        return  # LeRobot refuses these
+    # Of a constant dimension, rounding leaves a small standard deviation.
+    spread, rounding = most - least, _ROUNDING * (1 + np.abs(mean))
+    own = values.std(axis=0)
+    wrong = (mean < least - _TOLERANCE * spread - rounding) | (mean > most + _TOLERANCE * spread + rounding)
+    wrong |= (std > spread + rounding) | ((std <= 0) & (own > rounding))
+    if len(values) == dataset.meta.total_frames:
+        wrong |= np.abs(values.mean(axis=0) - mean) > _MAX_MEAN_ERROR * own + rounding
+        wrong |= (own > rounding) & ((std < own / _MAX_STD_RATIO) | (std > own * _MAX_STD_RATIO))
+    if wrong.any():
+        dimension = int(np.argmax(wrong))
+        raise UserError(
+            f"The statistics of `{name}` in {dataset.meta.root / 'meta/stats.json'} are not those of the "
+            f"frames: by them, dimension {dimension} has mean {mean[dimension]:g} and standard deviation "
+            f"{std[dimension]:g}; in the frames, {values[:, dimension].mean():g} and "
+            f"{values[:, dimension].std():g}. Compute them again: lerobot-edit-dataset "
+            "--operation.type=recompute_stats."
         )
 
 

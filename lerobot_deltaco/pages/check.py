@@ -31,7 +31,7 @@ from lerobot_deltaco.data.grasps import Grasp, find_grasps
 from lerobot_deltaco.data.gripper_states import GripperStates, find_gripper_states
 from lerobot_deltaco.data.images import as_uint8, resize_images
 from lerobot_deltaco.data.pauses import paused_frames
-from lerobot_deltaco.data.reading import dimension_names, open_folder_or_hub
+from lerobot_deltaco.data.reading import decoding, dimension_names, open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments
@@ -195,7 +195,10 @@ def _read_episodes(
         times = np.linspace(first, last, 4).round().astype(int).tolist()
         if isinstance(grasp, Grasp):
             times = [first, grasp.grasp, grasp.release, last]
-        items = [dataset[time] for time in times]
+        items = []
+        for shown in times:
+            with decoding(dataset, shown, demo_camera or ""):
+                items.append(dataset[shown])
         for camera in cameras:
             staying[camera].append(_staying_edges(torch.stack([item[camera] for item in items[:3]])))
         images = [] if demo_camera is None else [item[demo_camera] for item in items]

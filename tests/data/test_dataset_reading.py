@@ -67,10 +67,20 @@ def put(row, value, dimension=None):
     [
         (TABLE, "tasks", swap, r"Episode 0 .*: its task is \['stack the cups'\], but \['pour the tea'\] by"),
         (TABLE, "tasks", put(2, []), r"Episode 2 .*: its task is \['stack the cups'\], but \[\] by"),
-        (TABLE, "length", put(1, 4), "Episode 1 of .*: the table contradicts itself"),
+        (
+            TABLE,
+            "length",
+            put(1, 4),
+            "Episode 1 .*(the table contradicts itself|has 5 frames in .*, but 4 by)",
+        ),
         (TABLE, "dataset_from_index", swap, "Episode 0 of .*: the table contradicts itself"),
         (TABLE, "episode_index", swap, "Episode 0 of .*: the table contradicts itself"),
-        (DATA, "episode_index", put(12, 0), "Episode 0 .*: its frames are not those with the indices"),
+        (
+            DATA,
+            "episode_index",
+            put(12, 0),
+            "Episode 0 .*(not those with the indices|has 6 frames in .*, but 5 by)",
+        ),
         (DATA, "frame_index", put(12, 0), "Episode 2 .*: its frames are not those with the indices"),
         (DATA, "task_index", put(12, 2), r"Episode 2 .*: it has several tasks, \['stack the cups', 'w"),
         (DATA, "task_index", put(12, 9), r"Episode 2 .*: it has several tasks, .*number 9"),
