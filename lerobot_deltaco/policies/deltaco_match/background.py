@@ -7,6 +7,8 @@ that were never grasped.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
@@ -58,6 +60,12 @@ class Background(nn.Module):
         self.register_buffer("contrast", torch.tensor(_MIN_CONTRAST))
         self.register_buffer("object_size", torch.tensor(_DEFAULT_SIZE))
         self.register_buffer("perspective", torch.zeros(2))
+        self._bounds: tuple[Tensor, Tensor] | None = None  # of the remembered colors around each pixel
+        self.register_load_state_dict_post_hook(self._forget_bounds)
+
+    @staticmethod
+    def _forget_bounds(module: Background, _: object) -> None:
+        module._bounds = None
 
     def forward(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
         """Proposes objects, those that stand out most first.
@@ -100,6 +108,7 @@ class Background(nn.Module):
             _scaled(images[chosen.to(images.device)]).mul(255).round().to(self.images)
         )
         self.n_images.fill_(len(chosen))
+        self._bounds = None
         scenes, at = images[chosen.to(images.device)], locations[chosen.to(locations.device)].to(device)
         rows = torch.arange(len(chosen))
         differences = torch.cat(
@@ -138,16 +147,19 @@ class Background(nn.Module):
 
     def _differences(self, scenes: Tensor, remembered: Tensor | None) -> Tensor:
         """Returns the difference of each pixel from the colors that are common there, (batch, 128, 128)."""
-        images = self.images[: int(self.n_images)].float() / 255
-        # A pixel may lie between two of the image: its neighbors count.
-        low, high = -F.max_pool2d(-images, 3, 1, 1), F.max_pool2d(images, 3, 1, 1)
-        n_common = max(2, round(_COMMON * len(images)))
+        if self._bounds is None or self._bounds[0].device != self.images.device:
+            images = self.images[: int(self.n_images)]
+            # A pixel may lie between two of the image: its neighbors count.
+            least, most = (_over_neighbors(images, extreme) for extreme in (torch.minimum, torch.maximum))
+            self._bounds = least.float() / 255, most.float() / 255
+        low, high = self._bounds
+        n_common = min(max(2, round(_COMMON * len(low))), len(low))
         results = []
-        for n, scene in enumerate(_scaled(scenes).to(images.device)):
+        for n, scene in enumerate(_scaled(scenes).to(low.device)):
             away = torch.maximum(low - scene, scene - high).amax(dim=1)  # (images, 128, 128)
             if remembered is not None and remembered[n] >= 0:
                 away[remembered[n]] = 2.0
-            results.append(away.kthvalue(min(n_common, len(away)), dim=0).values)
+            results.append(_kth_smallest(away, n_common))
         return torch.stack(results).clamp_min(0)
 
     def _peaks(self, masks: Tensor) -> Tensor:
@@ -163,6 +175,28 @@ class Background(nn.Module):
             found.append((inside[..., None] * centers).sum(dim=1) / inside.sum(dim=1, keepdim=True))
             smooth = smooth.masked_fill(away < _NEIGHBOR * size, -1.0)
         return torch.stack(found, dim=1)
+
+
+def _over_neighbors(images: Tensor, extreme: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Returns the extreme value of 3 x 3 pixels of images (..., h, w)."""
+    for dim in (-1, -2):
+        size = images.shape[dim]
+        first, last = images.narrow(dim, 0, size - 1), images.narrow(dim, 1, size - 1)
+        pairs = extreme(first, last)
+        ends = images.narrow(dim, 0, 1), images.narrow(dim, size - 1, 1)
+        images = extreme(torch.cat([ends[0], pairs], dim=dim), torch.cat([pairs, ends[1]], dim=dim))
+    return images
+
+
+def _kth_smallest(maps: Tensor, k: int) -> Tensor:
+    """Returns the k-th smallest value of each pixel of maps (n, h, w), (h, w); faster than `kthvalue`."""
+    smallest = maps.new_full((k, *maps.shape[1:]), torch.inf)  # ascending
+    for values in maps:
+        for n in range(k):
+            lower = torch.minimum(smallest[n], values)
+            values = torch.maximum(smallest[n], values)  # noqa: PLW2901
+            smallest[n] = lower
+    return smallest[-1]
 
 
 def _scaled(images: Tensor) -> Tensor:

@@ -43,19 +43,16 @@ def robust_regression(
 def _smooth_regression(features: Tensor, targets: Tensor, weights: Tensor, degrees: Tensor) -> Tensor:
     """Returns the weights of a regression of weighted samples, each target with its own ridges."""
     present = [degree for degree in degrees.unique().tolist() if degree > 0]
+    # A higher degree is never penalized less.
+    combinations = torch.tensor(list(combinations_with_replacement(_RIDGES, len(present))))
+    ridges = torch.zeros(len(combinations), len(degrees))
+    for degree, values in zip(present, combinations.T, strict=True):
+        ridges[:, degrees.cpu() == degree] = values[:, None] * len(features)
     weighted = features * weights[:, None]
     gram, moments = weighted.T @ features, weighted.T @ targets
-    best = torch.zeros_like(moments)
-    least = torch.full((targets.shape[1],), torch.inf, device=features.device)
-    # A higher degree is never penalized less.
-    for ridges in combinations_with_replacement(_RIDGES, len(present)):
-        ridge = torch.zeros(len(degrees), device=features.device)
-        for degree, value in zip(present, ridges, strict=True):
-            ridge[degrees == degree] = value * len(features)
-        inverse = torch.linalg.inv(gram + torch.diag(ridge))
-        solution = inverse @ moments
-        leverage = ((features @ inverse) * weighted).sum(dim=1).clamp(max=0.999)
-        errors = (targets - features @ solution) / (1 - leverage)[:, None]
-        error = (weights[:, None] * errors.square()).sum(dim=0)
-        best, least = torch.where(error < least, solution, best), torch.minimum(error, least)
-    return best
+    inverse = torch.linalg.inv(gram + torch.diag_embed(ridges.to(features)))  # (ridges, features, features)
+    solutions = inverse @ moments  # (ridges, features, targets)
+    leverage = ((features @ inverse) * weighted).sum(dim=2).clamp(max=0.999)  # (ridges, n)
+    errors = (targets - features @ solutions) / (1 - leverage)[..., None]
+    best = (weights[:, None] * errors.square()).sum(dim=1).argmin(dim=0)  # (targets,)
+    return solutions[best, :, torch.arange(len(best), device=best.device)].T
