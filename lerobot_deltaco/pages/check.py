@@ -37,7 +37,7 @@ from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
-from lerobot_deltaco.policies.deltaco_match import proposals
+from lerobot_deltaco.policies.deltaco_match.background import N_OBJECTS
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
@@ -364,7 +364,7 @@ def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[
     began = time.perf_counter()
     policy.feature_matching.describe(images.float() / 255, native, middle, middle)
     per_crop = (time.perf_counter() - began) / len(images)
-    fit = min(len(bank), policy.feature_matching.settings.max_episodes) * proposals.N_PROPOSALS * per_crop
+    fit = min(len(bank), policy.feature_matching.settings.max_episodes) * N_OBJECTS * per_crop
     total = reading + fit + steps * per_step
     memory = start.bytes + psutil.Process().memory_info().rss
     return [
