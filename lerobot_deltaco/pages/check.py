@@ -21,6 +21,7 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_STATE
 from PIL import Image
+from scipy.stats import binomtest
 from torch import Tensor
 from torch.utils.data import default_collate
 from tqdm import tqdm
@@ -44,6 +45,8 @@ from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import Deltac
 from lerobot_deltaco.training.train import image_size_in_memory
 
 _PICTURE_HEIGHT = 180  # px
+_MAX_FITTED = 300  # episodes, for which the fit takes about a minute
+_ENOUGH = 70  # percent of the objects that are found, from which on a policy is worth training
 # A camera stands still if at least this fraction of the edges in an episode's first image stay where they
 # are: of the benchmark's fixed cameras 0.6 to 0.8, of its wrist camera below 0.1.
 _MIN_STAYING, _COMPARED_SIZE, _EDGES, _SAME = 0.4, 48, 0.2, 0.5
@@ -94,6 +97,9 @@ class TrainingStart:
         self.grasps = find_grasps(opening, robot.spans, command.usual_range, robot.states)
         self.gripper_states = find_gripper_states(robot.states, opening, robot.spans, robot.state_names)
         self.policy.fit_locations(data.to(self.policy.step.device))
+        if len(self.bank) <= _MAX_FITTED:
+            self.policy.fit_matching()
+            return
         with_grasp = zip(self.bank.tasks, self.grasps, strict=True)
         EpisodePairs([task for task, grasp in with_grasp if isinstance(grasp, Grasp)])
 
@@ -293,6 +299,8 @@ def _facts(
         facts.append(("its state", f"{which}, {start.gripper_states.reason}; the rest is the arm's"))
     if start.grasps:
         facts.append(("grasps", f"in {n_found} of {len(start.grasps)} episodes; others are left out"))
+    if start.refusal is None and start.policy is not None:
+        facts.append(("finding", _finding(start.policy)))
     for feature, rows in dimensions.items():
         arm = [ends for name, *ends in rows if "gripper" not in name.lower()] or [[0.0, 0.0]]
         low, high = min(low for low, _ in arm), max(high for _, high in arm)
@@ -306,6 +314,24 @@ def _facts(
         paused = paused_frames(robot, dataset.fps)
         facts.append(("pauses", f"the robot stands still in {100 * paused.mean():.0f} % of the frames"))
     return facts
+
+
+def _finding(policy: DeltacoMatchPolicy) -> str:
+    """Returns how often the object is found where that was not learned, and what to make of it."""
+    matching = policy.feature_matching
+    if not bool(matching.fitted):
+        return f"not tried with more than {_MAX_FITTED} episodes; training tells after its fit"
+    n_right, n_all = matching.held_out.tolist()
+    if not n_all:
+        return f"{matching.report}: record more episodes of each task"
+    interval = binomtest(n_right, n_all).proportion_ci(method="wilson")
+    low, high = 100 * interval.low, 100 * interval.high
+    verdict = "enough for new scenes of these tasks"
+    if low < _ENOUGH:
+        verdict = "too few episodes are held out to tell whether that is enough: record more of each task"
+    if high < _ENOUGH:
+        verdict = "not enough for new scenes: record more episodes, and larger or clearer images"
+    return f"{matching.report} ({low:.0f} to {high:.0f} %): {verdict}"
 
 
 def _advice(start: TrainingStart, staying: dict[str, float]) -> list[str]:

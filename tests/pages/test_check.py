@@ -1,5 +1,6 @@
 """`deltaco check`: its report agrees with the training."""
 
+import re
 import shutil
 import sys
 from itertools import islice
@@ -36,7 +37,7 @@ def checked(root, out, **options):
     return report, (out / "index.html").read_text()
 
 
-def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path):
+def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path, short_fit):
     report, page = checked(table.root, tmp_path)
     assert "Training would refuse" not in report
     assert "demo camera:    observation.image stands still" in report
@@ -45,6 +46,9 @@ def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path):
     assert "in 48 of 48 episodes" in report
     assert all(f"24 episodes, 24 with a grasp: {task}" in report for task in TABLE_TASKS)
     assert "for 100 steps of 4" in report
+    assert re.search(
+        r"finding: +object found in \d of 6 held-out episodes \(\d+ to \d+ %\): .*enough", report
+    )
     # The training's own warning, of a joint that never moves.
     assert report.count("warning:") == report.count("of the robot's state hardly move") == 1
     assert page.count("data:image/jpeg;base64") == 4 * 48
