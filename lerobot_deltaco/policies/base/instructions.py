@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base import language
 
 _UNIT_TOLERANCE = 1e-6  # deviation from length 1 below which a vector is left as it is
@@ -63,31 +62,19 @@ class InstructionEmbeddings:
 
 
 class Paraphrases:
-    """Sentences that replace the task strings of a dataset in training.
+    """Sentences that replace the task strings of a dataset in training; other tasks keep theirs.
 
     Args:
         sentences: Sentences by task string.
         probability: Probability that a sentence replaces the task string.
-        is_complete: Whether a task without sentences is an error; otherwise, it keeps its task string.
     """
 
-    def __init__(
-        self, sentences: Mapping[str, Sequence[str]], probability: float = 1.0, is_complete: bool = True
-    ) -> None:
-        self.sentences, self.probability, self.is_complete = dict(sentences), probability, is_complete
+    def __init__(self, sentences: Mapping[str, Sequence[str]], probability: float = 1.0) -> None:
+        self.sentences, self.probability = dict(sentences), probability
 
     def of(self, task: str) -> Sequence[str]:
-        """Returns the sentences of a task.
-
-        Raises:
-            ValueError: There are none, and there should be.
-        """
-        sentences = self.sentences.get(task, ())
-        if self.is_complete and not sentences:
-            raise UserError(
-                f"`paraphrases` has no sentence for the task {task!r} in its split for training. Add some."
-            )
-        return sentences
+        """Returns the sentences of a task; none if it has none."""
+        return self.sentences.get(task, ())
 
     def left_out_of(self, instructions: InstructionEmbeddings) -> InstructionEmbeddings:
         """Returns a cache of instructions without these sentences."""
@@ -103,9 +90,6 @@ class Paraphrases:
         Args:
             tasks: Task string of each sample.
             generator: Source of the draws, on the CPU.
-
-        Raises:
-            ValueError: There is no sentence for a task, and there should be.
         """
         draws = torch.rand(len(tasks), generator=generator).tolist()
         instructions = []

@@ -464,7 +464,7 @@ def _read_paraphrases(config: TaskConditionedConfig, meta: LeRobotDatasetMetadat
             f"{config.paraphrases} has sentences for none of the dataset's tasks, such as "
             f"{meta.tasks.index[0]!r}, but for tasks such as {next(iter(sentences))!r}."
         )
-    return Paraphrases(sentences, config.p_paraphrase, is_complete=False)
+    return Paraphrases(sentences, config.p_paraphrase)
 
 
 def _not_finite(tensors: Mapping[str, Any]) -> list[str]:
