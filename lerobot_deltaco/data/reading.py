@@ -197,17 +197,6 @@ def frame_name(dataset: LeRobotDataset, row: int, camera: str | None = None) -> 
     return f"frame {frame} of episode {episode} ({meta.root / path})"
 
 
-def read_frame(dataset: LeRobotDataset, row: int, camera: str) -> dict[str, Any]:
-    """Returns a row of a dataset; an error names the frame whose image cannot be decoded.
-
-    Raises:
-        ValueError: An image of a camera cannot be decoded.
-    """
-    with decoding(dataset, row, camera):
-        item = dataset[row]
-    return item
-
-
 @contextmanager
 def decoding(dataset: LeRobotDataset, row: int, camera: str) -> Iterator[None]:
     """Names the frame in errors while an image of a camera is decoded.

@@ -49,7 +49,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         trim_pauses: Whether `deltaco train` leaves out frames in which the robot has stood still for more
             than 0.1 s.
         num_mixture_components: Number of Gaussians of the action's distribution. One averages two actions
-            that are equally good; of several, the policy takes the likeliest.
+            that are equally good; of several, the policy cycles through the likely ones.
         gripper: Gripper's dimension of the action: an index, "auto" (of those whose name contains "gripper",
             the one that moves most) or "none".
         gripper_closed: Whether low or high values of the gripper's dimension mean closed.

@@ -70,20 +70,20 @@ class ActionDistribution(NamedTuple):
         """The mean of the likeliest component, (batch, steps, dims)."""
         return self.likely_mean(0)
 
-    def likely_mean(self, turn: int) -> Tensor:
+    def likely_mean(self, index: int) -> Tensor:
         """Returns the mean of a likely component, (batch, steps, dims).
 
         Components that are nearly as likely as the likeliest take turns, each as often as it is likely. Where
         waiting is a little likelier than going on, a robot that always does the likeliest may wait forever.
 
         Args:
-            turn: Number of the action in the episode; at 0, it is the likeliest component's.
+            index: Number of the action in the episode; at 0, it is the likeliest component's.
         """
         probabilities, components = self.logits.float().softmax(dim=1).sort(dim=1, descending=True)
         probabilities = torch.where(probabilities < _NEARLY * probabilities[:, :1], 0.0, probabilities)
         shares = probabilities.cumsum(dim=1) / probabilities.sum(dim=1, keepdim=True)
         # Multiples of the golden ratio are spread evenly over 0..1: none waits long for its turn.
-        chosen = (shares[:, :-1] <= turn * _GOLDEN_RATIO % 1.0).sum(dim=1)
+        chosen = (shares[:, :-1] <= index * _GOLDEN_RATIO % 1.0).sum(dim=1)
         rows = torch.arange(len(chosen), device=chosen.device)
         return self.means[rows, components[rows, chosen]]
 

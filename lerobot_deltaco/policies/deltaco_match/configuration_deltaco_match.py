@@ -1,4 +1,4 @@
-"""`--policy.type=deltaco_match`; the defaults are the options of the shipped policy."""
+"""`--policy.type=deltaco_match`; the defaults are for a robot, and the benchmark's recipes change a few."""
 
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
@@ -23,8 +23,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     demonstration, an instruction, or both.
 
     Args:
-        crop_size: Side of the square around a thing that is compared, in the middle of the first camera's
-            image and as a fraction of its side: about the size of a large object.
+        crop_size: Side of the square around an object that is compared, in the middle of the first camera's
+            image and as a fraction of its side. Used only where objects do not stand out from other scenes,
+            such as after a camera was moved during recording; otherwise, the size of objects is measured.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation.
         grasp_height_bias: Height offset that is added to the estimate when the policy acts, in standard
             deviations over the training episodes; larger is farther along the approach. On a robot, a gripper
