@@ -20,7 +20,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-IMAGE_SIZE = 64
+IMAGE_SIZE = 128
 ACTION_SCALE = 0.025  # m per unit, for which the package's controller is made
 TASK = "Put the block on the green disc."
 # LeRobot's parser loads modules for `--env.discover_packages_path` as packages.
@@ -42,6 +42,7 @@ def make_so101(**options: Any) -> gym.Env:
             # Without a GPU, these take nine tenths of the time of a picture.
             self.model.light_castshadow[:] = 0
             self.model.vis.quality.offsamples = 0
+            self.model.vis.global_.offwidth = self.model.vis.global_.offheight = 2 * IMAGE_SIZE
 
         def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
             observation, reward, terminated, truncated, info = super().step(action)

@@ -37,8 +37,9 @@ class Demonstration:
         features: Features of the frames from a frozen image encoder, (features,); None without one.
         episode: Index of the episode in its dataset; None if it is not from a dataset.
         target_object: Index of the object that it moves; None if it is not known.
-        states: The robot's state in each frame, (frames, state); None if they were not kept.
-        actions: The action after each frame, (frames, action); None if they were not kept.
+        states: The robot's state at each step of the episode, as in the dataset, (steps, state); None if they
+            are not known.
+        actions: The action at each step, as in the dataset, (steps, action); None if they are not known.
     """
 
     task: str
@@ -66,6 +67,7 @@ class DemonstrationBank(torch.nn.Module):
             is the resolution of `frames`.
         pick_states: The robot's state when its gripper closed, as in the dataset, (episodes, state) float32;
             NaN where it did not. None unless the policy needs them.
+        trajectories: States and actions of the episodes; None unless the policy needs them.
 
     Attributes:
         features: Features of each by a frozen image encoder, (episodes, variants, features) float16; None
@@ -77,6 +79,8 @@ class DemonstrationBank(torch.nn.Module):
     first_images: Tensor | None
     pick_states: Tensor | None
     features: Tensor | None
+    states: Tensor | None
+    actions: Tensor | None
     _members: Tensor
     _count: Tensor
     _group: Tensor
@@ -92,8 +96,10 @@ class DemonstrationBank(torch.nn.Module):
         target_objects: Sequence[int] | None = None,
         first_images: Tensor | None = None,
         pick_states: Tensor | None = None,
+        trajectories: RobotData | None = None,
     ) -> None:
         super().__init__()
+        self.spans = None if trajectories is None else trajectories.spans
         self.tasks = list(tasks)
         self.target_objects = None if target_objects is None else list(target_objects)
         self.rows: dict[str, list[int]] = {}
@@ -112,6 +118,8 @@ class DemonstrationBank(torch.nn.Module):
             ("first_images", first_images),
             ("pick_states", pick_states),
             ("features", None),
+            ("states", None if trajectories is None else trajectories.states),
+            ("actions", None if trajectories is None else trajectories.actions),
             ("_members", torch.nn.utils.rnn.pad_sequence(members, batch_first=True)),
             ("_count", torch.tensor([len(rows) for rows in members])),
             ("_group", torch.tensor([group[task] for task in self.tasks])),
@@ -137,7 +145,17 @@ class DemonstrationBank(torch.nn.Module):
             None if self.features is None else self.features[row, 0].float(),
             int(self.episodes[row]),
             None if self.target_objects is None else self.target_objects[row],
+            *self.trajectory(row),
         )
+
+    def trajectory(self, row: int) -> tuple[Tensor | None, Tensor | None]:
+        """Returns the states (steps, state) and actions (steps, action) of a row, None if not known."""
+        if self.spans is None:
+            return None, None
+        first, last = self.spans[row]
+        assert self.states is not None
+        assert self.actions is not None
+        return self.states[first : last + 1], self.actions[first : last + 1]
 
     def of_task(self, task: str, target_object: int | None = None) -> list[Demonstration]:
         """Returns the demonstrations of a task.

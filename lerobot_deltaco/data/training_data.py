@@ -181,6 +181,7 @@ class TrainingData:
             None if objects is None else objects.reshape(-1)[first_rows].tolist(),
             first_images,
             None if grasps is None else grasps.pick_states,
+            None if grasps is None else robot,
         )
         return cls(bank, robot, grasps)
 

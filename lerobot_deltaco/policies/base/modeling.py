@@ -253,10 +253,13 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     def _sample_action(
         self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None
     ) -> Tensor:
-        """Returns the actions of a chunk, (batch, steps, action); an absurd one is an error."""
+        """Returns the actions of a chunk, (batch, steps, action)."""
         opening = None if gripper is None else torch.sigmoid(gripper.float())
         mean = predicted.likely_mean(self._component_index).float()
-        action = join_action(mean, opening, self.config.gripper_index)
+        return self._checked_action(batch, join_action(mean, opening, self.config.gripper_index))
+
+    def _checked_action(self, batch: dict[str, Any], action: Tensor) -> Tensor:
+        """Returns actions (batch, steps, action); an absurd one is an error."""
         if bool((action.abs() < _ABSURD_ACTION).all()):  # False for NaN
             return action
         damaged = _not_finite(batch)

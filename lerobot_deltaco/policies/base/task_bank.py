@@ -8,6 +8,9 @@ evaluation, so that these need no dataset:
     episodes       (demonstrations,) int64, indices in their dataset
     first_images   (demonstrations, 3, H', W') uint8, at the camera's own resolution; optional
     pick_states    (demonstrations, state) float32, NaN where there is none; optional
+    states         (steps of all demonstrations, state) float32; optional
+    actions        (steps of all demonstrations, action) float32; with states
+    n_steps        (demonstrations,) int64, steps of each; with states
     features       (demonstrations, features) float32, by a frozen image encoder; optional
     metadata       as JSON: instructions, tasks and target_objects
 """
@@ -23,7 +26,7 @@ from huggingface_hub import hf_hub_download
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from lerobot_deltaco.data.demonstrations import DemonstrationBank
+from lerobot_deltaco.data.demonstrations import DemonstrationBank, RobotData
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings
 
@@ -56,6 +59,10 @@ def write_task_bank(
             tensors["first_images"] = demonstrations.first_images
         if demonstrations.pick_states is not None:
             tensors["pick_states"] = demonstrations.pick_states.float()
+        if demonstrations.spans is not None:
+            states, actions = zip(*map(demonstrations.trajectory, range(len(demonstrations))), strict=True)
+            tensors |= {"states": torch.cat(states).float(), "actions": torch.cat(actions).float()}
+            tensors["n_steps"] = torch.tensor([len(each) for each in states])
         if demonstrations.features is not None:
             tensors["features"] = demonstrations.features[:, 0].float()
         texts |= {"tasks": demonstrations.tasks, "target_objects": demonstrations.target_objects}
@@ -105,6 +112,7 @@ def read_task_bank(path: Path, instructions: InstructionEmbeddings | None) -> De
             texts["target_objects"],
             tensors.get("first_images"),
             tensors.get("pick_states"),
+            _trajectories(tensors),
         )
     except (OSError, SafetensorError, ValueError, RecursionError, KeyError, TypeError) as error:
         raise UserError(
@@ -114,3 +122,12 @@ def read_task_bank(path: Path, instructions: InstructionEmbeddings | None) -> De
     if "features" in tensors:
         bank.features = tensors["features"][:, None].half()
     return bank
+
+
+def _trajectories(tensors: dict[str, torch.Tensor]) -> RobotData | None:
+    """Returns the states and actions of a bank's demonstrations; None if it has none."""
+    if "states" not in tensors:
+        return None
+    ends = tensors["n_steps"].cumsum(dim=0).tolist()
+    spans = list(zip([0, *ends[:-1]], [end - 1 for end in ends], strict=True))
+    return RobotData(tensors["states"], tensors["actions"], spans)

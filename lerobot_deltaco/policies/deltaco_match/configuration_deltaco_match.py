@@ -23,6 +23,8 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     demonstration, an instruction, or both.
 
     Args:
+        acting: "network": the policy network acts. "replay": the demonstration's trajectory is replayed,
+            moved to where the policy picks and places. Training is the same, and a checkpoint acts either way.
         crop_size: Side of the square around an object that is compared, in the middle of the first camera's
             image and as a fraction of its side. Used only where objects do not stand out from other scenes,
             such as after a camera was moved during recording; otherwise, the size of objects is measured.
@@ -43,6 +45,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     """
 
     chunk_size: int | None = None
+    acting: str = "network"
     crop_size: float = 0.17
     n_demonstrations: int = 1
     num_mixture_components: int = 5
@@ -67,6 +70,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             ValueError: An option is invalid; the message says what is valid.
         """
         super().check()
+        self.check_choices(acting=("network", "replay"))
         self.check_ranges(
             crop_size=(0.01, 1),
             n_demonstrations=(1, 1000),

@@ -30,7 +30,8 @@ from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_tra
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.data.grasps import warn_of_missing
+from lerobot_deltaco.data.demonstrations import Demonstration, RobotData
+from lerobot_deltaco.data.grasps import Grasp, find_grasps, warn_of_missing
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
 from lerobot_deltaco.data.gripper_states import find_gripper_states
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
@@ -50,6 +51,7 @@ from lerobot_deltaco.policies.deltaco_match.place import (
     PlaceNetwork,
     peak_locations,
 )
+from lerobot_deltaco.policies.deltaco_match.replay import Reference, Trajectory, TrajectoryReplay
 from lerobot_deltaco.policies.deltaco_match.states import N_LOCATIONS, StateRegressor, TrainingLocations
 from lerobot_deltaco.policies.deltaco_match.words import (
     INSTRUCTION_DIM,
@@ -94,6 +96,7 @@ class RunningEpisode(NamedTuple):
     instructions: tuple[str, ...]
     localization: PickPlace
     network: PolicyNetwork
+    reference: Reference | None
 
 
 class DemonstrationBatch(NamedTuple):
@@ -116,6 +119,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     Attributes:
         robot_states: The robot's states at locations.
+        replay: Replays demonstrations, if `acting` is "replay".
         feature_matching: Finds what to pick, and how high.
         attention: Finds what a demonstration moved, and where it was put.
         place: Finds where to place it.
@@ -155,6 +159,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             n_locations=N_LOCATIONS,
         )
         self.robot_states = StateRegressor(config.state_dim)
+        self.replay = TrajectoryReplay(config.state_dim, config.action_feature.shape[0])
         self.feature_matching = FeatureMatching(config.known_words, config.crop_size)
         self.attention = DemonstrationAttention()
         self.place = PlaceNetwork(INSTRUCTION_DIM)
@@ -291,8 +296,15 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             if demonstrations is None:
                 demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
             localization = self.localize(batch, instructions, demonstrations)
-            self._start(RunningEpisode(instructions, localization, self._acting_network()))
+            reference = None
+            if self.config.acting == "replay":
+                reference = self._move_demonstrations(demonstrations, localization, batch)
+            self._start(RunningEpisode(instructions, localization, self._acting_network(), reference))
         episode: RunningEpisode = self._episode
+        if episode.reference is not None:
+            reference, action = self.replay.follow(episode.reference, self.state_limits(batch[OBS_STATE]))
+            self._episode = episode._replace(reference=reference)
+            return self._checked_action(batch, action[:, None])
         locations, heights = episode.localization.locations, episode.localization.heights
         inputs = self._fuse_inputs(batch, locations, heights)
         return self._sample_action(batch, *episode.network(self._images(batch), None, inputs, locations))
@@ -415,6 +427,56 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         offsets = self.robot_states(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
 
+    def _move_demonstrations(
+        self, demonstrations: DemonstrationsOfTasks, localization: PickPlace, batch: dict[str, Any]
+    ) -> Reference:
+        """Moves the trajectory of each sample's first demonstration to where the policy picks and places.
+
+        Raises:
+            ValueError: There is none, or the policy was trained before it could replay.
+        """
+        trajectories = [self._trajectory(shown[0] if shown else None) for shown in demonstrations]
+        demonstrated = torch.stack(
+            [each.states[[each.grasp.grasp, each.grasp.release]] for each in trajectories]
+        )  # (batch, 2, state)
+        moved = self.robot_states(localization.locations, localization.heights)
+        # Relative to what the regression makes of the demonstration, so that its errors cancel.
+        states = (demonstrated - self.robot_states.state_shift) / self.robot_states.state_scale
+        places = self.robot_states.to_image(states).clamp(-1, 1)
+        displacements = moved - self.robot_states(places, self.robot_states.heights(states[:, 0]))
+        return self.replay.start(trajectories, self.state_limits(batch[OBS_STATE]), displacements)
+
+    def _trajectory(self, demonstration: Demonstration | None) -> Trajectory:
+        """Returns the trajectory of a demonstration, normalized."""
+        command = self.config.gripper_command
+        assert command is not None
+        if demonstration is None or demonstration.states is None or demonstration.actions is None:
+            raise UserError(
+                "`acting=replay` needs a demonstration with the robot's states and actions. Give one, or act "
+                "with --policy.acting=network."
+            )
+        if not bool(self.replay.action_scale.any()):
+            raise UserError(
+                "The checkpoint was trained by a version that could not replay demonstrations. Train it "
+                "again, or act with --policy.acting=network."
+            )
+        states = demonstration.states.to(self.step.device).float()
+        actions = demonstration.actions.to(self.step.device).float()
+        span = (0, len(states) - 1)
+        (grasp,) = find_grasps(command.opening(actions), [span], command.usual_range, states)
+        if not isinstance(grasp, Grasp):
+            raise UserError(
+                f"`acting=replay` needs a demonstration with a grasp, but {grasp}. Give another one, or act "
+                "with --policy.acting=network."
+            )
+        # The command to close takes effect one step later.
+        grasp = grasp._replace(grasp=min(grasp.grasp + 1, grasp.release))
+        return Trajectory(
+            states * self.robot_states.state_scale + self.robot_states.state_shift,
+            actions * self.replay.action_scale + self.replay.action_shift,
+            grasp,
+        )
+
     # Before the first step
 
     def fit(self, data: TrainingData) -> None:
@@ -472,6 +534,22 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             shift,
             ~gripper_states.is_gripper,
         )
+        self._fit_replay(robot, ~gripper_states.is_gripper)
+
+    def _fit_replay(self, robot: RobotData, is_arm: Tensor) -> None:
+        """Fits how actions move the robot, in a second."""
+        assert self.config.gripper_index is not None
+        ends = torch.stack([torch.zeros(robot.actions.shape[1]), torch.ones(robot.actions.shape[1])])
+        shift, end = self._normalize(ends, ACTION)
+        self.replay.action_scale.copy_(end - shift)
+        self.replay.action_shift.copy_(shift)
+        states = robot.states * self.robot_states.state_scale + self.robot_states.state_shift
+        actions = robot.actions * self.replay.action_scale + self.replay.action_shift
+        self.replay.fit(
+            [(states[first : last + 1], actions[first : last + 1]) for first, last in robot.spans],
+            is_arm,
+            self.config.gripper_index,
+        )
 
     def fit_matching(self) -> None:
         """Fits feature matching to the first images of the training episodes, in minutes.
@@ -527,11 +605,16 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     def _normalize_states(self, states: Tensor) -> Tensor:
         """Normalizes robot states (n, state) as the network gets them, without clipping, on the CPU."""
-        step = NormalizerProcessorStep(
-            {OBS_STATE: self.config.robot_state_feature}, self.config.normalization_mapping, self._stats
-        )
-        normalized = step(create_transition(observation={OBS_STATE: states}))
-        return normalized[TransitionKey.OBSERVATION][OBS_STATE] * self.state_limits.scale.cpu()
+        return self._normalize(states, OBS_STATE) * self.state_limits.scale.cpu()
+
+    def _normalize(self, values: Tensor, feature: str) -> Tensor:
+        """Normalizes states or actions as the preprocessor does."""
+        is_state = feature == OBS_STATE
+        features = {feature: self.config.robot_state_feature if is_state else self.config.action_feature}
+        step = NormalizerProcessorStep(features, self.config.normalization_mapping, self._stats)
+        if is_state:
+            return step(create_transition(observation={feature: values}))[TransitionKey.OBSERVATION][feature]
+        return step(create_transition(action=values))[TransitionKey.ACTION]
 
     def _check_demonstrations(self, data: TrainingData) -> None:
         if data.grasps is not None:

@@ -1,0 +1,283 @@
+"""Replays demonstrated trajectories at other pick and place locations.
+
+The states of a demonstration are moved to the new scene: its approach ends at the new pick location, what it
+carries goes to the new place location. In between, the displacement changes smoothly along the path, so that
+the last part before the grasp and before the release has the demonstrated shape. Each action is the recorded
+one, corrected for what the moved states ask for in addition, by linear inverse dynamics: how actions follow
+from the robot's state, and from where it is some frames later. They are fitted to the training episodes, so
+that they serve displacements of the end effector and targets of joints alike.
+
+Nothing here looks at images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_deltaco.data.grasps import Grasp
+
+_MAX_LAG = 8  # frames after which the effect of an action is looked for
+_RIDGE = 1e-5  # of the inverse dynamics, as a fraction of the number of samples
+# Parts of the path before the grasp, and before the release, in which the displacement changes.
+_APPROACH_BLEND, _CARRY_BLEND = (0.0, 0.6), (0.15, 0.75)
+# Distance from the moved trajectory within which its next state is approached: this much of its local step,
+# but no less than this much of a usual one.
+_STEPS_APART, _LEAST_APART = 1.0, 0.05
+_LEAST_APPROACH = 0.1  # of the tolerance, in a frame that comes closer
+_MAX_WAIT = 2  # frames that a state is waited for without coming closer
+_LEAST_EXPLAINED = 0.1  # of the variance of an action, by the dimension of the state that it moves
+_VELOCITY = 0.8  # coefficient of determination above which a dimension is a velocity
+
+
+class Trajectory(NamedTuple):
+    """A demonstration's states and actions, and its grasp.
+
+    Attributes:
+        states: (frames, state), normalized.
+        actions: (frames, action), normalized.
+        grasp: Its grasp.
+    """
+
+    states: Tensor
+    actions: Tensor
+    grasp: Grasp
+
+
+class Reference(NamedTuple):
+    """Trajectories that are followed, moved to the scenes of a batch; the shorter ones are padded at the end.
+
+    Attributes:
+        states: Moved states, (batch, frames, state).
+        steps: How far the demonstration moves within `lag` frames from each, (batch, frames, state).
+        recorded: Demonstrated states, (batch, frames, state).
+        actions: Recorded actions, (batch, frames, action).
+        tolerances: Distance within which a state counts as reached, (batch, frames).
+        frame: Frame that the robot is at, (batch,) int64.
+        waited: Frames that it has waited there without coming closer to the next state, (batch,) int64.
+        distance: Distance from the next state, (batch,).
+    """
+
+    states: Tensor
+    steps: Tensor
+    recorded: Tensor
+    actions: Tensor
+    tolerances: Tensor
+    frame: Tensor
+    waited: Tensor
+    distance: Tensor
+
+
+class TrajectoryReplay(nn.Module):
+    """Follows trajectories at other locations.
+
+    Args:
+        state_dim: Size of the robot's state.
+        action_dim: Size of an action.
+
+    Attributes:
+        displacement_gain: Change of an action per displacement `lag` frames later, (state, action).
+        state_gain: Change of an action per change of the present state, (state, action).
+        lag: Frames after which the effect of an action is looked for, () int64.
+        is_arm: 1 for the dimensions of the state that are followed, else 0, (state,).
+        usual_step: Distance that is usual between successive states, as the size of an action, ().
+    """
+
+    displacement_gain: Tensor
+    state_gain: Tensor
+    lag: Tensor
+    is_arm: Tensor
+    usual_step: Tensor
+    action_scale: Tensor
+    action_shift: Tensor
+
+    def __init__(self, state_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.register_buffer("displacement_gain", torch.zeros(state_dim, action_dim))
+        self.register_buffer("state_gain", torch.zeros(state_dim, action_dim))
+        self.register_buffer("lag", torch.ones((), dtype=torch.int64))
+        self.register_buffer("is_arm", torch.ones(state_dim))
+        self.register_buffer("usual_step", torch.ones(()))
+        # An action as it is predicted is action_scale * action + action_shift.
+        self.register_buffer("action_scale", torch.zeros(action_dim))
+        self.register_buffer("action_shift", torch.zeros(action_dim))
+        self.register_load_state_dict_pre_hook(self._add_state)
+
+    @staticmethod
+    def _add_state(module: TrajectoryReplay, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
+        """Adds what checkpoints of earlier versions do not have: they cannot replay."""
+        for name, value in module.state_dict().items():
+            state_dict.setdefault(prefix + name, value)
+
+    def fit(self, trajectories: Sequence[tuple[Tensor, Tensor]], is_arm: Tensor, gripper_index: int) -> None:
+        """Fits the inverse dynamics.
+
+        Args:
+            trajectories: States (frames, state) and actions (frames, action) of episodes, normalized.
+            is_arm: Dimensions of the state other than the gripper's, (state,) bool.
+            gripper_index: Dimension of the action that is the gripper.
+        """
+        trajectories = [each for each in trajectories if len(each[0]) > _MAX_LAG]
+        states = torch.cat([s[:-_MAX_LAG] for s, _ in trajectories]).double()
+        later = [
+            torch.cat([s[lag : len(s) - _MAX_LAG + lag] for s, _ in trajectories]).double()
+            for lag in range(1, _MAX_LAG + 1)
+        ]
+        actions = torch.cat([a[:-_MAX_LAG] for _, a in trajectories]).double()
+        actions[:, gripper_index] = 0
+        candidates = (is_arm & ~_velocities([s for s, _ in trajectories])).nonzero().flatten().tolist()
+        least = float("inf")
+        for lag, each in enumerate(later, start=1):
+            moved = _moved_dimensions(states, each, actions, candidates)
+            error, weights = _inverse_dynamics(states[:, moved], each[:, moved], actions)
+            if moved and error < least:
+                least, n = error, len(moved)
+                self.lag.fill_(lag)
+                for buffer in (self.is_arm, self.displacement_gain, self.state_gain):
+                    buffer.zero_()
+                self.is_arm[moved] = 1
+                self.displacement_gain[moved] = weights[:n].float()
+                self.state_gain[moved] = weights[n : 2 * n].float()
+        steps = torch.cat([self._distance(s[1:] - s[:-1]) for s, _ in trajectories])
+        self.usual_step.copy_(steps.quantile(0.9))
+
+    def _distance(self, displacements: Tensor) -> Tensor:
+        """Returns the size of the actions that make displacements of states, (...)."""
+        return (displacements @ self.displacement_gain).norm(dim=-1)
+
+    def start(
+        self,
+        trajectories: Sequence[Trajectory],
+        state: Tensor,
+        displacements: Tensor,
+    ) -> Reference:
+        """Moves trajectories to new scenes.
+
+        Args:
+            trajectories: One for each sample.
+            state: The robot's state, (batch, state), normalized.
+            displacements: Where the states at the grasp and at the release are, minus where they were in the
+                demonstration, (batch, 2, state).
+        """
+        n_frames = max(len(each.states) for each in trajectories)
+        recorded = torch.stack([_padded(each.states, n_frames) for each in trajectories])
+        actions = torch.stack([_padded(each.actions, n_frames) for each in trajectories])
+        start = (state - recorded[:, 0]) * self.is_arm
+        moved = []
+        for n, each in enumerate(trajectories):
+            shares = _shares(each.states * self.is_arm, each.grasp)  # (frames, 3)
+            targets = torch.cat([start[n : n + 1], displacements[n]]) * self.is_arm
+            moved.append(_padded(each.states + shares @ targets, n_frames))
+        states = torch.stack(moved)
+        lag = int(self.lag)
+        later = torch.cat([recorded[:, lag:], recorded[:, -1:].expand(-1, lag, -1)], dim=1)[:, :n_frames]
+        step = self._distance(states[:, 1:] - states[:, :-1])
+        step = torch.cat([step[:, :1], step], dim=1)
+        zeros = torch.zeros(len(states), dtype=torch.int64, device=states.device)
+        return Reference(
+            states,
+            later - recorded,
+            recorded,
+            actions,
+            (_STEPS_APART * step).clamp_min(_LEAST_APART * float(self.usual_step)),
+            zeros,
+            zeros,
+            torch.full(zeros.shape, torch.inf, device=states.device),
+        )
+
+    def follow(self, reference: Reference, state: Tensor) -> tuple[Reference, Tensor]:
+        """Returns the reference after a step, and the action, (batch, action), normalized.
+
+        Args:
+            reference: What is followed.
+            state: The robot's state, (batch, state), normalized.
+        """
+        rows = torch.arange(len(state), device=state.device)
+        lag, last = int(self.lag), reference.states.shape[1] - 1
+        wanted = (reference.frame + 1).clamp(max=last)
+        distance = self._distance(state - reference.states[rows, wanted])
+        tolerance = reference.tolerances[rows, wanted]
+        beyond = self._distance(state - reference.states[rows, (wanted + 1).clamp(max=last)])
+        comes_closer = distance < reference.distance - _LEAST_APPROACH * tolerance
+        waited = torch.where(comes_closer, 0, reference.waited + 1)
+        goes_on = (distance <= tolerance) | (beyond < distance) | (waited > _MAX_WAIT)
+        frame = torch.where(goes_on, wanted, reference.frame)
+        waited = torch.where(goes_on, 0, waited)
+        distance = torch.where(goes_on, torch.inf, distance)
+        target = reference.states[rows, (frame + lag).clamp(max=last)]
+        additional = target - state - reference.steps[rows, frame]
+        aside = state - reference.recorded[rows, frame]
+        action = (
+            reference.actions[rows, frame] + additional @ self.displacement_gain + aside @ self.state_gain
+        )
+        # No action is farther out than those of the training episodes.
+        action = action.clamp(-1, 1)
+        return reference._replace(frame=frame, waited=waited, distance=distance), action
+
+
+def _inverse_dynamics(states: Tensor, later: Tensor, actions: Tensor) -> tuple[float, Tensor]:
+    """Returns the error and the weights of a regression of actions on displacements and states."""
+    inputs = torch.cat([later - states, states, torch.ones_like(states[:, :1])], dim=1)
+    gram = inputs.T @ inputs
+    gram.diagonal().add_(_RIDGE * len(inputs))
+    weights = torch.linalg.solve(gram, inputs.T @ actions)
+    return float((inputs @ weights - actions).square().mean()), weights
+
+
+def _moved_dimensions(states: Tensor, later: Tensor, actions: Tensor, candidates: Sequence[int]) -> list[int]:
+    """Returns the dimensions of the state that actions move: of each, the one that explains it best.
+
+    All others, such as joints beside an end effector's position, would contradict these once they are moved.
+    """
+    moved = set()
+    variance = actions.var(dim=0)
+    for n in (variance > 1e-8).nonzero().flatten().tolist():
+        action = actions[:, [n]]
+        errors = [_inverse_dynamics(states[:, [dim]], later[:, [dim]], action)[0] for dim in candidates]
+        best = min(range(len(candidates)), key=errors.__getitem__)
+        if errors[best] < (1 - _LEAST_EXPLAINED) * variance[n]:
+            moved.add(candidates[best])
+    return sorted(moved)
+
+
+def _velocities(episodes: Sequence[Tensor]) -> Tensor:
+    """Returns which dimensions of states are velocities, (state,) bool: linear in changes of the others."""
+    values = torch.cat([states[1:-1] for states in episodes]).double()
+    changes = torch.cat([states[2:] - states[:-2] for states in episodes]).double()
+    values = values - values.mean(dim=0)
+    gram = changes.T @ changes
+    gram.diagonal().add_(1e-6 * len(changes))
+    is_velocity = torch.zeros(values.shape[1], dtype=torch.bool, device=values.device)
+    for dim in range(values.shape[1]):
+        others = [other for other in range(values.shape[1]) if other != dim]
+        weights = torch.linalg.solve(gram[others][:, others], changes[:, others].T @ values[:, dim])
+        rest = values[:, dim] - changes[:, others] @ weights
+        is_velocity[dim] = rest.square().mean() < (1 - _VELOCITY) * values[:, dim].square().mean()
+    return is_velocity
+
+
+def _padded(values: Tensor, n_frames: int) -> Tensor:
+    """Repeats the last row of values (frames, ...)."""
+    return torch.cat([values, values[-1:].expand(n_frames - len(values), *values.shape[1:])])
+
+
+def _shares(states: Tensor, grasp: Grasp) -> Tensor:
+    """Returns how much of the displacements of start, grasp and release each state has, (frames, 3)."""
+    step = torch.cat([states.new_zeros(1), (states[1:] - states[:-1]).norm(dim=1)])
+    travelled = step.cumsum(dim=0)
+    picked = _ramp(travelled, travelled[0], travelled[grasp.closing], _APPROACH_BLEND)
+    placed = _ramp(travelled, travelled[grasp.grasp], travelled[grasp.release], _CARRY_BLEND)
+    frames = torch.arange(len(states), device=states.device)
+    picked = torch.where(frames >= grasp.closing, 1.0, picked)
+    placed = torch.where(frames <= grasp.grasp, 0.0, torch.where(frames >= grasp.release, 1.0, placed))
+    return torch.stack([1 - picked, picked - placed, placed], dim=1)
+
+
+def _ramp(travelled: Tensor, first: Tensor, last: Tensor, blend: tuple[float, float]) -> Tensor:
+    """Returns a smooth step from 0 to 1 along a part of a path, (frames,)."""
+    along = (travelled - first) / (last - first).clamp_min(1e-6)
+    x = ((along - blend[0]) / (blend[1] - blend[0])).clamp(0, 1)
+    return x * x * (3 - 2 * x)
