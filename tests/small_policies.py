@@ -3,7 +3,6 @@
 import functools
 import hashlib
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,11 +24,12 @@ from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.policies.base import language
 from lerobot_deltaco.policies.deltaco_match import fit, localization
-from lerobot_deltaco.policies.deltaco_match import settings as matching_settings
-from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.crops import FEATURE_DIM, cut_crops
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import (
+    DeltacoMatchConfig,
+    MatchingSettings,
+)
+from lerobot_deltaco.policies.deltaco_match.matching import FEATURE_DIM, cut_crops
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
-from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.words import vocabulary_of
 from lerobot_deltaco.training.train import train
 
@@ -87,15 +87,16 @@ def use_short_fit(monkeypatch, steps=2, **settings):
         crops = cut_crops(images, locations, sizes, resolution=8).flatten(2)
         return torch.nn.functional.pad(crops, (0, FEATURE_DIM - crops.shape[2]))
 
-    short = MatchingSettings(
-        proposal_steps=2 * steps,
-        grasp_radius=9.0,  # any proposal will do
-        min_matching_steps=steps,
-        max_matching_steps=steps,
-    )
+    short = {
+        "proposal_steps": 2 * steps,
+        "grasp_radius": 9.0,  # any proposal will do
+        "min_matching_steps": steps,
+        "max_matching_steps": steps,
+        **settings,
+    }
     for module in (fit, localization):
         monkeypatch.setattr(module, "crop_features", colors)
-    monkeypatch.setattr(matching_settings, "DEFAULT_SETTINGS", replace(short, **settings))
+    monkeypatch.setattr(localization, "MatchingSettings", functools.partial(MatchingSettings, **short))
 
 
 # Datasets
