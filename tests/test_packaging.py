@@ -39,7 +39,7 @@ def files_of(folder):
 
 def test_imports_go_one_way():
     above = {f"lerobot_deltaco.{name}" for name in ("collection", "training", "evaluation", "reports")}
-    above |= {"lerobot_deltaco.experiments", "lerobot_deltaco.pages", "lerobot_deltaco.lerobot_env"}
+    above |= {"lerobot_deltaco.experiments", "lerobot_deltaco.pages"}
     plain = [ROOT / "lerobot_deltaco" / "policies" / "base" / name for name in ("networks.py", "losses.py")]
     for files, forbidden in (
         (GYM_FILES, {"torch", "lerobot", "lerobot_deltaco", "lerobot_policy_deltaco"}),
@@ -86,10 +86,12 @@ def test_lerobot_finds_the_distribution_and_its_types():
 
 
 def test_a_broken_import_ends_in_one_clear_sentence(monkeypatch):
-    monkeypatch.setitem(sys.modules, "lerobot_deltaco.lerobot_env", None)
+    monkeypatch.setitem(sys.modules, "lerobot_deltaco.evaluation.lerobot_env", None)
     at_exit = []
     monkeypatch.setattr("atexit.register", at_exit.append)
-    message = "could not be imported, so LeRobot does not know its types .*lerobot_deltaco.lerobot_env"
+    message = (
+        "could not be imported, so LeRobot does not know its types .*lerobot_deltaco.evaluation.lerobot_env"
+    )
     with pytest.raises(ImportError, match=message):
         runpy.run_path(str(ROOT / "lerobot_policy_deltaco.py"))
     assert len(at_exit) == 1

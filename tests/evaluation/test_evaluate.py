@@ -31,8 +31,8 @@ from lerobot_deltaco.evaluation.checkpoints import find_checkpoints, load_policy
 from lerobot_deltaco.evaluation.command import EvaluateArguments, evaluate_checkpoints
 from lerobot_deltaco.evaluation.episodes import draw_episodes
 from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
+from lerobot_deltaco.evaluation.lerobot_env import check_policy_fits
 from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records, scene_columns
-from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
 from lerobot_deltaco.policies.deltaco.configuration_deltaco import DeltacoConfig
 

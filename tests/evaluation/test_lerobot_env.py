@@ -13,7 +13,7 @@ from lerobot.scripts.lerobot_eval import eval_policy_all
 
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import TASKS, select_tasks
-from lerobot_deltaco.lerobot_env import DeltacoEnv
+from lerobot_deltaco.evaluation.lerobot_env import DeltacoEnv
 
 # One of each kind: a name, a color and a shape.
 ONE_OF_EACH_KIND = "4,32,90"
@@ -46,7 +46,9 @@ def test_registration_loads_neither_simulator_nor_policies():
     modules = (
         "'gym_deltaco.sim', 'gym_deltaco.env', 'pybullet', 'lerobot_deltaco.data', 'lerobot_deltaco.policies'"
     )
-    program = f"import sys, lerobot_deltaco.lerobot_env; assert not {{{modules}}} & set(sys.modules)"
+    program = (
+        f"import sys, lerobot_deltaco.evaluation.lerobot_env; assert not {{{modules}}} & set(sys.modules)"
+    )
     result = run_python(program)
     assert result.returncode == 0, result.stderr
 

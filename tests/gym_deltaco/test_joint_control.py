@@ -13,7 +13,7 @@ from gym_deltaco.expert import Stage, expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from lerobot_deltaco.collection.collect import CollectionPlan, collect
 from lerobot_deltaco.collection.dataset_card import dataset_card
-from lerobot_deltaco.lerobot_env import DeltacoEnv
+from lerobot_deltaco.evaluation.lerobot_env import DeltacoEnv
 
 SCENE = SceneConfig(control="joints", image_size=16)
 REST = [1.57, -0.6, -0.6, 0.0, -1.57, 0.0]
