@@ -121,7 +121,9 @@ class Background(nn.Module):
         allowed = stands_out.float()[:, None]
         region = near.float()[:, None] * allowed
         for _ in range(_GROWING_STEPS):
-            region = F.max_pool2d(region, 3, 1, 1) * allowed
+            smaller, region = region, F.max_pool2d(region, 3, 1, 1) * allowed
+            if torch.equal(region, smaller):
+                break
         diameter = ((region.sum(dim=(1, 2, 3)) * 4 / torch.pi).sqrt() - _EDGE) / _SIDE
         low, high = _SIZE_LIMITS
         seen = (diameter > low) & (diameter < high)
