@@ -206,8 +206,8 @@ def state_at(location):
     return np.array([3 + 0.4 * x + 0.1 * y, -1 - 0.1 * x + 0.5 * y, 7.0], np.float32)
 
 
-def write_table(root, episodes, n_joints=3):
-    """Writes episodes of `random_moves`: grasped in frame 3, released in frame 5."""
+def write_table(root, episodes, n_joints=3, grippers=("gripper",)):
+    """Writes episodes of `random_moves`: grasped in frame 3, released in frame 5; the last gripper moves."""
     home = np.zeros(2)
 
     def frame(step, task, start, other, end):
@@ -215,11 +215,12 @@ def write_table(root, episodes, n_joints=3):
         return {
             "observation.image": draw_table(task, start if step < 4 else end, other),
             "observation.state": np.resize(state_at(location), n_joints),
-            "action": np.array([*(location - home), GRIPPER[step]], np.float32),
+            "action": np.array([*(location - home), *resting, GRIPPER[step]], np.float32),
         }
 
+    resting = np.ones(len(grippers) - 1)
     frames = [(move[0], [frame(step, *move) for step in range(TABLE_LENGTH)]) for move in episodes]
-    names = {"observation.state": list("abcde"[:n_joints]), "action": ["a", "b", "gripper"]}
+    names = {"observation.state": list("abcde"[:n_joints]), "action": ["a", "b", *grippers]}
     return write_episodes(root, "test/table", frames, **names)
 
 

@@ -299,8 +299,6 @@ def test_different_evaluations_are_recorded_side_by_side(run, benchmark, tmp_pat
         [],
         ["--scene.adversarial-probability", 0],
         ["--demo-repo-id", "test/others", "--demo-root", benchmark],
-        ["--device", "cpu"],
-        ["--rename-map", "{}"],
         ["--experiment", "another name"],
     ]
     for more in evaluations:
