@@ -166,9 +166,7 @@ def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:
     n_wanted = max(settings.min_held_out, len(tasks) // settings.held_out_every)
     if len(tasks) < settings.held_out_every * settings.min_held_out * 0.75:
         return held_out
-    order = torch.arange(len(tasks)).roll(-settings.held_out_every + 1).tolist()
-    order = sorted(order, key=lambda row: (row % settings.held_out_every, row))
-    for row in order:
+    for row in sorted(range(len(tasks)), key=lambda row: (row % settings.held_out_every, row)):
         if int(held_out.sum()) < n_wanted and left[tasks[row]] > 2:
             held_out[row] = True
             left[tasks[row]] -= 1
@@ -470,10 +468,7 @@ class HeldOut:
             matching.load_state_dict(self._state)
         scores = self._scores()
         is_right = (scores.argmax(dim=2) == self._target).float().mean(dim=1)  # by each, and by both
-        n_seen, n_all = (
-            len(self._target) / _LOOKS,
-            int(matching.held_out[1]),
-        )  # in others, no proposal is near
+        n_seen, n_all = len(self._target) / _LOOKS, int(matching.held_out[1])  # a proposal is near; all
         matching.held_out[0] = round(float(is_right[2]) * n_seen)
         n_wrong = n_all - float(is_right[0] + is_right[2]) / 2 * n_seen
         error_rate = torch.tensor((n_wrong + 1) / (n_all + 2))  # by Laplace's rule of succession
