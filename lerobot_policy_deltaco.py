@@ -5,7 +5,7 @@ import sys
 
 try:
     # These register `--env.type=deltaco`, and both policies with the steps of their processors.
-    import lerobot_deltaco.lerobot_env
+    import lerobot_deltaco.evaluation.lerobot_env
     import lerobot_deltaco.policies.deltaco.configuration_deltaco
     import lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match  # noqa: F401
 except Exception as error:

@@ -4,6 +4,7 @@ import functools
 import os
 
 import pytest
+from filelock import FileLock
 
 # Before anything imports huggingface_hub, which reads it once.
 for name in ("HF_HUB_OFFLINE", "HF_DATASETS_OFFLINE", "TRANSFORMERS_OFFLINE"):
@@ -13,8 +14,8 @@ os.environ.setdefault("WANDB_MODE", "disabled")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-# `small_policies` is imported where it is used: it imports LeRobot, which takes 10 s. A process writes each
-# dataset once, so a test that changes files changes a copy.
+# `small_policies` is imported where it is used: it imports LeRobot, which takes 10 s. Each dataset is written
+# once, so a test that changes files changes a copy.
 
 
 @pytest.fixture
@@ -57,12 +58,24 @@ def dataset(tmp_path_factory):
     return hold_in_memory(write_dataset(tmp_path_factory.mktemp("data") / "foreign"))
 
 
+def written_once(tmp_path_factory, name, write):
+    """Returns a folder that one of the test processes writes, and the others wait for."""
+    folder = tmp_path_factory.getbasetemp()
+    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+    with FileLock(folder / f"{name}.lock"):
+        if not (folder / name).exists():
+            write(folder / f"{name}.part")
+            (folder / f"{name}.part").rename(folder / name)
+    return folder / name
+
+
 @pytest.fixture(scope="session")
 def table(tmp_path_factory):
     """A dataset of 48 episodes of `random_moves`."""
-    from small_policies import hold_in_memory, random_moves, write_table
+    from small_policies import LeRobotDataset, hold_in_memory, random_moves, write_table
 
-    return hold_in_memory(write_table(tmp_path_factory.mktemp("data") / "table", random_moves(48)))
+    root = written_once(tmp_path_factory, "table", lambda root: write_table(root, random_moves(48)))
+    return hold_in_memory(LeRobotDataset("test/table", root=root))
 
 
 @pytest.fixture(scope="session")
@@ -70,7 +83,7 @@ def benchmark(tmp_path_factory):
     """The folder of a small dataset of the benchmark."""
     from small_policies import collect_benchmark
 
-    return collect_benchmark(tmp_path_factory.mktemp("data") / "small")
+    return written_once(tmp_path_factory, "small", collect_benchmark)
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import functools
 import hashlib
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,12 +23,13 @@ from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.policies.base import language
-from lerobot_deltaco.policies.deltaco_match import fit, localization
-from lerobot_deltaco.policies.deltaco_match import settings as matching_settings
-from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.crops import FEATURE_DIM, cut_crops
+from lerobot_deltaco.policies.deltaco_match import fit, localization, modeling_deltaco_match
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import (
+    DeltacoMatchConfig,
+    MatchingSettings,
+)
+from lerobot_deltaco.policies.deltaco_match.matching import FEATURE_DIM, cut_crops
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
-from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.words import vocabulary_of
 from lerobot_deltaco.training.train import train
 
@@ -80,6 +80,24 @@ def use_fake_encoder(monkeypatch):
     torch.manual_seed(0)
 
 
+_fits = {}
+
+
+def fit_once(matching, *data, **options):
+    """Fits feature matching, or takes the result of an earlier fit to the same data."""
+    digest = hashlib.sha256()
+    arguments = [matching.vocabulary, matching.crop_size, matching.settings, options]
+    for part in data:
+        if isinstance(part, torch.Tensor):
+            digest.update(part.cpu().contiguous().numpy())
+        arguments.append(part.shape if isinstance(part, torch.Tensor) else part)
+    key = digest.digest(), repr(arguments)
+    if key not in _fits:
+        fit.fit_feature_matching(matching, *data, **options)
+        _fits[key] = {name: value.cpu().clone() for name, value in matching.state_dict().items()}
+    matching.load_state_dict(_fits[key])
+
+
 def use_short_fit(monkeypatch, steps=2, **settings):
     """Fits feature matching in a few steps, to colors instead of a pretrained encoder's features."""
 
@@ -87,15 +105,17 @@ def use_short_fit(monkeypatch, steps=2, **settings):
         crops = cut_crops(images, locations, sizes, resolution=8).flatten(2)
         return torch.nn.functional.pad(crops, (0, FEATURE_DIM - crops.shape[2]))
 
-    short = MatchingSettings(
-        proposal_steps=2 * steps,
-        grasp_radius=9.0,  # any proposal will do
-        min_matching_steps=steps,
-        max_matching_steps=steps,
-    )
+    short = {
+        "proposal_steps": 2 * steps,
+        "grasp_radius": 9.0,  # any proposal will do
+        "min_matching_steps": steps,
+        "max_matching_steps": steps,
+        **settings,
+    }
+    monkeypatch.setattr(modeling_deltaco_match, "fit_feature_matching", fit_once)
     for module in (fit, localization):
         monkeypatch.setattr(module, "crop_features", colors)
-    monkeypatch.setattr(matching_settings, "DEFAULT_SETTINGS", replace(short, **settings))
+    monkeypatch.setattr(localization, "MatchingSettings", functools.partial(MatchingSettings, **short))
 
 
 # Datasets
@@ -186,8 +206,8 @@ def state_at(location):
     return np.array([3 + 0.4 * x + 0.1 * y, -1 - 0.1 * x + 0.5 * y, 7.0], np.float32)
 
 
-def write_table(root, episodes, n_joints=3):
-    """Writes episodes of `random_moves`: grasped in frame 3, released in frame 5."""
+def write_table(root, episodes, n_joints=3, grippers=("gripper",)):
+    """Writes episodes of `random_moves`: grasped in frame 3, released in frame 5; the last gripper moves."""
     home = np.zeros(2)
 
     def frame(step, task, start, other, end):
@@ -195,11 +215,12 @@ def write_table(root, episodes, n_joints=3):
         return {
             "observation.image": draw_table(task, start if step < 4 else end, other),
             "observation.state": np.resize(state_at(location), n_joints),
-            "action": np.array([*(location - home), GRIPPER[step]], np.float32),
+            "action": np.array([*(location - home), *resting, GRIPPER[step]], np.float32),
         }
 
+    resting = np.ones(len(grippers) - 1)
     frames = [(move[0], [frame(step, *move) for step in range(TABLE_LENGTH)]) for move in episodes]
-    names = {"observation.state": list("abcde"[:n_joints]), "action": ["a", "b", "gripper"]}
+    names = {"observation.state": list("abcde"[:n_joints]), "action": ["a", "b", *grippers]}
     return write_episodes(root, "test/table", frames, **names)
 
 

@@ -39,7 +39,7 @@ def files_of(folder):
 
 def test_imports_go_one_way():
     above = {f"lerobot_deltaco.{name}" for name in ("collection", "training", "evaluation", "reports")}
-    above |= {"lerobot_deltaco.experiments", "lerobot_deltaco.pages", "lerobot_deltaco.lerobot_env"}
+    above |= {"lerobot_deltaco.experiments", "lerobot_deltaco.pages"}
     plain = [ROOT / "lerobot_deltaco" / "policies" / "base" / name for name in ("networks.py", "losses.py")]
     for files, forbidden in (
         (GYM_FILES, {"torch", "lerobot", "lerobot_deltaco", "lerobot_policy_deltaco"}),
@@ -61,35 +61,48 @@ def test_imports_go_one_way():
                 assert parents.isdisjoint(forbidden), f"{path} imports {name}"
 
 
-def test_a_policy_loads_neither_the_benchmark_nor_encoders_of_language():
-    result = run_python(
-        "import sys, lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match; print(*sys.modules)"
-    )
+IMPORTS = """
+import os, sys
+import lerobot.envs, lerobot.policies  # 10 s, once
+from lerobot.configs import PreTrainedConfig
+for module in sys.argv[1:]:
+    if os.fork() == 0:
+        __import__(module)
+        print(*sys.modules, *PreTrainedConfig.get_known_choices(), flush=True)
+        os._exit(0)
+    assert os.wait()[1] == 0, module
+"""
+
+
+def test_nothing_loads_more_than_it_needs():
+    # In this process, other tests may have imported anything.
+    policy = "lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match"
+    result = run_python(IMPORTS, policy, "lerobot_deltaco.evaluation.lerobot_env", "lerobot_policy_deltaco")
     assert result.returncode == 0, result.stderr
-    assert not {"gym_deltaco", "pybullet", "sentence_transformers", "onnxruntime"} & set(
-        result.stdout.split()
-    )
+    with_policy, with_env, with_all = (set(line.split()) for line in result.stdout.splitlines())
+    slow = {"pybullet", "sentence_transformers", "onnxruntime"}
+    assert not {"gym_deltaco", *slow} & with_policy
+    # Every command of LeRobot imports the environment's configuration.
+    loaded_later = {"gym_deltaco.sim", "gym_deltaco.env", "lerobot_deltaco.data", "lerobot_deltaco.policies"}
+    assert not {*loaded_later, *slow} & with_env
+    assert {"deltaco", "deltaco_match"} <= with_all
 
 
 def test_lerobot_finds_the_distribution_and_its_types():
     # With hyphens in its name, it would silently not be found.
     assert PROJECT["name"] == "lerobot_policy_deltaco"
     register_third_party_plugins()
-    # In this process, another test may have imported them.
-    result = run_python(
-        "import lerobot_policy_deltaco; from lerobot.configs import PreTrainedConfig; "
-        "print(*PreTrainedConfig.get_known_choices())"
-    )
-    assert {"deltaco", "deltaco_match"} <= set(result.stdout.split()), result.stderr
     assert "deltaco" in EnvConfig.get_known_choices()
     assert get_policy_class("deltaco_match").name == "deltaco_match"
 
 
 def test_a_broken_import_ends_in_one_clear_sentence(monkeypatch):
-    monkeypatch.setitem(sys.modules, "lerobot_deltaco.lerobot_env", None)
+    monkeypatch.setitem(sys.modules, "lerobot_deltaco.evaluation.lerobot_env", None)
     at_exit = []
     monkeypatch.setattr("atexit.register", at_exit.append)
-    message = "could not be imported, so LeRobot does not know its types .*lerobot_deltaco.lerobot_env"
+    message = (
+        "could not be imported, so LeRobot does not know its types .*lerobot_deltaco.evaluation.lerobot_env"
+    )
     with pytest.raises(ImportError, match=message):
         runpy.run_path(str(ROOT / "lerobot_policy_deltaco.py"))
     assert len(at_exit) == 1

@@ -28,8 +28,8 @@ from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.episodes import EpisodeSpec, draw_episodes
 from lerobot_deltaco.evaluation.expert_demonstrations import ExpertBank
+from lerobot_deltaco.evaluation.lerobot_env import check_policy_fits
 from lerobot_deltaco.evaluation.records import EvaluationPlan
-from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
 from lerobot_deltaco.processes import end_with_parent

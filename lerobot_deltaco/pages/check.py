@@ -38,10 +38,10 @@ from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
-from lerobot_deltaco.policies.deltaco_match.background import N_OBJECTS
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.policies.deltaco_match.proposals import N_OBJECTS
 from lerobot_deltaco.training.train import image_size_in_memory
 
 _PICTURE_HEIGHT = 180  # px

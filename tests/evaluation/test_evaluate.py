@@ -31,8 +31,8 @@ from lerobot_deltaco.evaluation.checkpoints import find_checkpoints, load_policy
 from lerobot_deltaco.evaluation.command import EvaluateArguments, evaluate_checkpoints
 from lerobot_deltaco.evaluation.episodes import draw_episodes
 from lerobot_deltaco.evaluation.evaluate import Evaluation, evaluate
+from lerobot_deltaco.evaluation.lerobot_env import check_policy_fits
 from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records, scene_columns
-from lerobot_deltaco.lerobot_env import check_policy_fits
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
 from lerobot_deltaco.policies.deltaco.configuration_deltaco import DeltacoConfig
 
@@ -299,8 +299,6 @@ def test_different_evaluations_are_recorded_side_by_side(run, benchmark, tmp_pat
         [],
         ["--scene.adversarial-probability", 0],
         ["--demo-repo-id", "test/others", "--demo-root", benchmark],
-        ["--device", "cpu"],
-        ["--rename-map", "{}"],
         ["--experiment", "another name"],
     ]
     for more in evaluations:

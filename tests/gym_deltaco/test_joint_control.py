@@ -1,9 +1,11 @@
 """Joint control: the interface, times and speeds of a robot, in the scenes of the benchmark."""
 
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.envs import env_to_policy_features
 from lerobot.envs.utils import preprocess_observation
@@ -13,7 +15,9 @@ from gym_deltaco.expert import Stage, expert_episode
 from gym_deltaco.scene_config import SceneConfig
 from lerobot_deltaco.collection.collect import CollectionPlan, collect
 from lerobot_deltaco.collection.dataset_card import dataset_card
-from lerobot_deltaco.lerobot_env import DeltacoEnv
+from lerobot_deltaco.evaluation.episodes import EpisodeSpec
+from lerobot_deltaco.evaluation.evaluate import run_episodes
+from lerobot_deltaco.evaluation.lerobot_env import DeltacoEnv
 
 SCENE = SceneConfig(control="joints", image_size=16)
 REST = [1.57, -0.6, -0.6, 0.0, -1.57, 0.0]
@@ -82,6 +86,34 @@ def test_expert_succeeds_at_its_own_speed_in_every_episode(episodes):
         # The object keeps the gripper open.
         lifted = [n for n, step in enumerate(steps) if step.stage is Stage.CARRY]
         assert (states[lifted, 6] > actions[lifted, 6] + 0.05).all()
+
+
+class Follower:
+    """A policy that carries out the expert's action for the nearest of the next states."""
+
+    def __init__(self, steps):
+        self.states = torch.tensor(np.stack([step.observation["agent_pos"] for step in steps]))
+        self.actions = torch.tensor(np.stack([step.action for step in steps]))
+
+    def reset(self):
+        self.row = 0
+
+    def select_action(self, batch):
+        assert batch["observation.images.wrist"].shape == (1, 3, 16, 16)
+        following = self.states[self.row : self.row + 3]
+        self.row += int((following - batch["observation.state"]).norm(dim=1).argmin())
+        return self.actions[[self.row]]
+
+
+def test_a_policy_succeeds_by_joint_positions(episodes, env):
+    """Observations lead to the actions of the expert, by the loop of the evaluation."""
+    for task_id, steps in list(episodes.items())[:2]:
+        spec = EpisodeSpec(task_id, 0, task_id, "", -1)
+        loaded = SimpleNamespace(policy=Follower(steps), preprocessor=dict, postprocessor=torch.clone)
+        (info,) = run_episodes(loaded, [env], [spec], [[]])
+        assert info["is_success"] == steps[-1].info["is_success"]
+        assert loaded.policy.row == len(steps) - 1
+    assert info["is_success"]
 
 
 def test_expert_repeats_to_the_last_bit(episodes, env):

@@ -13,8 +13,8 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import CONTAINER_WORDS, TASK_SETS, get_task
 from lerobot_deltaco.collection.collect import CollectionPlan, collect
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
+from lerobot_deltaco.evaluation.lerobot_env import DeltacoEnv
 from lerobot_deltaco.evaluation.records import EvaluationPlan
-from lerobot_deltaco.lerobot_env import DeltacoEnv
 
 TASKS = TASK_SETS["out_of_distribution"]
 

@@ -1,7 +1,10 @@
 """Tests of which actions of predicted chunks are carried out."""
 
+import math
+
 import pytest
 import torch
+from small_policies import TASKS, batch_of
 
 from lerobot_deltaco.policies.base.action_queues import ActionQueues
 
@@ -64,3 +67,20 @@ def test_clear_forgets_the_actions_and_the_gripper():
     queues.clear()
     assert queues.need_chunks
     assert carry_out(queues, [STAYS_OPEN], 3)[0] == [[0, 1, 2]]
+
+
+@pytest.mark.usefixtures("fake_language")
+def test_temporal_ensembling_averages_all_predictions_for_a_step(make, dataset):
+    """As in ACT: the weights of predictions fall by exp(-coefficient), from the oldest to the newest."""
+    options = {"chunk_size": 3, "n_action_steps": 1, "temporal_ensemble_coeff": 0.5}
+    policy, before, _ = make(method="language_only", **options)
+    policy.eval()
+    batches = [before({**batch_of(dataset, [frame]), "task": TASKS[:1]}) for frame in (0, 7)]
+    first, second = (policy.predict_action_chunk(batch) for batch in batches)
+    for _ in range(2):  # after a reset, as at first
+        policy.reset()
+        actions = [policy.select_action(batch) for batch in batches]
+        torch.testing.assert_close(actions[0], first[:, 0])
+        weight = math.exp(-0.5)
+        torch.testing.assert_close(actions[1], (first[:, 1] + weight * second[:, 0]) / (1 + weight))
+    assert not torch.allclose(actions[1], second[:, 0])

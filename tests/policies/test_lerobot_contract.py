@@ -13,7 +13,7 @@ from lerobot.policies import get_policy_class, make_policy, make_policy_config, 
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from small_policies import TASK_IDS, batch_of, demos_of, with_chunks
 
-from lerobot_deltaco.lerobot_env import DeltacoEnv
+from lerobot_deltaco.evaluation.lerobot_env import DeltacoEnv
 from lerobot_deltaco.policies.deltaco.configuration_deltaco import METHODS
 
 NO_INPUTS = {"film": "none", "concat": "none", "encoder_loss": "none"}

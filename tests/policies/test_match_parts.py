@@ -5,19 +5,20 @@ import pytest
 import torch
 from small_policies import random_moves
 
+from lerobot_deltaco.policies.base.augmentation import change_colors, random_color_changes
 from lerobot_deltaco.policies.base.configuration import has_bfloat16
-from lerobot_deltaco.policies.base.losses import location_loss
-from lerobot_deltaco.policies.base.networks import gaussian_maps
-from lerobot_deltaco.policies.deltaco_match import fit, proposals
-from lerobot_deltaco.policies.deltaco_match.background import N_OBJECTS, Background
-from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
-from lerobot_deltaco.policies.deltaco_match.crops import FEATURE_DIM, cut_crops, fit_perspective
+from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
+from lerobot_deltaco.policies.deltaco_match import fit
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching, fit_matching_head
-from lerobot_deltaco.policies.deltaco_match.grasp_height import GraspHeightEstimator
-from lerobot_deltaco.policies.deltaco_match.localization import Candidates, FeatureMatching
+from lerobot_deltaco.policies.deltaco_match.localization import (
+    Candidates,
+    FeatureMatching,
+    GraspHeightEstimator,
+)
+from lerobot_deltaco.policies.deltaco_match.matching import FEATURE_DIM, cut_crops
 from lerobot_deltaco.policies.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
-from lerobot_deltaco.policies.deltaco_match.proposals import peaks
-from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.proposals import N_OBJECTS, Background, fit_perspective, peaks
 from lerobot_deltaco.policies.deltaco_match.words import encode_words, understand, vocabulary_of
 
 
@@ -133,6 +134,7 @@ def matching(shapes, request):
         max_proposal_batch=16,
         min_matching_steps=60,
         matching_batch=32,
+        max_variants=2,
     )
     matching = FeatureMatching(vocabulary_of(SHAPE_TASKS), 0.25, short)
     sentences, heights = {task: [task] for task in tasks}, torch.zeros(24)
@@ -175,7 +177,6 @@ def test_fit_finds_shapes_of_one_color_by_demonstrations_and_by_words(matching, 
     # Unknown words leave the demonstration in charge, and known ones still count.
     assert fraction_found(matching, shapes, True, lambda task: "the gizmo") >= 0.9
     assert fraction_found(matching, shapes, words=lambda task: "a b c") < 0.8
-    assert fraction_found(matching, shapes, True, lambda task: "?!") >= 0.9
     # An object that was pushed before its grasp is found where it was.
     for grasp in (2.0, torch.nan):
         assert fraction_found(matching, shapes, True, grasp=grasp) >= 0.9
@@ -217,24 +218,7 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes, sho
     assert not torch.equal(fitted[0]["compare.hidden.weight"], fitted[2]["compare.hidden.weight"])
 
 
-@pytest.mark.parametrize(("n_images", "n_scenes"), [(3, 24), (20, 40), (100, 48)])
-def test_a_step_of_the_proposals_fit_has_more_scenes_if_there_are_more(n_images, n_scenes, monkeypatch):
-    seen = []
-
-    def loss(maps, locations):
-        seen.append(len(maps))
-        return location_loss(maps, locations)
-
-    monkeypatch.setattr(proposals, "location_loss", loss)
-    images = torch.zeros(n_images, 3, 16, 16, dtype=torch.uint8)
-    autocast = torch.autocast("cpu", enabled=False)
-    proposals.ProposalNetwork().fit(
-        images, torch.zeros(n_images, 2), torch.Generator(), autocast, MatchingSettings(proposal_steps=5)
-    )
-    assert seen == [n_scenes] * 5
-
-
-@pytest.mark.parametrize(("n_scenes", "steps"), [(8, 2), (24, 6), (80, 9)])
+@pytest.mark.parametrize(("n_scenes", "steps"), [(8, 2), (40, 9)])
 def test_steps_of_the_fit_follow_the_number_of_scenes(n_scenes, steps, monkeypatch, short_fit):
     draws, draw = [], fit.EpisodePairs.draw
     monkeypatch.setattr(fit.EpisodePairs, "draw", lambda *own: draws.append(1) or draw(*own))
@@ -254,7 +238,7 @@ def test_words_that_describe_the_container_do_not_count():
     """The color of an object and that of its container vary independently. A proposal is background."""
     tasks = [f"put the {color} cube in the {bin} bin" for color in ("red", "blue") for bin in ("red", "blue")]
     generator = torch.Generator().manual_seed(0)
-    matching = FeatureMatching(vocabulary_of(tasks), 0.25, MatchingSettings(matching_batch=32))
+    matching = FeatureMatching(vocabulary_of(tasks), 0.25, MatchingSettings(matching_batch=16))
     # Crops in which only the color can be seen, of two objects, and of the background.
     n_scenes = 256
     task = torch.arange(n_scenes) % 4
@@ -317,13 +301,13 @@ def test_objects_of_any_size_stand_out_whether_they_were_grasped_or_not(side):
     drawn = [draw_objects(side, own[: 2 if n < 24 else 3], seed=n) for n, own in enumerate(places)]
     images = torch.tensor(np.stack(drawn)).permute(0, 3, 1, 2)
     background, locations = Background(), torch.tensor(places, dtype=torch.float32)
-    remembered = background.fit(images[:24], locations[:24, 0], torch.Generator())
+    background.fit(images[:24], locations[:24, 0])
     assert float(background.object_size) == pytest.approx(side / 96, rel=0.35, abs=0.015)
     proposed = background(images[24:])
     distances = (proposed[:, :, None] - locations[24:, None]).norm(dim=3).amin(dim=1)  # (scenes, objects)
     assert (distances < 0.6 * side / 96).float().mean() > 0.9
     # A training scene is not compared with itself.
-    distances = (background(images[:24], remembered)[:, :, None] - locations[:24, None, :2]).norm(dim=3)
+    distances = (background(images[:24], torch.arange(24))[:, :, None] - locations[:24, None, :2]).norm(dim=3)
     assert (distances.amin(dim=1) < 0.6 * side / 96).float().mean() > 0.85
 
 
@@ -354,6 +338,25 @@ def test_crops_are_centered_and_see_the_native_resolution():
     assert crops.shape == (1, 2, 3, 24, 24)
     assert (crops[0, 0, 0] > 0.5).nonzero().float().mean(dim=0).tolist() == pytest.approx([11.5] * 2, abs=0.6)
     assert not crops[0, 1].any()
+
+
+def test_crops_show_what_the_policys_small_images_do_not(matching):
+    """At 192 px, objects with fine stripes are others than plain ones; at 48 px, they are equal."""
+    plain = torch.full((1, 3, 192, 192), 0.5)
+    plain[:, :, 80:112, 80:112] = 0.3
+    striped = plain.clone()
+    striped[:, :, 80:112, 80:112:4] = striped[:, :, 80:112, 81:112:4] = 0.1
+    striped[:, :, 80:112, 82:112:4] = striped[:, :, 80:112, 83:112:4] = 0.5
+    small = [
+        torch.nn.functional.interpolate(images, (SIZE, SIZE), mode="area") for images in (plain, striped)
+    ]
+    torch.testing.assert_close(*small)
+    at = torch.zeros(1, 2)
+    plain, striped, blurred = (
+        matching.describe(small[0], images, at, at) for images in (plain, striped, small[1])
+    )
+    similar, different = ((plain * other).sum() / plain.square().sum() for other in (blurred, striped))
+    assert different < 0.8 < similar
 
 
 def test_the_perspective_is_that_of_what_disappears():

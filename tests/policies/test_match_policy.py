@@ -93,12 +93,16 @@ def test_training_learns_to_find_what_a_demonstration_moved_and_an_instruction_n
         assert found.heights.isfinite().all()
 
 
-def test_locations_of_training_episodes_are_where_objects_were_moved(make):
-    known = make().training_locations
-    true = torch.tensor(np.stack([move[1::2] for move in MOVES])).float().clamp(-1, 1)
+def error_of_locations(policy, moves):
+    """Median distance of the locations of training episodes from where objects were moved, px."""
+    known = policy.training_locations
+    true = torch.tensor(np.stack([move[1::2] for move in moves])).float().clamp(-1, 1)
     assert known.has_grasp.all()
-    errors = (known.locations - true).norm(dim=2) * TABLE_SIZE / 2
-    assert errors.median() < 1.5  # px
+    return (known.locations - true).norm(dim=2).median() * TABLE_SIZE / 2
+
+
+def test_locations_of_training_episodes_are_where_objects_were_moved(make):
+    assert error_of_locations(make(), MOVES) < 1.5
 
 
 def test_episode_without_a_grasp_teaches_nothing(make, table):
@@ -170,6 +174,18 @@ def test_greater_values_of_the_gripper_may_mean_closed(table, caplog):
     with pytest.raises(ValueError, match=r"at least 24 episodes .* Got 0\."):
         small_policy(inverted, "deltaco_match")
     assert "Set --policy.gripper_closed=high." in caplog.text
+
+
+def test_of_two_grippers_the_one_that_moves_grasps(tmp_path, caplog):
+    two = write_table(tmp_path / "two", MOVES[:24], grippers=("left_gripper", "right_gripper"))
+    policy, before, after = small_policy(two, "deltaco_match")
+    assert "moves most, dimension 3 of the action (right_gripper)" in caplog.text
+    loss, _ = policy(before(batch_of(two, first_frames([0, 1]))))
+    assert torch.isfinite(loss)
+    assert error_of_locations(policy, MOVES[:24]) < 1.5  # px
+    action = after(policy.eval().select_action(before(observation(two, [RED]))))
+    assert action.shape == (1, 4)
+    assert action.isfinite().all()
 
 
 def test_validation_loss_of_held_out_episodes_is_that_at_their_recorded_locations(make, table, monkeypatch):

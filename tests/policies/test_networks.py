@@ -5,19 +5,16 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import nn
 
+from lerobot_deltaco.policies.base.augmentation import random_shift, random_shifts, shift_images
+from lerobot_deltaco.policies.base.image_coordinates import features_at, gaussian_maps
 from lerobot_deltaco.policies.base.losses import imitation_loss, join_action, location_loss, split_action
 from lerobot_deltaco.policies.base.networks import (
     BACKBONES,
     INITIAL_LOG_STD,
     ActionDistribution,
     PolicyNetwork,
-    features_at,
     fuse_batch_norms,
-    gaussian_maps,
     initialize_as_authors,
-    random_shift,
-    random_shifts,
-    shift_images,
     uniform_linear_layers,
 )
 from lerobot_deltaco.policies.deltaco.demo_encoders import (

@@ -15,7 +15,7 @@ from small_policies import as_options, batch_of, small_policy, write_episodes
 
 from gym_deltaco.tasks import TASK_SETS, get_task
 from lerobot_deltaco.evaluation.checkpoints import load_policy
-from lerobot_deltaco.lerobot_env import DeltacoEnv
+from lerobot_deltaco.evaluation.lerobot_env import DeltacoEnv
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "pick_place"

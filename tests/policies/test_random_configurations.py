@@ -5,8 +5,7 @@ import re
 
 import pytest
 import torch
-from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
-from small_policies import batch_of
+from small_policies import batch_of, small_policy
 
 # Options, with values that are valid alone and others.
 COMMON = {
@@ -49,22 +48,19 @@ OPTIONS = {
 @pytest.mark.parametrize("policy_type", OPTIONS)
 def test_a_random_configuration_works_or_is_refused_by_name(dataset, table, policy_type):
     data = {"deltaco": dataset, "deltaco_match": table}[policy_type]
-    fixed = {"backbone": "strided"} if policy_type == "deltaco" else {}
     values, rng = {**COMMON, **OPTIONS[policy_type]}, random.Random(0)
     batch = batch_of(data, [0, 7, 25])
     n_trained, refusals = 0, {}
     for _ in range(40):
         options = {name: rng.choice(values[name]) for name in rng.sample(sorted(values), 3)}
         try:
-            config = make_policy_config(policy_type, device="cpu", **fixed, **options)
-            policy = make_policy(config, ds_meta=data.meta).train()
-            before, after = make_pre_post_processors(config, dataset_stats=data.meta.stats)
+            policy, before, after = small_policy(data, policy_type, **options)
             loss, _ = policy(before(dict(batch)))
         except ValueError as error:
             refusals[str(options)] = str(error)
             continue
         loss.backward()
-        config.get_optimizer_preset().build(policy.get_optim_params()).step()
+        policy.config.get_optimizer_preset().build(policy.get_optim_params()).step()
         policy.eval()
         seen = {name: value for name, value in batch.items() if name.startswith("observation.")}
         action = after(policy.select_action(before({**seen, "task": batch["task"]})))

@@ -8,7 +8,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lerobot_deltaco.policies.base.networks import ActionDistribution, gaussian_maps
+from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
+from lerobot_deltaco.policies.base.networks import ActionDistribution
 
 # Kinds of the gripper's loss, and their usual weights.
 GRIPPER_LOSSES = {"squared_error": 30.0, "cross_entropy": 3.0}

@@ -34,9 +34,16 @@ from einops import rearrange
 from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
+from lerobot_deltaco.policies.base.image_coordinates import (
+    LOCATION_STD,
+    features_at,
+    gaussian_maps,
+    mean_location,
+    spatial_weights,
+)
+
 FILM_INITIAL_STD = 1e-3
 MIN_LOG_STD, MAX_LOG_STD = -6.0, 0.0
-LOCATION_STD = 1 / 12  # of the map of a location, where the image's edges are at -1 and 1
 _NEARLY = 0.5  # as likely as the likeliest
 _GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 INITIAL_LOG_STD = -1.0  # ours: of the order of the first errors, so that the first gradients are moderate
@@ -326,99 +333,6 @@ def conv_norm_relu(in_channels: int, out_channels: int, size: int = 3, stride: i
 def channels_last(images: Tensor) -> Tensor:
     """Returns images (batch, channels, H, W) in the memory format in which convolutions are fastest."""
     return images.contiguous(memory_format=torch.channels_last)
-
-
-# Maps and locations
-
-
-def spatial_weights(maps: Tensor) -> Tensor:
-    """Returns the softmax of each map over its cells, (batch, channels, h, w) as float32."""
-    weights = rearrange(maps, "b c h w -> b c (h w)").float().softmax(dim=-1)
-    return rearrange(weights, "b c (h w) -> b c h w", h=maps.shape[-2])
-
-
-def mean_location(weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns mean x and y, each (batch, channels) in -1..1, under weights (batch, channels, h, w)."""
-    height, width = weights.shape[-2:]
-    # Sums of products, because mixed precision would round the factors of a matrix product.
-    x = torch.linspace(-1, 1, width, device=weights.device)
-    y = torch.linspace(-1, 1, height, device=weights.device)
-    return (weights.sum(dim=2) * x).sum(-1), (weights.sum(dim=3) * y).sum(-1)
-
-
-def cell_centers(n_cells: int, device: torch.device) -> Tensor:
-    """Returns the centers of the cells of a row or column whose edges are at -1 and 1, (n_cells,)."""
-    return (torch.arange(n_cells, device=device) + 0.5) * 2 / n_cells - 1
-
-
-def grid_of_centers(height: int, width: int, device: torch.device) -> Tensor:
-    """Returns the centers of a map's cells, row by row, (h w, 2) in -1..1."""
-    x, y = cell_centers(width, device), cell_centers(height, device)
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)
-
-
-def gaussian_maps(locations: Tensor, height: int, width: int, std: float | Tensor) -> Tensor:
-    """Returns maps that are 1 at a location and fall off around it.
-
-    Args:
-        locations: Locations in -1..1, (batch, locations, 2).
-        height: Number of rows.
-        width: Number of columns.
-        std: Standard deviation in the same unit: one number, or those of x and y, (2,).
-
-    Returns:
-        (batch, locations, height, width).
-    """
-    std = torch.as_tensor(std, device=locations.device).expand(2)
-    across = torch.exp(-0.5 * ((cell_centers(width, locations.device) - locations[..., :1]) / std[0]) ** 2)
-    down = torch.exp(-0.5 * ((cell_centers(height, locations.device) - locations[..., 1:]) / std[1]) ** 2)
-    return down[..., :, None] * across[..., None, :]
-
-
-def features_at(maps: Tensor, locations: Tensor) -> Tensor:
-    """Returns features (batch, locations, channels) around locations (batch, locations, 2) in maps."""
-    height, width = maps.shape[-2:]
-    weights = gaussian_maps(locations, height, width, LOCATION_STD)
-    weights = weights / weights.sum(dim=(2, 3), keepdim=True).clamp_min(1e-3)
-    return torch.einsum("bphw,bchw->bpc", weights.to(maps.dtype), maps)
-
-
-# Random shifts
-
-
-def random_shift(images: Tensor, padding: int, generator: torch.Generator | None = None) -> Tensor:
-    """Shifts each image at random by up to `padding` pixels; the uncovered edges are black.
-
-    Args:
-        images: Images, (batch, ..., H, W). All images of a sample are shifted alike.
-        padding: Largest shift in x and in y, px.
-        generator: Source of the shifts, on the CPU.
-
-    Returns:
-        Shifted images, of the same shape.
-    """
-    return shift_images(images, random_shifts(len(images), padding, generator), padding)
-
-
-def random_shifts(n_samples: int, padding: int, generator: torch.Generator | None = None) -> Tensor:
-    """Draws shifts to the right and down, -padding..padding px, (n_samples, 2), on the CPU."""
-    # The draws are the top and left edges of crops of padded images, all tops first: `flip` puts x first, and
-    # an edge further to the right shifts the image to the left. Another order would change every training.
-    return padding - torch.randint(0, 2 * padding + 1, (2, n_samples), generator=generator).flip(0).T
-
-
-def shift_images(images: Tensor, shifts: Tensor, padding: int) -> Tensor:
-    """Shifts images (batch, ..., H, W) by shifts (batch, 2) of up to `padding` pixels."""
-    batch_size, (height, width) = len(images), images.shape[-2:]
-    left, top = (padding - shifts).to(images.device).unbind(dim=1)
-    padded = F.pad(images, [padding] * 4)
-    rows = top[:, None] + torch.arange(height, device=images.device)  # (batch, H)
-    columns = left[:, None] + torch.arange(width, device=images.device)  # (batch, W)
-    sample = torch.arange(batch_size, device=images.device)
-    flat = padded.flatten(1, -3) if padded.ndim > 4 else padded  # (batch, channels, H + 2p, W + 2p)
-    # Advanced indices on both sides of a slice put the batch, rows and columns first.
-    cropped = flat[sample[:, None, None], :, rows[:, :, None], columns[:, None, :]]  # (batch, H, W, channels)
-    return rearrange(cropped, "b h w c -> b c h w").reshape(images.shape)
 
 
 # Weights

@@ -12,14 +12,9 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from lerobot_deltaco.data.demonstrations import DemonstrationBank, sample_frames
-from lerobot_deltaco.policies.base.networks import (
-    channels_last,
-    conv_norm_relu,
-    mean_location,
-    multilayer_perceptron,
-    random_shift,
-    spatial_weights,
-)
+from lerobot_deltaco.policies.base.augmentation import random_shift
+from lerobot_deltaco.policies.base.image_coordinates import mean_location, spatial_weights
+from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu, multilayer_perceptron
 from lerobot_deltaco.policies.deltaco.vision import VisionEncoder
 
 # `AttentionEncoder`: channels of its convolutions, the first two of which halve the maps; number of locations

@@ -24,6 +24,7 @@ from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
 from lerobot_deltaco.data.reading import warn_of_equal_instructions
 from lerobot_deltaco.data.training_data import TrainingData
 from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.policies.base.augmentation import random_shift
 from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings
 from lerobot_deltaco.policies.base.losses import contrastive_logits, contrastive_loss, cosine_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
@@ -32,7 +33,6 @@ from lerobot_deltaco.policies.base.networks import (
     PolicyNetwork,
     UnitHead,
     initialize_as_authors,
-    random_shift,
     uniform_linear_layers,
 )
 from lerobot_deltaco.policies.deltaco.configuration_deltaco import DEMO_COLUMNS, DeltacoConfig

@@ -14,8 +14,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.policies.base.image_coordinates import mean_near
-from lerobot_deltaco.policies.base.networks import grid_of_centers
+from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers, mean_near
 from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
 
 logger = logging.getLogger(__name__)

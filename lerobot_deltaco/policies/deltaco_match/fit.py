@@ -14,29 +14,29 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from lerobot_deltaco.errors import UserError
-from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
-from lerobot_deltaco.policies.deltaco_match.crops import crop_features, fit_perspective
+from lerobot_deltaco.policies.base.augmentation import change_colors, random_color_changes
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
-from lerobot_deltaco.policies.deltaco_match.matching import Crops, MatchingHead, word_scores
-from lerobot_deltaco.policies.deltaco_match.proposals import nearest_proposals
-from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.matching import Crops, MatchingHead, crop_features, word_scores
+from lerobot_deltaco.policies.deltaco_match.proposals import (
+    MAX_REMEMBERED,
+    fit_perspective,
+    nearest_proposals,
+)
 from lerobot_deltaco.policies.deltaco_match.words import UNKNOWN_WORD, encode_words
 
 logger = logging.getLogger(__name__)
 
 _SCENES_AT_A_TIME, _NORMALIZED_AT_A_TIME = 16, 256
-# Logit between the median right and the median wrong cosine, and their least difference, before the fit.
-_SEPARATION, _MIN_SEPARATED = 6.0, 0.1
-_COMMON = 0.8  # fraction of the sentences from which on a word is penalized
 _LOOKS = 2  # at each held-out episode
-_SHARPNESSES = (0.4, 0.55, 0.7, 0.85, 1.0)  # of scores, among which held-out episodes choose
+_MIN_DIFFERENCE = 0.1  # between the cosines of right and wrong proposals
 
 
 def fit_feature_matching(
     matching: FeatureMatching,
     images: Tensor,
     last: Tensor,
-    native: Tensor,
+    full_resolution: Tensor,
     locations: Tensor,
     heights: Tensor,
     tasks: Sequence[str],
@@ -54,7 +54,7 @@ def fit_feature_matching(
         matching: What is fitted.
         images: First images of episodes, (episodes, 3, H, W) uint8, as small as the policy's.
         last: Last images of the same episodes.
-        native: The first images at full resolution, (episodes, 3, H', W') uint8.
+        full_resolution: The first images at full resolution, (episodes, 3, H', W') uint8.
         locations: Locations of their grasps, (episodes, 2) in -1..1; NaN where there is none.
         heights: Height offsets of their grasps, (episodes,).
         tasks: Task of each episode.
@@ -83,13 +83,13 @@ def fit_feature_matching(
             if isinstance(layer, (nn.Conv2d, nn.Linear, nn.BatchNorm2d)):
                 layer.reset_parameters()
         matching.requires_grad_(True)
-        proposed = _fit_proposals(matching, images, native, locations, drawn, generator, autocast)
+        proposed = _fit_proposals(matching, images, full_resolution, locations, drawn, generator, autocast)
         if not bool(matching.uses_background):
             rows = grasps.to(device)
             matching.perspective.copy_(fit_perspective(images[rows], last[rows], locations[rows]))
         matching.compare.feature_weight.fill_(settings.feature_weight)
         features, target, kept = _crops_of_proposals(
-            *(matching, native, locations, drawn, proposed, generator, autocast)
+            *(matching, full_resolution, locations, drawn, proposed, generator, autocast)
         )
         held_out = _held_out([tasks[row] for row in drawn.tolist()], settings)
         is_kept = torch.isin(drawn, kept)
@@ -117,23 +117,10 @@ def fit_feature_matching(
         logger.info("Feature matching: %s.", matching.report)
 
 
-@torch.no_grad()
-def _background_proposals(
-    matching: FeatureMatching, native: Tensor, rows: Tensor, remembered: Tensor
-) -> Tensor:
-    """Returns what stands out in scenes, (rows, n, 2), each without its own image among the remembered."""
-    found = []
-    with tqdm(total=len(rows), desc="Looking for objects", unit="scene", leave=False) as progress:
-        for some, own in zip(rows.split(_SCENES_AT_A_TIME), remembered.split(_SCENES_AT_A_TIME), strict=True):
-            found.append(matching.background(native[some.to(native.device)], own))
-            progress.update(len(some))
-    return torch.cat(found)
-
-
 def _fit_proposals(
     matching: FeatureMatching,
     images: Tensor,
-    native: Tensor,
+    full_resolution: Tensor,
     locations: Tensor,
     drawn: Tensor,
     generator: torch.Generator,
@@ -144,10 +131,18 @@ def _fit_proposals(
     Where objects do not stand out from the background, as if the camera was moved, a network learns where
     grippers closed, and is used if it finds more of the grasps.
     """
-    settings, rows = matching.settings, drawn.to(images.device)
+    settings, background, rows = matching.settings, matching.background, drawn.to(images.device)
+    chosen = torch.randperm(len(drawn), generator=generator)[:MAX_REMEMBERED].sort().values
+    remembered = torch.full((len(drawn),), -1)
+    remembered[chosen] = torch.arange(len(chosen))
     with torch.no_grad():
-        remembered = matching.background.fit(native[drawn.to(native.device)], locations[rows], generator)
-    proposed = _background_proposals(matching, native, drawn, remembered).to(images.device)
+        some = drawn[chosen]
+        background.fit(full_resolution[some.to(full_resolution.device)], locations[some.to(locations.device)])
+        batches = list(zip(drawn.split(_SCENES_AT_A_TIME), remembered.split(_SCENES_AT_A_TIME), strict=True))
+        progress = tqdm(batches, desc="Looking for objects", unit="batch", leave=False)
+        proposed = torch.cat(
+            [background(full_resolution[some.to(full_resolution.device)], own) for some, own in progress]
+        ).to(images.device)
     matching.uses_background.fill_(True)
     matching.perspective.copy_(matching.background.perspective)
     _, stands_out = nearest_proposals(proposed, locations[rows], matching.grasp_radius)
@@ -171,9 +166,7 @@ def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:
     n_wanted = max(settings.min_held_out, len(tasks) // settings.held_out_every)
     if len(tasks) < settings.held_out_every * settings.min_held_out * 0.75:
         return held_out
-    order = torch.arange(len(tasks)).roll(-settings.held_out_every + 1).tolist()
-    order = sorted(order, key=lambda row: (row % settings.held_out_every, row))
-    for row in order:
+    for row in sorted(range(len(tasks)), key=lambda row: (row % settings.held_out_every, row)):
         if int(held_out.sum()) < n_wanted and left[tasks[row]] > 2:
             held_out[row] = True
             left[tasks[row]] -= 1
@@ -183,7 +176,7 @@ def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:
 @torch.no_grad()
 def _crops_of_proposals(
     matching: FeatureMatching,
-    native: Tensor,
+    full_resolution: Tensor,
     locations: Tensor,
     drawn: Tensor,
     proposed: Tensor,
@@ -209,7 +202,7 @@ def _crops_of_proposals(
             rows = some.to(locations.device)
             nearest, near = nearest_proposals(of_some, locations[rows], matching.grasp_radius)
             if bool(near.any()):
-                scenes = native[rows[near].to(native.device)]
+                scenes = full_resolution[rows[near].to(full_resolution.device)]
                 variants = []
                 for n in range(n_variants):
                     images, at = scenes, of_some[near]
@@ -281,7 +274,8 @@ def fit_matching_head(
     )
     each_word = torch.arange(int(encoded.max()) + 1, device=device)
     frequency = (encoded[..., None] == each_word).any(dim=1).float().mean(dim=0)
-    _begin_at_features(head, features[0], target, pairs.draw(settings.max_proposal_batch, generator))
+    some = pairs.draw(settings.max_proposal_batch, generator)
+    _begin_at_features(head, features[0], target, some, settings.initial_separation)
     rate, decay = settings.learning_rate, settings.weight_decay
     scales = [head.log_scale, head.gate]
     groups: list[dict[str, Any]] = [
@@ -345,7 +339,7 @@ def fit_matching_head(
 
 @torch.no_grad()
 def _begin_at_features(
-    head: MatchingHead, features: Tensor, target: Tensor, pairs: tuple[Tensor, Tensor]
+    head: MatchingHead, features: Tensor, target: Tensor, pairs: tuple[Tensor, Tensor], separation: float
 ) -> None:
     """Sets the scales and the gate to where the features' cosines separate objects from other proposals."""
     scenes, others = (rows.to(features.device) for rows in pairs)
@@ -355,7 +349,7 @@ def _begin_at_features(
     right = cosines.gather(1, target[scenes, None])
     wrong = cosines.scatter(1, target[scenes, None], -1.0).amax(dim=1)
     high, low = right.median(), wrong.median()
-    slope = (_SEPARATION / (high - low).clamp_min(_MIN_SEPARATED)).clamp_min(1.0)
+    slope = (separation / (high - low).clamp_min(_MIN_DIFFERENCE)).clamp_min(1.0)
     head.log_scale.fill_(float(slope.log()))
     head.gate.copy_(torch.stack([slope, -slope * (high + low) / 2]))
 
@@ -385,7 +379,8 @@ def _word_losses(
     of_words = named.gather(1, (words - UNKNOWN_WORD - 1).clamp_min(0))
     naming = -(known_weights * of_words).sum(dim=1) / known_weights.sum(dim=1).clamp_min(1e-6)
     # A word of every sentence, such as "the", tells nothing apart.
-    is_common = ((frequency[words] - _COMMON) / (1 - _COMMON)).clamp_min(0)
+    common = settings.common_fraction
+    is_common = ((frequency[words] - common) / (1 - common)).clamp_min(0)
     cost = settings.word_penalty * (1 + settings.common_word_penalty * is_common)
     penalty = (cost * weights * (words > UNKNOWN_WORD)).sum(dim=1).mean()
     # What an unknown word is about follows from its neighbors.
@@ -473,15 +468,12 @@ class HeldOut:
             matching.load_state_dict(self._state)
         scores = self._scores()
         is_right = (scores.argmax(dim=2) == self._target).float().mean(dim=1)  # by each, and by both
-        n_seen, n_all = (
-            len(self._target) / _LOOKS,
-            int(matching.held_out[1]),
-        )  # in others, no proposal is near
+        n_seen, n_all = len(self._target) / _LOOKS, int(matching.held_out[1])  # a proposal is near; all
         matching.held_out[0] = round(float(is_right[2]) * n_seen)
         n_wrong = n_all - float(is_right[0] + is_right[2]) / 2 * n_seen
         error_rate = torch.tensor((n_wrong + 1) / (n_all + 2))  # by Laplace's rule of succession
         losses = {}
-        for sharpness in _SHARPNESSES:
+        for sharpness in matching.settings.sharpnesses:
             p = (sharpness * scores).softmax(dim=2)
             p = torch.lerp(p, torch.full_like(p, 1 / p.shape[2]), error_rate.to(p))
             losses[sharpness] = float(F.nll_loss(p.flatten(0, 1).log(), self._target.repeat(3)))

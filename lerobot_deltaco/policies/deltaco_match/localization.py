@@ -28,14 +28,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lerobot_deltaco.policies.base.networks import gaussian_maps
-from lerobot_deltaco.policies.deltaco_match import settings as matching_settings
-from lerobot_deltaco.policies.deltaco_match.background import Background
-from lerobot_deltaco.policies.deltaco_match.crops import crop_features
-from lerobot_deltaco.policies.deltaco_match.grasp_height import GraspHeightEstimator
-from lerobot_deltaco.policies.deltaco_match.matching import HIDDEN_DIM, Crops, MatchingHead, word_scores
-from lerobot_deltaco.policies.deltaco_match.proposals import ProposalNetwork, nearest_proposals
-from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
+from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.matching import (
+    HIDDEN_DIM,
+    Crops,
+    MatchingHead,
+    crop_features,
+    word_scores,
+)
+from lerobot_deltaco.policies.deltaco_match.proposals import Background, ProposalNetwork, nearest_proposals
 from lerobot_deltaco.policies.deltaco_match.words import (
     UNKNOWN_WORD,
     WordWeights,
@@ -44,8 +46,9 @@ from lerobot_deltaco.policies.deltaco_match.words import (
     words_of,
 )
 
-# A proposal stands for a grasp at a distance of this much, in -1..1, and this much of an object's diameter.
-_GRASP_ERROR, _GRASP_SIZE = 0.06, 0.75
+_MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
+# Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
+_APPEARANCE_STD = 0.7
 # What checkpoints of earlier fits do not have: they keep their proposals, crops and probabilities.
 _ADDED_STATE = (
     "background.",
@@ -96,7 +99,7 @@ class FeatureMatching(nn.Module):
     Args:
         vocabulary: Known words.
         crop_size: Side of a crop in the middle of an image, as a fraction of the image's.
-        settings: Constants of the method; by default, `DEFAULT_SETTINGS`.
+        settings: Constants of the method; by default, those of `MatchingSettings`.
 
     Attributes:
         perspective: How the log of the apparent size of objects changes along x and y in the image, (2,).
@@ -120,7 +123,7 @@ class FeatureMatching(nn.Module):
     ) -> None:
         super().__init__()
         self.vocabulary, self.crop_size = list(vocabulary), crop_size
-        self.settings = settings or matching_settings.DEFAULT_SETTINGS
+        self.settings = settings or MatchingSettings()
         self.propose = ProposalNetwork()
         self.background = Background()
         self.compare = MatchingHead(len(vocabulary))
@@ -150,7 +153,7 @@ class FeatureMatching(nn.Module):
     def find(
         self,
         scenes: Tensor,
-        native: Tensor,
+        full_resolution: Tensor,
         instructions: Sequence[str],
         described: Tensor | None,
         demonstrated: Tensor | None,
@@ -159,7 +162,7 @@ class FeatureMatching(nn.Module):
 
         Args:
             scenes: First images of episodes, (batch, 3, H, W) in 0..1, as small as the policy's.
-            native: The same at full resolution, (batch, 3, H', W').
+            full_resolution: The same at full resolution, (batch, 3, H', W').
             instructions: Instruction of each sample, "" for none.
             described: Descriptors of the demonstrated objects, (batch, descriptor); None without
                 demonstrations.
@@ -167,8 +170,8 @@ class FeatureMatching(nn.Module):
                 None without demonstrations.
         """
         with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
-            locations = self.proposals(scenes, native)
-            crops = self.compare(self.features(native, locations))
+            locations = self.proposals(scenes, full_resolution)
+            crops = self.compare(self.features(full_resolution, locations))
             words = encode_words(instructions, self.vocabulary).to(scenes.device)
             scores, similarity = self.scores(crops, words, described)
             if demonstrated is None:
@@ -208,9 +211,9 @@ class FeatureMatching(nn.Module):
         by_words = (1 - p_misdescribed) * by_words + p_misdescribed / scores.shape[1]
         return matches + by_words.log(), similarity
 
-    def proposals(self, scenes: Tensor, native: Tensor) -> Tensor:
+    def proposals(self, scenes: Tensor, full_resolution: Tensor) -> Tensor:
         """Returns where something could be grasped in scenes, (batch, n, 2) in -1..1. See `find`."""
-        return self.background(native) if bool(self.uses_background) else self.propose(scenes)
+        return self.background(full_resolution) if bool(self.uses_background) else self.propose(scenes)
 
     @property
     def report(self) -> str:
@@ -225,10 +228,10 @@ class FeatureMatching(nn.Module):
         """Distance from a grasp within which a proposal stands for the grasped object, in -1..1."""
         if not bool(self.uses_background):
             return self.settings.grasp_radius
-        return _GRASP_ERROR + _GRASP_SIZE * float(self.background.object_size)
+        return self.settings.grasp_error + self.settings.grasp_size * float(self.background.object_size)
 
     @torch.no_grad()
-    def describe(self, images: Tensor, native: Tensor, grasps: Tensor, attended: Tensor) -> Tensor:
+    def describe(self, images: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor) -> Tensor:
         """Returns descriptors of what was grasped in demonstrations, (batch, descriptor).
 
         An object that was pushed before it was grasped, as by an attempt that failed, is no longer where it
@@ -236,19 +239,19 @@ class FeatureMatching(nn.Module):
 
         Args:
             images: First images, (batch, 3, H, W) in 0..1, as small as the policy's.
-            native: The same at full resolution, (batch, 3, H', W').
+            full_resolution: The same at full resolution, (batch, 3, H', W').
             grasps: Locations of the grasps, (batch, 2) in -1..1; NaN where they are not known.
             attended: Locations of what moved, by the attention, (batch, 2) in -1..1.
         """
         with torch.autocast(images.device.type, enabled=False):
-            proposed, radius = self.proposals(images, native), self.grasp_radius
+            proposed, radius = self.proposals(images, full_resolution), self.grasp_radius
             by_grasp, is_near = nearest_proposals(proposed, grasps, radius)
             by_attention, is_attended = nearest_proposals(proposed, attended, radius)
             nearest = torch.where(is_near, by_grasp, by_attention)
             # A gripper is not always above the middle of an object, but a proposal is.
             near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
             locations = torch.where((is_near | is_attended)[:, None], near, attended)
-            return self.compare(self.features(native, locations[:, None])).descriptors[:, 0]
+            return self.compare(self.features(full_resolution, locations[:, None])).descriptors[:, 0]
 
     @torch.no_grad()
     def understood(self, instruction: str) -> list[tuple[str, str]]:
@@ -262,9 +265,9 @@ class FeatureMatching(nn.Module):
             if meant is not None and weight > self.settings.shown_word_weight
         ]
 
-    def features(self, native: Tensor, locations: Tensor) -> Tensor:
+    def features(self, full_resolution: Tensor, locations: Tensor) -> Tensor:
         """Returns features of the crops at locations (batch, n, 2), (batch, n, FEATURE_DIM)."""
-        return crop_features(native, locations, self.crop_sizes(locations))
+        return crop_features(full_resolution, locations, self.crop_sizes(locations))
 
     def crop_sizes(self, locations: Tensor) -> Tensor:
         """Returns the sides of crops at locations (..., 2), as fractions of the image's, (...)."""
@@ -273,3 +276,55 @@ class FeatureMatching(nn.Module):
         if bool(self.uses_background):
             side = self.settings.crop_factor * self.background.object_size
         return side * (locations * self.perspective).sum(dim=-1).exp()
+
+
+class GraspHeightEstimator(nn.Module):
+    """Estimates the height offset of a grasp, from the demonstration and from the object's appearance.
+
+    If the demonstration moved the same object, its height is the right one. If it moved another object of
+    that color or shape, the appearance of the object in the scene is a better guide. So two estimates are
+    averaged, weighted by the inverse of their variances. The variance of the estimate from the demonstration
+    is learned, from the similarity of the two objects. The variance of the other is fixed: training objects
+    have hardly any error to learn it from.
+
+    Args:
+        feature_dim: Size of the features of an object's appearance.
+    """
+
+    def __init__(self, feature_dim: int) -> None:
+        super().__init__()
+        self.by_appearance = nn.Linear(feature_dim, 1)
+        self.demonstration_error = nn.Sequential(nn.Linear(1, 16), nn.ReLU(inplace=True), nn.Linear(16, 1))
+
+    def losses(self, features: Tensor, similarity: Tensor, demonstrated: Tensor, heights: Tensor) -> Tensor:
+        """Returns the loss of each sample, (batch,).
+
+        Args:
+            features: Features of the objects to grasp, (batch, feature_dim).
+            similarity: Cosine of their descriptors with those of the demonstrated objects, (batch,).
+            demonstrated: Height offsets of the demonstrations, (batch,).
+            heights: Height offsets of the grasps, (batch,).
+        """
+        by_appearance = 0.5 * (self.by_appearance(features)[:, 0] - heights).square()
+        log_std = self._log_std(similarity)
+        error = (demonstrated - heights) * torch.exp(-log_std)
+        return by_appearance + 0.5 * error.square() + log_std
+
+    def forward(self, features: Tensor, similarity: Tensor, demonstrated: Tensor) -> Tensor:
+        """Estimates height offsets, (...).
+
+        Args:
+            features: Features of the objects to grasp, (..., feature_dim).
+            similarity: Cosine of their descriptors with those of the demonstrated objects, (...).
+            demonstrated: Height offsets of the demonstrations, (...); NaN where they are not known.
+        """
+        by_appearance = self.by_appearance(features)[..., 0]
+        variance = torch.exp(2 * self._log_std(similarity))
+        weight = _APPEARANCE_STD**2 / (_APPEARANCE_STD**2 + variance)
+        weight = torch.where(demonstrated.isnan(), 0.0, weight)
+        return weight * demonstrated.nan_to_num() + (1 - weight) * by_appearance
+
+    def _log_std(self, similarity: Tensor) -> Tensor:
+        """Returns the log standard deviation of the error of the demonstrations' estimate, (...)."""
+        log_std = self.demonstration_error(similarity[..., None])[..., 0]
+        return _MIN_LOG_STD + (_MAX_LOG_STD - _MIN_LOG_STD) * torch.sigmoid(log_std)

@@ -37,11 +37,16 @@ from lerobot_deltaco.data.gripper_states import find_gripper_states
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
 from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.policies.base.augmentation import (
+    change_colors,
+    random_color_changes,
+    random_shifts,
+    shift_images,
+)
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
-from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork, random_shifts, shift_images
+from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork
 from lerobot_deltaco.policies.deltaco_match.calibration import MIN_EPISODES
-from lerobot_deltaco.policies.deltaco_match.color_jitter import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
 from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching

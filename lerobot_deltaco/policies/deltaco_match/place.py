@@ -19,14 +19,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.policies.base.networks import (
-    Film,
-    cell_centers,
-    channels_last,
-    conv_norm_relu,
-    mean_location,
-    spatial_weights,
-)
+from lerobot_deltaco.policies.base.image_coordinates import mean_location, mean_near, spatial_weights
+from lerobot_deltaco.policies.base.networks import Film, channels_last, conv_norm_relu
 
 _CHANNELS = 32
 TARGET_DIM = _CHANNELS + 2
@@ -114,17 +108,6 @@ def peak_locations(logits: Tensor) -> Tensor:
     Returns:
         (batch, maps, 2) in -1..1.
     """
-    height, width = logits.shape[-2:]
-    weights = spatial_weights(logits)  # (batch, maps, h, w)
-    greatest = F.avg_pool2d(weights, 3, 1, 1).flatten(2).argmax(dim=2)  # (batch, maps)
-    row, column = greatest // width, greatest % width
-    rows = torch.arange(height, device=logits.device)
-    columns = torch.arange(width, device=logits.device)
-    near = ((rows - row[..., None]).abs() <= _PEAK_RADIUS)[..., :, None] & (
-        (columns - column[..., None]).abs() <= _PEAK_RADIUS
-    )[..., None, :]
-    weights = weights * near
-    weights = weights / weights.sum(dim=(2, 3), keepdim=True)
-    x = (weights.sum(dim=2) * cell_centers(width, logits.device)).sum(dim=2)
-    y = (weights.sum(dim=3) * cell_centers(height, logits.device)).sum(dim=2)
-    return torch.stack([x, y], dim=2)
+    weights = spatial_weights(logits)
+    cells = F.avg_pool2d(weights, 3, 1, 1).flatten(2).argmax(dim=2)  # (batch, maps)
+    return mean_near(weights.flatten(0, 1), cells.flatten(), _PEAK_RADIUS).unflatten(0, cells.shape)

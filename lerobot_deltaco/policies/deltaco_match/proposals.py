@@ -1,24 +1,217 @@
-"""Proposals: where in a scene the gripper might close, whatever the task."""
+"""Proposals: where in a scene something stands that could be grasped, whatever the task."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from lerobot_deltaco.policies.base.image_coordinates import cell_centers, grid_of_centers, mean_near
 from lerobot_deltaco.policies.base.losses import location_loss
-from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu, grid_of_centers
-from lerobot_deltaco.policies.deltaco_match.settings import MatchingSettings
+from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
 
-N_PROPOSALS = 5
+N_OBJECTS = 6  # proposed in a scene by `Background`
+_SIDE = 128  # px, of the images as they are compared
+MAX_REMEMBERED = 48  # images
+_MIN_IMAGES = 8
+# Fraction of the images that may show a pixel's color while it still stands out. It is more than an object
+# takes, and less than a container that stands in one of four places.
+_COMMON = 0.17
+_MIN_CONTRAST = 0.02  # of colors in 0..1
+_NOISE_FACTOR = 4.0  # by which a contrast exceeds the median of a scene
+_BLUR = 0.6  # standard deviation of the smoothing, in diameters of an object divided by two
+_NEIGHBOR = 1.6  # least distance between two proposals, in the same unit
+_SEED_RADIUS, _GROWING_STEPS = 0.12, 40  # around a grasp, in -1..1; px by which an object's region grows
+_EDGE = 1.0  # px, by which images blur an object
+_SIZE_LIMITS = (0.02, 0.4)  # of an object's diameter, as a fraction of the image's side
+_MAX_SLOPE = 1.5  # of the log of a size along an image's half
+_LEAST_ERROR = 0.02  # of the log of a size, below which errors are all alike
+_DEFAULT_SIZE = 0.12
+_AT_A_TIME = 16
+N_PROPOSALS = 5  # of `ProposalNetwork`
 _CHANNELS = 32
 _MIN_DISTANCE = 1 / 6  # between two proposals, where an image's edges are at -1 and 1
 _PEAK_RADIUS = 1.6  # of the cells around a peak whose mean is a proposal
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
+# Change of a pixel (in 0..1) that counts for an object's size, and its distance from the grasp (in -1..1).
+_CHANGE, _CHANGE_RADIUS = 0.1, 1 / 3
+
+
+class Background(nn.Module):
+    """Proposes what differs from the first images of other episodes.
+
+    The camera is fixed, so a pixel shows the same surface in most scenes, and now and then an object. A pixel
+    stands out if few of the remembered images have its color there. That needs no training, and holds for
+    objects that were never grasped.
+
+    Attributes:
+        images: First images of training episodes, (48, 3, 128, 128) uint8.
+        n_images: Number of them, ().
+        contrast: Difference from which a pixel counts as an object's, ().
+        object_size: Diameter of a typical object in the middle of the image, as a fraction of its side, ().
+        perspective: How the log of the apparent size of objects changes along x and y in the image, (2,).
+    """
+
+    images: Tensor
+    n_images: Tensor
+    contrast: Tensor
+    object_size: Tensor
+    perspective: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("images", torch.zeros(MAX_REMEMBERED, 3, _SIDE, _SIDE, dtype=torch.uint8))
+        self.register_buffer("n_images", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("contrast", torch.tensor(_MIN_CONTRAST))
+        self.register_buffer("object_size", torch.tensor(_DEFAULT_SIZE))
+        self.register_buffer("perspective", torch.zeros(2))
+        self._bounds: tuple[Tensor, Tensor] | None = None  # of the remembered colors around each pixel
+        self.register_load_state_dict_post_hook(self._forget_bounds)
+
+    @staticmethod
+    def _forget_bounds(module: Background, _: object) -> None:
+        module._bounds = None
+
+    def forward(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
+        """Proposes objects, those that stand out most first.
+
+        Args:
+            scenes: First images, (batch, 3, H, W), uint8 or in 0..1, at full resolution.
+            remembered: Row of each scene among the remembered images, which is left out, (batch,); -1 for a
+                scene that is not among them.
+
+        Returns:
+            Locations in -1..1, (batch, N_OBJECTS, 2).
+        """
+        found = [
+            self._peaks(self.mask(some, None if remembered is None else remembered[n : n + _AT_A_TIME]))
+            for n, some in zip(range(0, len(scenes), _AT_A_TIME), scenes.split(_AT_A_TIME), strict=True)
+        ]
+        return torch.cat(found)
+
+    def mask(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
+        """Returns how clearly each pixel stands out, (batch, 128, 128) in 0..1. See `forward`."""
+        return ((self._differences(scenes, remembered) - self.contrast) / self.contrast).clamp(0, 1)
+
+    def fit(self, images: Tensor, locations: Tensor) -> None:
+        """Remembers images, and measures objects.
+
+        Args:
+            images: First images of episodes, (up to 48, 3, H, W) uint8, at full resolution.
+            locations: Locations of their grasps, (episodes, 2) in -1..1.
+        """
+        self.images.zero_()
+        self.images[: len(images)] = _scaled(images).mul(255).round().to(self.images)
+        self.n_images.fill_(len(images))
+        self._bounds = None
+        differences = self._differences(images, torch.arange(len(images)))
+        noise = _NOISE_FACTOR * differences.flatten(1).median(dim=1).values.median()
+        self.contrast.copy_(noise.clamp_min(_MIN_CONTRAST))
+        self._measure(differences > 1.5 * self.contrast, locations.to(self.images.device))
+
+    def _measure(self, stands_out: Tensor, locations: Tensor) -> None:
+        """Measures the regions around grasps."""
+        centers = grid_of_centers(_SIDE, _SIDE, locations.device)  # (cells, 2)
+        near = (centers - locations[:, None]).norm(dim=2).view(-1, _SIDE, _SIDE) < _SEED_RADIUS
+        allowed = stands_out.float()[:, None]
+        region = near.float()[:, None] * allowed
+        for _ in range(_GROWING_STEPS):
+            smaller, region = region, F.max_pool2d(region, 3, 1, 1) * allowed
+            if torch.equal(region, smaller):
+                break
+        diameter = ((region.sum(dim=(1, 2, 3)) * 4 / torch.pi).sqrt() - _EDGE) / _SIDE
+        low, high = _SIZE_LIMITS
+        seen = (diameter > low) & (diameter < high)
+        self.perspective.zero_()
+        self.object_size.fill_(_DEFAULT_SIZE)
+        if int(seen.sum()) >= _MIN_IMAGES:
+            self.object_size.copy_(diameter[seen].median())
+            if int(seen.sum()) >= 3 * _MIN_IMAGES:
+                size, slopes = _perspective(diameter[seen], locations[seen])
+                self.perspective.copy_(slopes)
+                self.object_size.copy_(size.clamp(*_SIZE_LIMITS))
+
+    def _differences(self, scenes: Tensor, remembered: Tensor | None) -> Tensor:
+        """Returns the difference of each pixel from the colors that are common there, (batch, 128, 128)."""
+        if self._bounds is None or self._bounds[0].device != self.images.device:
+            images = self.images[: int(self.n_images)]
+            # A pixel may lie between two of the image: its neighbors count.
+            least, most = (_over_neighbors(images, extreme) for extreme in (torch.minimum, torch.maximum))
+            self._bounds = least.float() / 255, most.float() / 255
+        low, high = self._bounds
+        n_common = min(max(2, round(_COMMON * len(low))), len(low))
+        results = []
+        for n, scene in enumerate(_scaled(scenes).to(low.device)):
+            away = torch.maximum(low - scene, scene - high).amax(dim=1)  # (images, 128, 128)
+            if remembered is not None and remembered[n] >= 0:
+                away[remembered[n]] = 2.0
+            results.append(_kth_smallest(away, n_common))
+        return torch.stack(results).clamp_min(0)
+
+    def _peaks(self, masks: Tensor) -> Tensor:
+        """Returns the middles of the regions of objects' size that stand out most, (batch, N_OBJECTS, 2)."""
+        size = self.object_size
+        centers = grid_of_centers(_SIDE, _SIDE, masks.device)
+        smooth = _blurred(masks, float(_BLUR * size * _SIDE / 2)).flatten(1)
+        weights, found = masks.flatten(1), []
+        for _ in range(N_OBJECTS):
+            peak = centers[smooth.argmax(dim=1)]  # (batch, 2)
+            away = (centers - peak[:, None]).norm(dim=2)  # (batch, cells)
+            inside = weights * (away < size) + 1e-6 * (away < size / 4)
+            found.append((inside[..., None] * centers).sum(dim=1) / inside.sum(dim=1, keepdim=True))
+            smooth = smooth.masked_fill(away < _NEIGHBOR * size, -1.0)
+        return torch.stack(found, dim=1)
+
+
+def _over_neighbors(images: Tensor, extreme: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Returns the extreme value of 3 x 3 pixels of images (..., h, w)."""
+    for dim in (-1, -2):
+        size = images.shape[dim]
+        first, last = images.narrow(dim, 0, size - 1), images.narrow(dim, 1, size - 1)
+        pairs = extreme(first, last)
+        ends = images.narrow(dim, 0, 1), images.narrow(dim, size - 1, 1)
+        images = extreme(torch.cat([ends[0], pairs], dim=dim), torch.cat([pairs, ends[1]], dim=dim))
+    return images
+
+
+def _kth_smallest(maps: Tensor, k: int) -> Tensor:
+    """Returns the k-th smallest value of each pixel of maps (n, h, w), (h, w); faster than `kthvalue`."""
+    smallest = maps.new_full((k, *maps.shape[1:]), torch.inf)  # ascending
+    for values in maps:
+        for n in range(k):
+            lower = torch.minimum(smallest[n], values)
+            values = torch.maximum(smallest[n], values)  # noqa: PLW2901
+            smallest[n] = lower
+    return smallest[-1]
+
+
+def _scaled(images: Tensor) -> Tensor:
+    """Scales images to 128 x 128 px, in 0..1."""
+    images = images.float() / 255 if images.dtype == torch.uint8 else images
+    if images.shape[-2:] == (_SIDE, _SIDE):
+        return images
+    if min(images.shape[-2:]) >= _SIDE:
+        return F.interpolate(images, (_SIDE, _SIDE), mode="area")
+    return F.interpolate(images, (_SIDE, _SIDE), mode="bilinear", align_corners=False)
+
+
+def _blurred(maps: Tensor, std: float) -> Tensor:
+    """Smooths maps (batch, h, w) by a Gaussian of a standard deviation in px."""
+    half = max(1, round(3 * std))
+    offsets = torch.arange(-half, half + 1, device=maps.device)
+    weights = torch.exp(-0.5 * (offsets / std) ** 2)
+    weights = weights / weights.sum()
+    across = F.conv2d(maps[:, None], weights[None, None, None], padding=(0, half))
+    return F.conv2d(across, weights[None, None, :, None], padding=(half, 0))[:, 0]
 
 
 class ProposalNetwork(nn.Module):
-    """Proposes pick locations. It is fitted to where the gripper closed in training scenes.
+    """Proposes where grippers closed in training scenes, if objects do not stand out from the background.
 
     The network is not told what to look for, so its map has a peak at each thing that can be grasped.
     """
@@ -75,6 +268,40 @@ class ProposalNetwork(nn.Module):
         self.layers.eval()
 
 
+def fit_perspective(first: Tensor, last: Tensor, locations: Tensor) -> Tensor:
+    """Returns how the log of the apparent size of objects changes along x and y in the image, (2,).
+
+    Things that are farther from the camera look smaller. The size of an object is the square root of the area
+    around its grasp that differs between the first and the last image of the episode, since it is gone then.
+
+    Args:
+        first: First images of episodes, (episodes, 3, H, W) uint8.
+        last: Last images of the same episodes.
+        locations: Locations of the grasps, (episodes, 2) in -1..1.
+    """
+    height, width = first.shape[-2:]
+    x, y = cell_centers(width, first.device), cell_centers(height, first.device)
+    changes = torch.stack(
+        [(b.int() - a.int()).abs().amax(dim=0) / 255 for a, b in zip(first, last, strict=True)]
+    )  # (episodes, H, W)
+    # The robot itself changes in every episode.
+    changes = changes * (changes.median(dim=0).values < _CHANGE)
+    away = torch.hypot(x - locations[:, :1, None], y[:, None] - locations[:, 1:, None])  # (episodes, H, W)
+    side = ((changes > _CHANGE) & (away < _CHANGE_RADIUS)).float().sum(dim=(1, 2)).sqrt() - _EDGE
+    seen = side > _EDGE
+    if int(seen.sum()) < 3 * _MIN_IMAGES:
+        return torch.zeros(2, device=first.device)
+    return _perspective(side[seen], locations[seen])[1]
+
+
+def _perspective(sizes: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the size of objects in the middle of the image, (), and the slopes of its log, (2,)."""
+    features = torch.cat([torch.ones_like(locations[:, :1]), locations], dim=1)
+    degrees = torch.tensor([0, 1, 1], device=features.device)
+    fitted = robust_regression(features, sizes.log()[:, None], degrees, _LEAST_ERROR)[:, 0]
+    return fitted[0].exp(), fitted[1:].clamp(-_MAX_SLOPE, _MAX_SLOPE)
+
+
 def peaks(maps: Tensor, n_peaks: int) -> Tensor:
     """Returns the highest peaks of maps, at a distance from one another.
 
@@ -87,16 +314,14 @@ def peaks(maps: Tensor, n_peaks: int) -> Tensor:
     """
     height, width = maps.shape[1:]
     centers = grid_of_centers(height, width, maps.device)
-    radius = _PEAK_RADIUS * 2 / torch.tensor([width, height], device=maps.device)
-    values = maps.flatten(1)
-    left, locations = values.clone(), []
+    left, locations = maps.flatten(1), []
     for _ in range(n_peaks):
         best, cell = left.max(dim=1)
-        away = centers - centers[cell][:, None]  # (batch, cells, 2)
         # Beyond the last peak, all cells may be taken; then the highest is proposed again.
-        weights = (values - best[:, None]).clamp(max=0).exp() * (away.abs() <= radius).all(dim=2)
-        locations.append((weights[..., None] * centers).sum(dim=1) / weights.sum(dim=1, keepdim=True))
-        left = left.masked_fill(away.norm(dim=2) < _MIN_DISTANCE, -1e9)
+        weights = (maps - best[:, None, None]).clamp(max=0).exp()
+        locations.append(mean_near(weights, cell, _PEAK_RADIUS))
+        away = (centers - centers[cell][:, None]).norm(dim=2)  # (batch, cells)
+        left = left.masked_fill(away < _MIN_DISTANCE, -1e9)
     return torch.stack(locations, dim=1)
 
 
