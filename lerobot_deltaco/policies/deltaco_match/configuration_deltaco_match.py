@@ -24,7 +24,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
 
     Args:
         acting: "network": the policy network acts. "replay": the demonstration's trajectory is replayed,
-            moved to where the policy picks and places. Training is the same, and a checkpoint acts either way.
+            moved to where the policy picks and places. Training is the same: a checkpoint acts either way.
         crop_size: Side of the square around an object that is compared, in the middle of the first camera's
             image and as a fraction of its side. Used only where objects do not stand out from other scenes,
             such as after a camera was moved during recording; otherwise, the size of objects is measured.

@@ -108,6 +108,18 @@ def fit_feature_matching(
             autocast,
             held_out=held_out[is_kept],
         )
+        if bool(matching.uses_background):
+            rows = kept.to(device)
+            nearest = proposed[is_kept.to(device)][torch.arange(len(kept)), target]
+            matching.refine.fit(
+                full_resolution[kept.to(full_resolution.device)],
+                locations[rows],
+                nearest,
+                matching.object_sizes(nearest),
+                held_out[is_kept],
+                generator,
+                autocast,
+            )
     matching.requires_grad_(False)
     for weights in matching.parameters():
         weights.grad = None

@@ -38,6 +38,7 @@ from lerobot_deltaco.policies.deltaco_match.matching import (
     word_scores,
 )
 from lerobot_deltaco.policies.deltaco_match.proposals import Background, ProposalNetwork, nearest_proposals
+from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner
 from lerobot_deltaco.policies.deltaco_match.words import (
     UNKNOWN_WORD,
     WordWeights,
@@ -58,6 +59,7 @@ _ADDED_STATE = (
     "sharpness",
     "error_rate",
     "held_out",
+    "refine.",
 )
 
 
@@ -126,6 +128,7 @@ class FeatureMatching(nn.Module):
         self.settings = settings or MatchingSettings()
         self.propose = ProposalNetwork()
         self.background = Background()
+        self.refine = GraspRefiner()
         self.compare = MatchingHead(len(vocabulary))
         self.word_weights = WordWeights(len(vocabulary))
         self.grasp_height = GraspHeightEstimator(HIDDEN_DIM)
@@ -215,6 +218,15 @@ class FeatureMatching(nn.Module):
         """Returns where something could be grasped in scenes, (batch, n, 2) in -1..1. See `find`."""
         return self.background(full_resolution) if bool(self.uses_background) else self.propose(scenes)
 
+    def grasps(self, full_resolution: Tensor, proposals: Tensor) -> Tensor:
+        """Returns where the gripper closes on proposed objects, (batch, 2) in -1..1.
+
+        Args:
+            full_resolution: First images of episodes, (batch, 3, H, W), uint8 or in 0..1.
+            proposals: A proposal in each, (batch, 2) in -1..1.
+        """
+        return self.refine(full_resolution, proposals, self.object_sizes(proposals))
+
     @property
     def report(self) -> str:
         """How often the object was found where that was not learned."""
@@ -271,11 +283,16 @@ class FeatureMatching(nn.Module):
 
     def crop_sizes(self, locations: Tensor) -> Tensor:
         """Returns the sides of crops at locations (..., 2), as fractions of the image's, (...)."""
+        side = self.settings.crop_factor * self.background.object_size
+        return (side if bool(self.uses_background) else self.crop_size) * self._perspective_factor(locations)
+
+    def object_sizes(self, locations: Tensor) -> Tensor:
+        """Returns the diameters of objects at locations (..., 2), as fractions of the image's side."""
+        return self.background.object_size * self._perspective_factor(locations)
+
+    def _perspective_factor(self, locations: Tensor) -> Tensor:
         # Not as a product of matrices, which autocast would round.
-        side: Tensor | float = self.crop_size
-        if bool(self.uses_background):
-            side = self.settings.crop_factor * self.background.object_size
-        return side * (locations * self.perspective).sum(dim=-1).exp()
+        return (locations * self.perspective).sum(dim=-1).exp()
 
 
 class GraspHeightEstimator(nn.Module):

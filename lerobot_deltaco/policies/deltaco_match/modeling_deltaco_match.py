@@ -358,7 +358,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             heights = self.robot_states.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
             attention, last = attentions[::n_each], ends[::n_each, 1]
         candidates = self.feature_matching.find(scenes, batch[camera], instructions, descriptors, heights)
-        pick, confidence, height = candidates.best
+        proposal, confidence, height = candidates.best
+        pick = self.feature_matching.grasps(batch[camera], proposal)
         place_maps = self._place_maps(
             scenes, by_instruction, instructions, last, None if attention is None else attention[:, 1]
         )
