@@ -1,8 +1,8 @@
 """A second look at what is picked: where on the object the gripper closes.
 
-A proposal is somewhere on an object. A small network sees its surroundings, enlarged from the full resolution,
-and finds the grasp in them. It learns from the training episodes, whose grasps are known, at centers and sizes
-that are off at random, so that it learns to center objects that it has never seen.
+A proposal is somewhere on an object. A small network sees its surroundings, enlarged from the full
+resolution, and finds the grasp in them. It learns from the training episodes, whose grasps are known, at
+centers and sizes that are off at random, so that it learns to center objects that it has never seen.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class GraspRefiner(nn.Module):
             nn.Conv2d(_CHANNELS, 1, 1),
         )
         self.register_buffer("is_used", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("errors", torch.full((2,), torch.nan))
+        self.register_buffer("errors", torch.zeros(2))
 
     def forward(self, images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
         """Returns where the gripper closes, (batch, 2) in -1..1.
