@@ -107,6 +107,7 @@ def use_short_fit(monkeypatch, steps=2, **settings):
 
     short = {
         "proposal_steps": 2 * steps,
+        "refinement_steps": steps,
         "grasp_radius": 9.0,  # any proposal will do
         "min_matching_steps": steps,
         "max_matching_steps": steps,

@@ -164,6 +164,7 @@ class MatchingSettings:
             where an image's edges are at -1 and 1; 4.5 px of 48.
         grasp_error: The same where objects stand out from the background, in addition to `grasp_size`.
         grasp_size: Part of that distance that grows with the objects, in their diameters.
+        refinement_steps: Steps of the fit of where on an object the gripper closes.
         min_matching_steps: Smallest number of steps of the fit of the matching head.
         max_matching_steps: Largest number of steps.
         matching_draws: How often each scene is drawn in them, as far as these bounds allow.
@@ -204,6 +205,7 @@ class MatchingSettings:
     grasp_radius: float = 0.19
     grasp_error: float = 0.06
     grasp_size: float = 0.75
+    refinement_steps: int = 300
     min_matching_steps: int = 300
     max_matching_steps: int = 1500
     matching_draws: int = 16

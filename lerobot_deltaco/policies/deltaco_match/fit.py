@@ -117,6 +117,7 @@ def fit_feature_matching(
                 nearest,
                 matching.object_sizes(nearest),
                 held_out[is_kept],
+                settings.refinement_steps,
                 generator,
                 autocast,
             )

@@ -446,10 +446,12 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             [each.states[[each.grasp.grasp, each.grasp.release]] for each in trajectories]
         )  # (batch, 2, state)
         moved = self.robot_states(localization.locations, localization.heights)
-        # Relative to what the regression makes of the demonstration, so that its errors cancel.
+        # The pick is relative to what the regression makes of the demonstration, so that the way in which it
+        # grasped is kept. Where it released is chance.
         states = (demonstrated - self.robot_states.state_shift) / self.robot_states.state_scale
         places = self.robot_states.to_image(states).clamp(-1, 1)
-        displacements = moved - self.robot_states(places, self.robot_states.heights(states[:, 0]))
+        expected = self.robot_states(places, self.robot_states.heights(states[:, 0]))
+        displacements = moved - torch.stack([expected[:, 0], demonstrated[:, 1]], dim=1)
         return self.replay.start(trajectories, self.state_limits(batch[OBS_STATE]), displacements)
 
     def _trajectory(self, demonstration: Demonstration | None) -> Trajectory:

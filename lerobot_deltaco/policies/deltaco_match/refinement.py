@@ -23,7 +23,7 @@ _CHANNELS = 32
 # Standard deviations in training: of centers, in diameters, and of the log of sizes.
 _OFFSET, _LOG_SCALE = 0.25, 0.1
 _P_OTHER_COLORS = 0.7
-_STEPS, _BATCH = 300, 48
+_BATCH = 32
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
 _PEAK_RADIUS = 2.6  # of the cells around a peak whose mean is the location
 _ROUNDS = 2  # of looking
@@ -86,6 +86,7 @@ class GraspRefiner(nn.Module):
         proposals: Tensor,
         sizes: Tensor,
         held_out: Tensor,
+        steps: int,
         generator: torch.Generator,
         autocast: torch.autocast,
     ) -> None:
@@ -97,6 +98,7 @@ class GraspRefiner(nn.Module):
             proposals: The nearest proposals, (episodes, 2) in -1..1.
             sizes: Diameters of typical objects there, as fractions of the image's side, (episodes,).
             held_out: Episodes that are not fitted, (episodes,) bool.
+            steps: Number of steps.
             generator: Source of the draws, on the CPU.
             autocast: Context of the forward pass.
         """
@@ -106,9 +108,9 @@ class GraspRefiner(nn.Module):
             self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, fused=True
         )
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, _LEARNING_RATE, _STEPS, pct_start=_WARMUP_FRACTION
+            optimizer, _LEARNING_RATE, steps, pct_start=_WARMUP_FRACTION
         )
-        for _ in tqdm(range(_STEPS), desc="Fitting where grasps are", unit="step", leave=False):
+        for _ in tqdm(range(steps), desc="Fitting where grasps are", unit="step", leave=False):
             rows = fitted[torch.randint(len(fitted), (_BATCH,), generator=generator)].to(images.device)
             noise = torch.randn(_BATCH, 3, generator=generator).to(images.device)
             extent = _EXTENT * sizes[rows] * (_LOG_SCALE * noise[:, 2]).exp()

@@ -25,8 +25,9 @@ _RIDGE = 1e-5  # of the inverse dynamics, as a fraction of the number of samples
 # Parts of the path before the grasp, and before the release, in which the displacement changes.
 _APPROACH_BLEND, _CARRY_BLEND = (0.0, 0.6), (0.15, 0.75)
 # Distance from the moved trajectory within which its next state is approached: this much of its local step,
-# but no less than this much of a usual one.
+# but this much of a usual one where the gripper closes and opens, and no less anywhere.
 _STEPS_APART, _LEAST_APART = 1.0, 0.05
+_PASSED = 3.0  # tolerances within which a state counts as reached if the one after it is nearer
 _LEAST_APPROACH = 0.1  # of the tolerance, in a frame that comes closer
 _MAX_WAIT = 2  # frames that a state is waited for without coming closer
 _LEAST_EXPLAINED = 0.1  # of the variance of an action, by the dimension of the state that it moves
@@ -175,14 +176,18 @@ class TrajectoryReplay(nn.Module):
         lag = int(self.lag)
         later = torch.cat([recorded[:, lag:], recorded[:, -1:].expand(-1, lag, -1)], dim=1)[:, :n_frames]
         step = self._distance(states[:, 1:] - states[:, :-1])
-        step = torch.cat([step[:, :1], step], dim=1)
+        least = _LEAST_APART * self.usual_step
+        tolerances = (_STEPS_APART * torch.cat([step[:, :1], step], dim=1)).clamp_min(least)
+        for row, (_, _, grasp) in zip(tolerances, trajectories, strict=True):
+            for frame in (grasp.closing, grasp.closing + 1, grasp.release):
+                row[frame] = least
         zeros = torch.zeros(len(states), dtype=torch.int64, device=states.device)
         return Reference(
             states,
             later - recorded,
             recorded,
             actions,
-            (_STEPS_APART * step).clamp_min(_LEAST_APART * float(self.usual_step)),
+            tolerances,
             zeros,
             zeros,
             torch.full(zeros.shape, torch.inf, device=states.device),
@@ -201,9 +206,10 @@ class TrajectoryReplay(nn.Module):
         distance = self._distance(state - reference.states[rows, wanted])
         tolerance = reference.tolerances[rows, wanted]
         beyond = self._distance(state - reference.states[rows, (wanted + 1).clamp(max=last)])
+        is_passed = (beyond < distance) & (distance < _PASSED * tolerance)
         comes_closer = distance < reference.distance - _LEAST_APPROACH * tolerance
         waited = torch.where(comes_closer, 0, reference.waited + 1)
-        goes_on = (distance <= tolerance) | (beyond < distance) | (waited > _MAX_WAIT)
+        goes_on = (distance <= tolerance) | is_passed | (waited > _MAX_WAIT)
         frame = torch.where(goes_on, wanted, reference.frame)
         waited = torch.where(goes_on, 0, waited)
         distance = torch.where(goes_on, torch.inf, distance)
