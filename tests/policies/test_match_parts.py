@@ -8,7 +8,8 @@ from small_policies import random_moves
 from lerobot_deltaco.policies.base.augmentation import change_colors, random_color_changes
 from lerobot_deltaco.policies.base.configuration import has_bfloat16
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
-from lerobot_deltaco.policies.deltaco_match import fit
+from lerobot_deltaco.policies.deltaco_match import fit, localization
+from lerobot_deltaco.policies.deltaco_match import matching as matching_module
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching, fit_matching_head
 from lerobot_deltaco.policies.deltaco_match.localization import (
@@ -148,6 +149,22 @@ def matching(shapes, request):
         )
     assert matching.fitted
     return matching
+
+
+@pytest.fixture(scope="module", autouse=True)
+def encode_once():
+    """Encodes the same crops once."""
+    features = {}
+
+    def crop_features(*crops):
+        key = tuple(part.numpy().tobytes() for part in crops)
+        if key not in features:
+            features[key] = matching_module.crop_features(*crops)
+        return features[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(localization, "crop_features", crop_features)
+        yield
 
 
 def fraction_found(matching, shapes, by_demonstration=False, words=lambda task: "", grasp=None):

@@ -214,12 +214,11 @@ def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
 
 
 def test_feature_matching_takes_images_of_any_size(table):
-    for size in (16, 19):
-        policy, _, _ = small_policy(table, "deltaco_match", image_size=size)
-        policy(batch_of(table, [0]))
-        found = found_in(policy.eval(), batch_of(table, [0, 0]), [RED, ""], [[0], [2]])
-        assert found.locations.isfinite().all()
-        assert found.locations.abs().max() <= 1
+    policy, _, _ = small_policy(table, "deltaco_match", image_size=19)
+    policy(batch_of(table, [0]))
+    found = found_in(policy.eval(), batch_of(table, [0, 0]), [RED, ""], [[0], [2]])
+    assert found.locations.isfinite().all()
+    assert found.locations.abs().max() <= 1
 
 
 def test_actions_that_cannot_be_carried_out_are_errors(make, table):
