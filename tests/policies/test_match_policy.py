@@ -1,6 +1,7 @@
 """`deltaco_match` on a small synthetic pick-and-place dataset: two objects, of which one is moved."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from small_policies import (
 )
 
 from lerobot_deltaco.policies.base.normalization import StateLimits
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, PickPlace
 
 pytestmark = pytest.mark.usefixtures("short_fit")
 
@@ -319,3 +320,53 @@ def test_a_demonstration_may_be_given_by_hand_while_the_arm_rests(tremble, table
     action = policy.select_action(before(observation(table, [task])))
     assert torch.isfinite(action).all()
     assert policy.localization.by_demonstration[0]
+
+
+def test_replay_needs_a_demonstration_with_states_and_a_grasp(make, table):
+    policy = make(acting="replay").eval()
+    bank = policy.training_data.demonstrations
+    shown, scene = bank[0], batch_of(table, [2 * TABLE_LENGTH])
+    still = dataclasses.replace(shown, actions=torch.ones_like(shown.actions))
+    by_camera = dataclasses.replace(shown, states=None)
+    for demonstrations, message in (
+        ([], "needs a demonstration with the robot's states and actions"),
+        ([by_camera], "needs a demonstration with the robot's states and actions"),
+        ([still], "needs a demonstration with a grasp, but the gripper"),
+    ):
+        policy.set_tasks([RED], [demonstrations])
+        with pytest.raises(ValueError, match=message):
+            policy.select_action(scene)
+    policy.set_tasks([RED], [[shown]])
+    assert torch.isfinite(policy.select_action(scene)).all()
+    policy.replay.action_scale.zero_()
+    policy.set_tasks([RED], [[shown]])
+    with pytest.raises(ValueError, match="could not replay demonstrations. Train it again"):
+        policy.select_action(scene)
+
+
+def test_replay_repeats_the_demonstration_in_its_own_scene(table):
+    policy, before, _ = small_policy(table, "deltaco_match", acting="replay")
+    policy.eval()
+    located = policy.training_locations
+    policy.localize = lambda *_: PickPlace(
+        located.locations[:1], located.heights[:1], None, None, (True, False), torch.ones(1)
+    )
+    policy.set_tasks([RED], [[policy.training_data.demonstrations[0]]])
+    steps = range(1, TABLE_LENGTH)
+    actions = torch.cat([policy.select_action(before(batch_of(table, [step]))) for step in steps])
+    recorded = before(batch_of(table, list(steps)))["action"]
+    assert torch.equal(actions[:, -1] > 0, recorded[:, -1] > 0)
+    torch.testing.assert_close(actions, recorded, atol=0.05, rtol=0)
+
+
+def test_a_checkpoint_keeps_the_trajectories_of_its_demonstrations(make, table, tmp_path):
+    policy, before, _ = small_policy(table, "deltaco_match", acting="replay", **demos_of(table))
+    policy.eval().save_pretrained(tmp_path)
+    loaded = DeltacoMatchPolicy.from_pretrained(tmp_path).eval()
+    for row in range(2):
+        for own, kept in zip(
+            policy.demonstrations.trajectory(row), loaded.demonstrations.trajectory(row), strict=True
+        ):
+            assert torch.equal(own, kept)
+    scene = before(observation(table, [RED]))
+    torch.testing.assert_close(loaded.select_action(scene), policy.select_action(scene))

@@ -51,7 +51,7 @@ def demonstrate(kind, start, pick, place):
     closed = np.flatnonzero(np.array(actions)[:, GRIPPER] == 0)
     grasp = Grasp(closed[0] - 1, closed[0] + 1, closed[-1], closed[-1] + 1)
     states, actions = (torch.from_numpy(np.array(each)).float() for each in (states, actions))
-    return Trajectory(states, actions, grasp)
+    return Trajectory(states, actions, grasp, states[[grasp.grasp, grasp.release]])
 
 
 def draw(rng):

@@ -442,13 +442,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             ValueError: There is none, or the policy was trained before it could replay.
         """
         trajectories = [self._trajectory(shown[0] if shown else None) for shown in demonstrations]
-        demonstrated = torch.stack(
-            [each.states[[each.grasp.grasp, each.grasp.release]] for each in trajectories]
-        )  # (batch, 2, state)
+        states = torch.stack([each.keyframes for each in trajectories])  # (batch, 2, state)
+        demonstrated = states * self.robot_states.state_scale + self.robot_states.state_shift
         moved = self.robot_states(localization.locations, localization.heights)
         # The pick is relative to what the regression makes of the demonstration, so that the way in which it
         # grasped is kept. Where it released is chance.
-        states = (demonstrated - self.robot_states.state_shift) / self.robot_states.state_scale
         places = self.robot_states.to_image(states).clamp(-1, 1)
         expected = self.robot_states(places, self.robot_states.heights(states[:, 0]))
         displacements = moved - torch.stack([expected[:, 0], demonstrated[:, 1]], dim=1)
@@ -483,6 +481,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             states * self.robot_states.state_scale + self.robot_states.state_shift,
             actions * self.replay.action_scale + self.replay.action_shift,
             grasp,
+            states[[grasp.grasp, grasp.release]],
         )
 
     # Before the first step

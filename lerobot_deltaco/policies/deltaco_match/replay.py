@@ -20,7 +20,8 @@ from torch import Tensor, nn
 
 from lerobot_deltaco.data.grasps import Grasp
 
-_MAX_LAG = 8  # frames after which the effect of an action is looked for
+# Frames after which the effect of an action is looked for: at most so many, and this part of an episode.
+_MAX_LAG, _STEPS_PER_LAG = 8, 4
 _RIDGE = 1e-5  # of the inverse dynamics, as a fraction of the number of samples
 # Parts of the path before the grasp, and before the release, in which the displacement changes.
 _APPROACH_BLEND, _CARRY_BLEND = (0.0, 0.6), (0.15, 0.75)
@@ -41,11 +42,13 @@ class Trajectory(NamedTuple):
         states: (frames, state), normalized.
         actions: (frames, action), normalized.
         grasp: Its grasp.
+        keyframes: States at the grasp and at the release, as in the dataset, (2, state).
     """
 
     states: Tensor
     actions: Tensor
     grasp: Grasp
+    keyframes: Tensor
 
 
 class Reference(NamedTuple):
@@ -121,14 +124,18 @@ class TrajectoryReplay(nn.Module):
             is_arm: Dimensions of the state other than the gripper's, (state,) bool.
             gripper_index: Dimension of the action that is the gripper.
         """
-        trajectories = [each for each in trajectories if len(each[0]) > _MAX_LAG]
-        states = torch.cat([s[:-_MAX_LAG] for s, _ in trajectories]).double()
+        shortest = min(len(states) for states, _ in trajectories)
+        n_lags = max(1, min(_MAX_LAG, shortest // _STEPS_PER_LAG))
+        trajectories = [each for each in trajectories if len(each[0]) > n_lags]
+        states = torch.cat([s[:-n_lags] for s, _ in trajectories]).double()
         later = [
-            torch.cat([s[lag : len(s) - _MAX_LAG + lag] for s, _ in trajectories]).double()
-            for lag in range(1, _MAX_LAG + 1)
+            torch.cat([s[lag : len(s) - n_lags + lag] for s, _ in trajectories]).double()
+            for lag in range(1, n_lags + 1)
         ]
-        actions = torch.cat([a[:-_MAX_LAG] for _, a in trajectories]).double()
+        actions = torch.cat([a[:-n_lags] for _, a in trajectories]).double()
         actions[:, gripper_index] = 0
+        for buffer in (self.is_arm, self.displacement_gain, self.state_gain):
+            buffer.zero_()
         candidates = (is_arm & ~_velocities([s for s, _ in trajectories])).nonzero().flatten().tolist()
         least = float("inf")
         for lag, each in enumerate(later, start=1):
@@ -140,8 +147,8 @@ class TrajectoryReplay(nn.Module):
                 for buffer in (self.is_arm, self.displacement_gain, self.state_gain):
                     buffer.zero_()
                 self.is_arm[moved] = 1
-                self.displacement_gain[moved] = weights[:n].float()
-                self.state_gain[moved] = weights[n : 2 * n].float()
+                self.displacement_gain[moved] = weights[:n].to(self.is_arm)
+                self.state_gain[moved] = weights[n : 2 * n].to(self.is_arm)
         steps = torch.cat([self._distance(s[1:] - s[:-1]) for s, _ in trajectories])
         self.usual_step.copy_(steps.quantile(0.9))
 
@@ -178,8 +185,8 @@ class TrajectoryReplay(nn.Module):
         step = self._distance(states[:, 1:] - states[:, :-1])
         least = _LEAST_APART * self.usual_step
         tolerances = (_STEPS_APART * torch.cat([step[:, :1], step], dim=1)).clamp_min(least)
-        for row, (_, _, grasp) in zip(tolerances, trajectories, strict=True):
-            for frame in (grasp.closing, grasp.closing + 1, grasp.release):
+        for row, each in zip(tolerances, trajectories, strict=True):
+            for frame in (each.grasp.closing, each.grasp.closing + 1, each.grasp.release):
                 row[frame] = least
         zeros = torch.zeros(len(states), dtype=torch.int64, device=states.device)
         return Reference(

@@ -1,0 +1,66 @@
+"""The second look at a picked object: drawn disks, which the gripper takes by their left edge."""
+
+import contextlib
+
+import pytest
+import torch
+
+from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner
+
+SIZE, RADIUS = 96, 7
+N_EPISODES, N_HELD_OUT = 48, 16
+
+
+def disks(centers, generator):
+    """Draws a disk at each center (n, 2), px, on a gray table."""
+    y, x = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    away = torch.hypot(x + 0.5 - centers[:, :1, None], y + 0.5 - centers[:, 1:, None])
+    colors = torch.randint(0, 256, (len(centers), 3, 1, 1), generator=generator)
+    return torch.where((away < RADIUS)[:, None], colors, 120).to(torch.uint8)
+
+
+@pytest.fixture(scope="module")
+def refined():
+    """A refiner that was fitted, and the episodes that it was fitted to."""
+    generator = torch.Generator().manual_seed(0)
+    centers = 20 + 56 * torch.rand(N_EPISODES, 2, generator=generator)
+    images = disks(centers, generator)
+    edges = centers - torch.tensor([RADIUS, 0])
+    grasps, middles = (2 * each / SIZE - 1 for each in (edges, centers))
+    sizes = torch.full((N_EPISODES,), 2 * RADIUS / SIZE)
+    held_out = torch.arange(N_EPISODES) % 3 == 0
+    torch.manual_seed(0)
+    refiner = GraspRefiner()
+    data = (images, grasps, middles, sizes, held_out)
+    refiner.fit(*data, 120, generator, contextlib.nullcontext())
+    return refiner, data
+
+
+def test_the_grasp_is_found_beside_the_middle_of_the_object(refined):
+    refiner, (images, grasps, middles, sizes, held_out) = refined
+    found = refiner(images[held_out], middles[held_out], sizes[held_out])
+    errors = (found - grasps[held_out]).norm(dim=1) * SIZE / 2  # px
+    assert errors.median() < 1.5
+    before, after = refiner.errors.tolist()
+    assert before == pytest.approx(2 * RADIUS / SIZE, rel=1e-3)
+    assert after < before / 3
+
+
+def test_what_does_not_come_nearer_is_not_used(refined):
+    _, (images, grasps, _, sizes, held_out) = refined
+    torch.manual_seed(0)
+    refiner = GraspRefiner()
+    # The proposals are right already.
+    refiner.fit(
+        images, grasps, grasps, sizes, held_out, 1, torch.Generator().manual_seed(0), contextlib.nullcontext()
+    )
+    assert not refiner.is_used
+    assert torch.equal(refiner(images, grasps, sizes), grasps)
+
+
+def test_without_held_out_episodes_it_is_not_used(refined):
+    _, (images, grasps, middles, sizes, held_out) = refined
+    refiner = GraspRefiner()
+    nothing = torch.zeros_like(held_out)
+    refiner.fit(images, grasps, middles, sizes, nothing, 1, torch.Generator(), contextlib.nullcontext())
+    assert torch.equal(refiner(images, middles, sizes), middles)
