@@ -34,9 +34,9 @@ TASKS = (
     "shelf-place-v3",
     "stick-push-v3",
 )
-RENDERED_SIZE = 96
-CUT = (slice(16, 80), slice(32, 96))  # rows and columns in which objects and the gripper can be
-IMAGE_SIZE = 64
+RENDERED_SIZE = 192
+CUT = (slice(32, 160), slice(64, 192))  # rows and columns in which objects and the gripper can be
+IMAGE_SIZE = 128
 REPEATS = 2  # steps of Meta-World, at 80 Hz, that an action lasts
 EPISODE_LENGTH = 150  # actions
 RELEASE_LENGTH = 6  # actions at the end of a recorded episode that open the gripper

@@ -8,7 +8,7 @@ import torch
 from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner
 
 SIZE, RADIUS = 96, 7
-N_EPISODES, N_HELD_OUT = 48, 16
+N_EPISODES = 36
 
 
 def disks(centers, generator):
@@ -32,7 +32,7 @@ def refined():
     torch.manual_seed(0)
     refiner = GraspRefiner()
     data = (images, grasps, middles, sizes, held_out)
-    refiner.fit(*data, 120, generator, contextlib.nullcontext())
+    refiner.fit(*data, 60, generator, contextlib.nullcontext())
     return refiner, data
 
 
