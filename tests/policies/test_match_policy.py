@@ -322,26 +322,43 @@ def test_a_demonstration_may_be_given_by_hand_while_the_arm_rests(tremble, table
     assert policy.localization.by_demonstration[0]
 
 
-def test_replay_needs_a_demonstration_with_states_and_a_grasp(make, table):
+def test_the_network_acts_where_a_demonstration_cannot_be_replayed(make, table, caplog):
     policy = make(acting="replay").eval()
-    bank = policy.training_data.demonstrations
-    shown, scene = bank[0], batch_of(table, [2 * TABLE_LENGTH])
-    still = dataclasses.replace(shown, actions=torch.ones_like(shown.actions))
+    shown, scene = policy.training_data.demonstrations[0], batch_of(table, [2 * TABLE_LENGTH])
+
+    def act(*demonstrations):
+        policy.set_tasks([RED] * len(demonstrations), demonstrations)
+        return policy.select_action(batch_of(table, [2 * TABLE_LENGTH] * len(demonstrations)))
+
+    replayed = act([shown])
+    assert "replayed" not in caplog.text
     by_camera = dataclasses.replace(shown, states=None)
+    still = dataclasses.replace(shown, actions=torch.ones_like(shown.actions))
     for demonstrations, message in (
-        ([], "needs a demonstration with the robot's states and actions"),
-        ([by_camera], "needs a demonstration with the robot's states and actions"),
-        ([still], "needs a demonstration with a grasp, but the gripper"),
+        ([], "none was given"),
+        ([by_camera], "the demonstration has no states and actions of the robot"),
+        ([still], "the gripper"),
     ):
-        policy.set_tasks([RED], [demonstrations])
-        with pytest.raises(ValueError, match=message):
-            policy.select_action(scene)
-    policy.set_tasks([RED], [[shown]])
-    assert torch.isfinite(policy.select_action(scene)).all()
+        caplog.clear()
+        action = act(demonstrations)
+        assert f"no demonstration can be replayed: {message}" in caplog.text
+        policy.config.acting = "network"
+        torch.testing.assert_close(act(demonstrations), action)
+        policy.config.acting = "replay"
+    # Each sample of a batch on its own
+    both = act([by_camera], [shown])
+    torch.testing.assert_close(both[1:], replayed)
+    torch.testing.assert_close(both[:1], act([by_camera]))
     policy.replay.action_scale.zero_()
     policy.set_tasks([RED], [[shown]])
     with pytest.raises(ValueError, match="could not replay demonstrations. Train it again"):
         policy.select_action(scene)
+
+
+def test_few_episodes_are_replayed(make, monkeypatch):
+    assert make().config.acting == "replay"
+    monkeypatch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._MAX_REPLAYED", 40)
+    assert make().config.acting == "network"
 
 
 def test_replay_repeats_the_demonstration_in_its_own_scene(table):

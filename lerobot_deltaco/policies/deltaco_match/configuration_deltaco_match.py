@@ -24,7 +24,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
 
     Args:
         acting: "network": the policy network acts. "replay": the demonstration's trajectory is replayed,
-            moved to where the policy picks and places. Training is the same: a checkpoint acts either way.
+            moved to where the policy picks and places; without a trajectory, the network acts. Training is
+            the same: a checkpoint acts either way. With None, training chooses "replay" for up to 200
+            episodes.
         crop_size: Side of the square around an object that is compared, in the middle of the first camera's
             image and as a fraction of its side. Used only where objects do not stand out from other scenes,
             such as after a camera was moved during recording; otherwise, the size of objects is measured.
@@ -45,7 +47,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     """
 
     chunk_size: int | None = None
-    acting: str = "network"
+    acting: str | None = None
     crop_size: float = 0.17
     n_demonstrations: int = 1
     num_mixture_components: int = 5
@@ -70,7 +72,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             ValueError: An option is invalid; the message says what is valid.
         """
         super().check()
-        self.check_choices(acting=("network", "replay"))
+        self.check_choices(acting=(None, "network", "replay"))
         self.check_ranges(
             crop_size=(0.01, 1),
             n_demonstrations=(1, 1000),

@@ -20,6 +20,7 @@ have to wait for the place network, which learns beside it.
 
 # No `from __future__ import annotations`: LeRobot expects the annotation of `config` to be a class.
 
+import logging
 from collections.abc import Iterable, Sequence
 from itertools import chain, starmap
 from typing import Any, NamedTuple
@@ -30,8 +31,8 @@ from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_tra
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.data.demonstrations import Demonstration, RobotData
-from lerobot_deltaco.data.grasps import Grasp, find_grasps, warn_of_missing
+from lerobot_deltaco.data.demonstrations import RobotData
+from lerobot_deltaco.data.grasps import warn_of_missing
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
 from lerobot_deltaco.data.gripper_states import find_gripper_states
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
@@ -65,8 +66,12 @@ from lerobot_deltaco.policies.deltaco_match.words import (
     vocabulary_of,
 )
 
+logger = logging.getLogger(__name__)
+
 _GRIPPER_LOSS = "cross_entropy"
 _PLACE_FRACTION = 0.25  # of a batch's samples, which train the place network and the attention
+# Training episodes up to which demonstrations are replayed, unless `acting` says otherwise.
+_MAX_REPLAYED = 200
 _HEIGHT_NOISE = 0.1  # of the policy network's heights, in standard deviations over the training episodes
 _SHIFT_PADDING = 4  # px, of the random shifts of the place network's images
 _P_PLACE_BY_DEMONSTRATION = 0.25  # of the place network's samples; in the others, the instruction says where
@@ -102,6 +107,7 @@ class RunningEpisode(NamedTuple):
     localization: PickPlace
     network: PolicyNetwork
     reference: Reference | None
+    replayed: Tensor
 
 
 class DemonstrationBatch(NamedTuple):
@@ -301,18 +307,24 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             if demonstrations is None:
                 demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
             localization = self.localize(batch, instructions, demonstrations)
-            reference = None
+            reference, replayed = None, torch.zeros(len(instructions), dtype=torch.bool)
             if self.config.acting == "replay":
-                reference = self._move_demonstrations(demonstrations, localization, batch)
-            self._start(RunningEpisode(instructions, localization, self._acting_network(), reference))
+                reference, replayed = self._move_demonstrations(demonstrations, localization, batch)
+            network = self._acting_network()
+            self._start(RunningEpisode(instructions, localization, network, reference, replayed))
         episode: RunningEpisode = self._episode
+        replay = None
         if episode.reference is not None:
-            reference, action = self.replay.follow(episode.reference, self.state_limits(batch[OBS_STATE]))
+            reference, replay = self.replay.follow(episode.reference, self.state_limits(batch[OBS_STATE]))
             self._episode = episode._replace(reference=reference)
-            return self._checked_action(batch, action[:, None])
+            if bool(episode.replayed.all()):
+                return self._checked_action(batch, replay[:, None])
         locations, heights = episode.localization.locations, episode.localization.heights
         inputs = self._fuse_inputs(batch, locations, heights)
-        return self._sample_action(batch, *episode.network(self._images(batch), None, inputs, locations))
+        actions = self._sample_action(batch, *episode.network(self._images(batch), None, inputs, locations))
+        if replay is not None:
+            actions = torch.where(episode.replayed[:, None, None], replay[:, None], actions[:, :1])
+        return actions
 
     @property
     def localization(self) -> PickPlace | None:
@@ -435,13 +447,27 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     def _move_demonstrations(
         self, demonstrations: DemonstrationsOfTasks, localization: PickPlace, batch: dict[str, Any]
-    ) -> Reference:
+    ) -> tuple[Reference | None, Tensor]:
         """Moves the trajectory of each sample's first demonstration to where the policy picks and places.
 
+        Returns:
+            The moved trajectories, None if there are none, and whether each sample has one, (batch,) bool.
+
         Raises:
-            ValueError: There is none, or the policy was trained before it could replay.
+            ValueError: The policy was trained before it could replay.
         """
-        trajectories = [self._trajectory(shown[0] if shown else None) for shown in demonstrations]
+        command = self.config.gripper_command
+        assert command is not None
+        read = [self.replay.trajectory(shown[0] if shown else None, command) for shown in demonstrations]
+        reasons = {each for each in read if isinstance(each, str)}
+        if reasons:
+            logger.warning("The policy network acts, since no demonstration can be replayed: %s.", *reasons)
+        replayed = torch.tensor([isinstance(each, Trajectory) for each in read], device=self.step.device)
+        trajectories = [each for each in read if isinstance(each, Trajectory)]
+        if not trajectories:
+            return None, replayed
+        # The others get any one, and do not follow it.
+        trajectories = [each if isinstance(each, Trajectory) else trajectories[0] for each in read]
         states = torch.stack([each.keyframes for each in trajectories])  # (batch, 2, state)
         demonstrated = states * self.robot_states.state_scale + self.robot_states.state_shift
         moved = self.robot_states(localization.locations, localization.heights)
@@ -450,39 +476,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         places = self.robot_states.to_image(states).clamp(-1, 1)
         expected = self.robot_states(places, self.robot_states.heights(states[:, 0]))
         displacements = moved - torch.stack([expected[:, 0], demonstrated[:, 1]], dim=1)
-        return self.replay.start(trajectories, self.state_limits(batch[OBS_STATE]), displacements)
-
-    def _trajectory(self, demonstration: Demonstration | None) -> Trajectory:
-        """Returns the trajectory of a demonstration, normalized."""
-        command = self.config.gripper_command
-        assert command is not None
-        if demonstration is None or demonstration.states is None or demonstration.actions is None:
-            raise UserError(
-                "`acting=replay` needs a demonstration with the robot's states and actions. Give one, or act "
-                "with --policy.acting=network."
-            )
-        if not bool(self.replay.action_scale.any()):
-            raise UserError(
-                "The checkpoint was trained by a version that could not replay demonstrations. Train it "
-                "again, or act with --policy.acting=network."
-            )
-        states = demonstration.states.to(self.step.device).float()
-        actions = demonstration.actions.to(self.step.device).float()
-        span = (0, len(states) - 1)
-        (grasp,) = find_grasps(command.opening(actions), [span], command.usual_range, states)
-        if not isinstance(grasp, Grasp):
-            raise UserError(
-                f"`acting=replay` needs a demonstration with a grasp, but {grasp}. Give another one, or act "
-                "with --policy.acting=network."
-            )
-        # The command to close takes effect one step later.
-        grasp = grasp._replace(grasp=min(grasp.grasp + 1, grasp.release))
-        return Trajectory(
-            states * self.robot_states.state_scale + self.robot_states.state_shift,
-            actions * self.replay.action_scale + self.replay.action_shift,
-            grasp,
-            states[[grasp.grasp, grasp.release]],
-        )
+        return self.replay.start(trajectories, self.state_limits(batch[OBS_STATE]), displacements), replayed
 
     # Before the first step
 
@@ -521,6 +515,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         gripper_states = find_gripper_states(robot.states, opening, robot.spans, robot.state_names)
         gripper_states.warn()
         n_grasps = int(grasps.has_grasp.sum())
+        if self.config.acting is None:
+            self.config.acting = "replay" if n_grasps <= _MAX_REPLAYED else "network"
+            logger.info("From %d episodes with a grasp, `acting` is %r.", n_grasps, self.config.acting)
         if n_grasps < MIN_EPISODES:
             raise UserError(
                 f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} "
@@ -548,11 +545,14 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert self.config.gripper_index is not None
         ends = torch.stack([torch.zeros(robot.actions.shape[1]), torch.ones(robot.actions.shape[1])])
         shift, end = self._normalize(ends, ACTION)
-        self.replay.action_scale.copy_(end - shift)
-        self.replay.action_shift.copy_(shift)
-        states = robot.states * self.robot_states.state_scale + self.robot_states.state_shift
-        actions = robot.actions * self.replay.action_scale + self.replay.action_shift
-        self.replay.fit(
+        replay, regressor = self.replay, self.robot_states
+        replay.action_scale.copy_(end - shift)
+        replay.action_shift.copy_(shift)
+        replay.state_scale.copy_(regressor.state_scale)
+        replay.state_shift.copy_(regressor.state_shift)
+        states = robot.states * replay.state_scale + replay.state_shift
+        actions = robot.actions * replay.action_scale + replay.action_shift
+        replay.fit(
             [(states[first : last + 1], actions[first : last + 1]) for first, last in robot.spans],
             is_arm,
             self.config.gripper_index,

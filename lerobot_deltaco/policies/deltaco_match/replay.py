@@ -18,7 +18,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lerobot_deltaco.data.grasps import Grasp
+from lerobot_deltaco.data.demonstrations import Demonstration
+from lerobot_deltaco.data.grasps import Grasp, find_grasps
+from lerobot_deltaco.data.gripper import Gripper
+from lerobot_deltaco.errors import UserError
 
 # Frames after which the effect of an action is looked for: at most so many, and this part of an episode.
 _MAX_LAG, _STEPS_PER_LAG = 8, 4
@@ -97,6 +100,8 @@ class TrajectoryReplay(nn.Module):
     usual_step: Tensor
     action_scale: Tensor
     action_shift: Tensor
+    state_scale: Tensor
+    state_shift: Tensor
 
     def __init__(self, state_dim: int, action_dim: int) -> None:
         super().__init__()
@@ -105,9 +110,11 @@ class TrajectoryReplay(nn.Module):
         self.register_buffer("lag", torch.ones((), dtype=torch.int64))
         self.register_buffer("is_arm", torch.ones(state_dim))
         self.register_buffer("usual_step", torch.ones(()))
-        # An action as it is predicted is action_scale * action + action_shift.
+        # An action as it is predicted is action_scale * action + action_shift; so are states.
         self.register_buffer("action_scale", torch.zeros(action_dim))
         self.register_buffer("action_shift", torch.zeros(action_dim))
+        self.register_buffer("state_scale", torch.ones(state_dim))
+        self.register_buffer("state_shift", torch.zeros(state_dim))
         self.register_load_state_dict_pre_hook(self._add_state)
 
     @staticmethod
@@ -155,6 +162,41 @@ class TrajectoryReplay(nn.Module):
     def _distance(self, displacements: Tensor) -> Tensor:
         """Returns the size of the actions that make displacements of states, (...)."""
         return (displacements @ self.displacement_gain).norm(dim=-1)
+
+    def trajectory(self, demonstration: Demonstration | None, command: Gripper) -> Trajectory | str:
+        """Returns the trajectory of a demonstration, or the reason why it cannot be replayed.
+
+        Args:
+            demonstration: The demonstration; None if there is none.
+            command: How the gripper is read from an action.
+
+        Raises:
+            ValueError: Nothing was fitted.
+        """
+        if not bool(self.action_scale.any()):
+            raise UserError(
+                "The checkpoint was trained by a version that could not replay demonstrations. Train it "
+                "again, or act with --policy.acting=network."
+            )
+        if demonstration is None:
+            return "none was given"
+        if demonstration.states is None or demonstration.actions is None:
+            return "the demonstration has no states and actions of the robot"
+        states, actions = (
+            each.to(self.is_arm.device).float() for each in (demonstration.states, demonstration.actions)
+        )
+        span = (0, len(states) - 1)
+        (grasp,) = find_grasps(command.opening(actions), [span], command.usual_range, states)
+        if isinstance(grasp, str):
+            return grasp
+        # The command to close takes effect one step later.
+        grasp = grasp._replace(grasp=min(grasp.grasp + 1, grasp.release))
+        return Trajectory(
+            states * self.state_scale + self.state_shift,
+            actions * self.action_scale + self.action_shift,
+            grasp,
+            states[[grasp.grasp, grasp.release]],
+        )
 
     def start(
         self,
