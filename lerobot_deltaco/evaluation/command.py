@@ -78,6 +78,7 @@ class EvaluateArguments:
             raise UserError("--demo-root is the folder of the dataset --demo-repo-id. Name that, too.")
         if not isinstance(self.renaming, dict | None):
             raise UserError(f"--rename-map must be a JSON object, {{...}}. Got {self.rename_map}.")
+        self.plan.scene_seed(self.plan.task_ids[0], trial=0)  # fails here, and not later, if it is sealed
 
     @property
     def renaming(self) -> dict[str, str] | None:
