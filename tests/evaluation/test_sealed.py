@@ -7,7 +7,7 @@ import pytest
 
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation import sealed
-from lerobot_deltaco.evaluation.command import EvaluateArguments
+from lerobot_deltaco.evaluation.command import EvaluateArguments, evaluate_checkpoints
 from lerobot_deltaco.evaluation.records import EvaluationPlan
 
 SEEDS = [f"{number:032x}\n" for number in (3, 2**127)]
@@ -22,16 +22,17 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_sealed_scenes_are_refused_until_their_seed_is_there(folder):
-    plan = EvaluationPlan(scene_split="sealed")
+    arguments = EvaluateArguments(Path("missing"), EvaluationPlan(scene_split="sealed"))
     name = sealed.sealed_splits()[-1]
-    assert plan.scene_split == name
+    assert arguments.plan.scene_split == name
     with pytest.raises(UserError, match=f"closed until the release.*{name}.txt.*{sealed.DIGESTS[-1]}"):
-        EvaluateArguments(Path("any"), plan)
+        evaluate_checkpoints(arguments)
     (folder / f"{name}.txt").write_text(SEEDS[0])
     with pytest.raises(UserError, match="is not the file of the seed"):
-        EvaluateArguments(Path("any"), plan)
+        evaluate_checkpoints(arguments)
     (folder / f"{name}.txt").write_text(SEEDS[1])
-    EvaluateArguments(Path("any"), plan)
+    with pytest.raises(UserError, match="missing has no checkpoints"):
+        evaluate_checkpoints(arguments)
 
 
 def test_scenes_follow_from_the_seed(folder):
