@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gym_deltaco.control import CONTROLS
 from gym_deltaco.env import N_JOINTS, PickPlaceEnv
 from gym_deltaco.expert import Expert, JointExpert, target_positions
 from gym_deltaco.robot.kinematics import forward, inverse
@@ -37,10 +36,16 @@ def check_oracle(policy: Any, oracle: Oracle) -> None:
         )
 
 
+def state_at(position: NDArray[np.float64], control: str) -> NDArray[np.float64]:
+    """Returns the robot's state with the open gripper at a position of the end effector, (3,), m."""
+    joints, opening = inverse(position), 1.0
+    return np.array([*joints, opening] if control == "joints" else [*joints, *position, opening])
+
+
 def give_locations(policy: Any, envs: Sequence[PickPlaceEnv]) -> None:
     """Gives a policy the robot's states at the true pick and place of each environment's scene."""
     states = [
-        [_state_at(position, env.scene_config.control) for position in target_positions(env.scene)]
+        [state_at(position, env.scene_config.control) for position in target_positions(env.scene)]
         for env in envs
     ]
     device = next(policy.parameters()).device
@@ -69,11 +74,3 @@ def make_controllers(policy: Any, envs: Sequence[PickPlaceEnv]) -> list[Expert]:
         kind(env, np.random.default_rng(0), noise=0.0, goals=goals)
         for env, goals in zip(envs, positions, strict=True)
     ]
-
-
-def _state_at(position: NDArray[np.float64], control: str) -> NDArray[np.float64]:
-    """Returns the robot's state with the open gripper at a position."""
-    joints, opening = inverse(position), 1.0
-    state = [*joints, opening] if control == "joints" else [*joints, *position, opening]
-    assert len(state) == len(CONTROLS[control].state_names)
-    return np.array(state)

@@ -14,7 +14,7 @@ from gym_deltaco.scene_config import SceneConfig
 from lerobot_deltaco.evaluation.checkpoints import load_policy
 from lerobot_deltaco.evaluation.evaluate import evaluate
 from lerobot_deltaco.evaluation.failures import FAILURES, NO_FAILURE, EpisodeMonitor
-from lerobot_deltaco.evaluation.oracle import check_oracle
+from lerobot_deltaco.evaluation.oracle import check_oracle, state_at
 from lerobot_deltaco.evaluation.records import EvaluationPlan, Oracle
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 
@@ -80,6 +80,18 @@ def test_the_controller_reaches_the_goals(control, kind):
             for _ in range(env.scene_config.n_steps):
                 info = env.step(controller.act())[-1]
             assert info["is_success"] == info["right_object"] == succeeds
+
+
+@pytest.mark.parametrize(("control", "kind"), [("position", Expert), ("joints", JointExpert)])
+def test_the_state_at_a_position_is_the_robots_own(control, kind):
+    with closing(PickPlaceEnv(4, SceneConfig(control=control))) as env:
+        env.reset(seed=0)
+        expert = kind(env, np.random.default_rng(0), noise=0.0)
+        for _ in range(3 if control == "position" else 30):
+            observation = env.step(expert.act())[0]
+        assert env.scene.arm.is_open
+        expected = state_at(env.scene.arm.position, control)
+        np.testing.assert_allclose(observation["agent_pos"], expected, atol=0.05)
 
 
 def carry(env, monitor, n_steps=4):
