@@ -46,6 +46,10 @@ COMMANDS = {
     "report": Command(
         "Write tables and a figure from the records of evaluations.", "reports.report.write_report"
     ),
+    "compare": Command(
+        "Compare two evaluations in the same scenes, and say whether it is decided.",
+        "reports.compare.compare_records",
+    ),
     "experiment": Command(
         "Run experiments: collect, train, evaluate and report.", "experiments.run.run_experiments"
     ),

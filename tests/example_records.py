@@ -40,6 +40,9 @@ def make_record(
             "right_object": success,
             "right_container": success,
             "p_pick": np.nan,
+            "pick_error": np.nan,
+            "place_error": np.nan,
+            "failure": None,
         }
     ).assign(**(columns or {}))
     other = {

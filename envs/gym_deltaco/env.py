@@ -246,9 +246,8 @@ class PickPlaceEnv(gym.Env[Observation, NDArray[np.float32]]):
         else:
             scene.command(scene.arm.position + ACTION_SCALE * np.array(motion), is_open=bool(gripper > 0))
         self._n_steps += 1
-        for index in range(len(scene.bodies)):
-            if scene.is_grasped(index):
-                self._grasped_object = index
+        if (held := scene.held_object) >= 0:
+            self._grasped_object = held
         info = self._info()
         is_truncated = self._n_steps >= self.scene_config.n_steps
         return self._observation(), float(info["is_success"]), False, is_truncated, info

@@ -14,6 +14,7 @@ from gym_deltaco import EXPERT_NOISE
 from gym_deltaco.env import ACTION_SCALE, Observation, PickPlaceEnv
 from gym_deltaco.robot.arm import FINGER_OPEN, FINGER_THICKNESS, FINGERTIP_OFFSET, POSITION_HIGH, POSITION_LOW
 from gym_deltaco.robot.kinematics import inverse
+from gym_deltaco.scene import Scene
 from gym_deltaco.scene_config import DEFAULT_SCENE, SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.sim.workspace import (
@@ -136,6 +137,30 @@ def record_demonstration(task_id: int, number: int = 0, scene: SceneConfig = DEF
     raise RuntimeError(f"The expert failed {_MAX_ATTEMPTS} times at: {env.task.instruction}")
 
 
+def grasp_position(scene: Scene, index: int) -> NDArray[np.float64]:
+    """Returns the position of the end effector at which the expert grasps an object, (3,), m."""
+    xy, (bottom, top) = scene.object_pose(index).position[:2], scene.object_span(index)
+    height = scene.layout.objects[index].model.grasp_height
+    tip_z = max(
+        bottom + min(height, top - bottom - _PAD_HEIGHT) - _PAD_HEIGHT,
+        TRAY_FLOOR + _TIP_CLEARANCE,
+    )
+    return np.array([*xy, max(tip_z + FINGERTIP_OFFSET, top + _PALM_CLEARANCE)])
+
+
+def target_positions(scene: Scene) -> NDArray[np.float64]:
+    """Returns where the end effector grasps and releases the target of a scene, (2, 3), m.
+
+    The release is above the middle of the target container.
+    """
+    layout = scene.layout
+    grasp = grasp_position(scene, layout.target_object)
+    bottom, _ = scene.object_span(layout.target_object)
+    middle = layout.containers[layout.target_container].quadrant.container_center
+    release_z = grasp[2] + CONTAINER_FLOOR + _RELEASE_CLEARANCE - bottom
+    return np.array([grasp, [*middle, release_z]])
+
+
 @dataclass(eq=False)
 class Expert:
     """Policy for one episode that reads the privileged state of the scene.
@@ -148,6 +173,9 @@ class Expert:
         rng: Source of the drop point and of the noise.
         noise: Standard deviation of the Gaussian noise on the first three numbers of the actions; the binary
             command of the gripper has no noise.
+        goals: Positions of the end effector at the grasp and at the release, (2, 3), m. With them, the expert
+            grasps there, whatever stands there, and releases what it holds there; by default, it puts the
+            target into its container.
 
     Attributes:
         stage: Stage of the last action.
@@ -157,15 +185,17 @@ class Expert:
     env: PickPlaceEnv
     rng: np.random.Generator
     noise: float = EXPERT_NOISE
+    goals: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         self._scene = self.env.scene
         layout = self._scene.layout
         self._target, self._container = layout.target_object, layout.target_container
-        self._grasp_height = layout.objects[self._target].model.grasp_height
         middle = layout.containers[self._container].quadrant.container_center
         spread = _DROP_FRACTION * np.array(CONTAINER_HALF_EXTENTS)
         self._drop_xy = self.rng.uniform(middle - spread, middle + spread)
+        if self.goals is not None:
+            self._drop_xy = self.goals[1, :2]
         self._rest: NDArray[np.float64] | None = None
         self.stage = Stage.REACH
         self.is_done = False
@@ -183,33 +213,35 @@ class Expert:
     def _plan(self, gripper: NDArray[np.float64]) -> tuple[Stage, NDArray[np.float64], float]:
         """Returns the stage, the target of the end effector, (3,), m, and the gripper's command."""
         scene = self._scene
-        if scene.arm.is_open and scene.container_around(self._target) == self._container:
+        if scene.arm.is_open and self._has_placed():
             if self._rest is None:
                 self._rest = gripper + [0, 0, _RETREAT]
             return Stage.REST, self._rest, OPEN
         self._rest = None
-        if scene.is_grasped(self._target):
-            return self._plan_place(gripper)
+        held = self._target if self.goals is None else scene.held_object
+        if held >= 0 and scene.is_grasped(held):
+            return self._plan_place(gripper, held)
         return self._plan_pick(gripper)
 
+    def _has_placed(self) -> bool:
+        if self.goals is not None:
+            return self.stage in (Stage.RELEASE, Stage.REST)
+        return self._scene.container_around(self._target) == self._container
+
     def _plan_pick(self, gripper: NDArray[np.float64]) -> tuple[Stage, NDArray[np.float64], float]:
-        item = self._scene.object_pose(self._target).position
-        bottom, top = self._scene.object_span(self._target)
-        tip_z = max(
-            bottom + min(self._grasp_height, top - bottom - _PAD_HEIGHT) - _PAD_HEIGHT,
-            TRAY_FLOOR + _TIP_CLEARANCE,
-        )
-        grasp = np.array([*item[:2], max(tip_z + FINGERTIP_OFFSET, top + _PALM_CLEARANCE)])
+        grasp = grasp_position(self._scene, self._target) if self.goals is None else self.goals[0]
         error = np.abs(grasp - gripper)
         if (error < _GRASP_TOLERANCE).all() and self._scene.arm.is_open:
             return Stage.GRASP, grasp, CLOSED
         is_low = gripper[2] < grasp[2] + _GRASP_TOLERANCE[2]
         if (error[:2] < (_STRADDLE_TOLERANCE if is_low else _DESCEND_TOLERANCE)).all():
             return Stage.DESCEND, grasp, OPEN
-        return Stage.REACH, np.array([*item[:2], _HOVER_Z]), OPEN
+        return Stage.REACH, np.array([*grasp[:2], _HOVER_Z]), OPEN
 
-    def _plan_place(self, gripper: NDArray[np.float64]) -> tuple[Stage, NDArray[np.float64], float]:
-        bottom, _ = self._scene.object_span(self._target)
+    def _plan_place(
+        self, gripper: NDArray[np.float64], held: int
+    ) -> tuple[Stage, NDArray[np.float64], float]:
+        bottom, _ = self._scene.object_span(held)
         carry_z = gripper[2] + TRAY_FLOOR + _CARRY_CLEARANCE - bottom
         release_z = gripper[2] + CONTAINER_FLOOR + _RELEASE_CLEARANCE - bottom
         if (np.abs(self._drop_xy - gripper[:2]) < _LOWER_TOLERANCE).all():

@@ -132,6 +132,11 @@ class Scene:
             for finger in self.arm.finger_links
         )
 
+    @property
+    def held_object(self) -> int:
+        """Number of the object that the gripper holds; -1 for none."""
+        return max(filter(self.is_grasped, range(len(self.bodies))), default=-1)
+
     def container_around(self, index: int) -> int:
         """Returns the container whose floor an object is low enough to stand on; -1 for none."""
         offsets = np.abs(self._poses[index].position[:2] - self._container_centers)

@@ -92,9 +92,11 @@ def evaluate_checkpoints(arguments: EvaluateArguments) -> str:
         A line for each checkpoint, with its success rate.
 
     Raises:
-        UserError: There is no such checkpoint, a record is of another policy, or the plan does not fit.
+        UserError: There is no such checkpoint, a record is of another policy, the plan does not fit, or its
+            scenes are sealed.
     """
-    path = arguments.checkpoint
+    path, task_ids = arguments.checkpoint, arguments.plan.task_ids
+    arguments.plan.scene_seed(task_ids[0], trial=0)  # fails now, and not after minutes, if they are sealed
     checkpoints = _select(find_checkpoints(path), arguments.steps)
     for checkpoint in checkpoints:
         if arguments.demo_repo_id is not None and checkpoint.policy_type not in OWN_TYPES:

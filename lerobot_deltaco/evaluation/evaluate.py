@@ -22,14 +22,22 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gym_deltaco.env import N_JOINTS, PickPlaceEnv
+from gym_deltaco.expert import Expert
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.episodes import EpisodeSpec, draw_episodes
 from lerobot_deltaco.evaluation.expert_demonstrations import ExpertBank
+from lerobot_deltaco.evaluation.failures import NO_FAILURE, EpisodeMonitor
 from lerobot_deltaco.evaluation.lerobot_env import check_policy_fits
-from lerobot_deltaco.evaluation.records import EvaluationPlan
+from lerobot_deltaco.evaluation.oracle import (
+    check_oracle,
+    give_locations,
+    localized_positions,
+    make_controllers,
+)
+from lerobot_deltaco.evaluation.records import EvaluationPlan, Oracle
 from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
 from lerobot_deltaco.processes import end_with_parent
@@ -62,6 +70,7 @@ class Evaluation:
         self.loaded, self.plan = loaded, plan
         policy = loaded.policy
         check_policy_fits(policy.config, plan.scene, loaded.rename_map)
+        check_oracle(policy, plan.oracle)
         self._bank = _bank_for(policy, plan)
         episodes = draw_episodes(plan, self._bank)
         if getattr(policy.config, "method", None) == "mcil":
@@ -79,15 +88,28 @@ class Evaluation:
         """Runs the episodes of a batch, and returns the row of each in the record."""
         batch = self.batches[number]
         demonstrations = [self._demonstrations(episode) for episode in batch]
+        monitors: list[EpisodeMonitor] = []
+
+        def monitor(envs: Sequence[PickPlaceEnv], _: Any) -> None:
+            for each in monitors:
+                each.step()
+            if not monitors:  # after the reset
+                monitors.extend(map(EpisodeMonitor, envs))
+
+        policy, plan = self.loaded.policy, self.plan
         with self._inference(batch):
             infos = run_episodes(
-                self.loaded, self._envs, batch, demonstrations, joint_noise=self.plan.joint_noise
+                self.loaded, self._envs, batch, demonstrations, monitor, plan.joint_noise, plan.oracle
             )
-        policy = self.loaded.policy
+            localized = localized_positions(policy, plan.scene.control)
         p_pick = policy.pick_confidence if isinstance(policy, TaskConditionedPolicy) else None
         p_picks = [math.nan] * len(batch) if p_pick is None else p_pick.tolist()
+        positions = [None] * len(batch) if localized is None else list(localized)
         rows = []
-        for episode, info, given, p_pick in zip(batch, infos, demonstrations, p_picks, strict=True):
+        for episode, info, given, p_pick, observed, position in zip(
+            batch, infos, demonstrations, p_picks, monitors, positions, strict=True
+        ):
+            pick_error, place_error = observed.errors(position)
             template = get_task(episode.task_id).instruction
             rows.append(
                 {
@@ -105,6 +127,9 @@ class Evaluation:
                     "right_object": bool(info["right_object"]),
                     "right_container": bool(info["right_container"]),
                     "p_pick": p_pick,
+                    "pick_error": pick_error,
+                    "place_error": place_error,
+                    "failure": NO_FAILURE if info["is_success"] else observed.failure(position),
                 }
             )
         return rows
@@ -157,6 +182,7 @@ def run_episodes(
     demonstrations: Sequence[Sequence[Demonstration]],
     callback: StepCallback | None = None,
     joint_noise: float = 0.0,
+    oracle: Oracle = "none",
 ) -> list[dict[str, Any]]:
     """Runs episodes at the same time.
 
@@ -167,6 +193,7 @@ def run_episodes(
         demonstrations: Demonstrations of each.
         callback: Called after the reset and after each step.
         joint_noise: Standard deviation of the noise on each joint angle that the policy observes, degrees.
+        oracle: What the benchmark does in place of the policy, as in `EvaluationPlan`.
 
     Returns:
         Info of each environment after its last step.
@@ -181,17 +208,25 @@ def run_episodes(
     policy.reset()
     if hasattr(policy, "set_tasks"):
         policy.set_tasks(instructions, demonstrations)
+    if oracle == "location":
+        give_locations(policy, envs)
+    controllers: list[Expert] = []
     generators = [np.random.default_rng(episode.seed) for episode in episodes]
     for _ in range(envs[0].scene_config.n_steps):
         if callback is not None:
             callback(envs, observations)
-        stacked = _stack(observations)
-        if joint_noise:
-            offsets = np.stack([rng.normal(0, np.radians(joint_noise), N_JOINTS) for rng in generators])
-            stacked["agent_pos"][:, :N_JOINTS] += offsets.astype(np.float32)
-        batch = {**preprocess_observation(stacked), "task": instructions}
-        actions = loaded.postprocessor(policy.select_action(loaded.preprocessor(batch)))
-        steps = [env.step(action) for env, action in zip(envs, actions.cpu().numpy(), strict=True)]
+        if not controllers:
+            stacked = _stack(observations)
+            if joint_noise:
+                offsets = np.stack([rng.normal(0, np.radians(joint_noise), N_JOINTS) for rng in generators])
+                stacked["agent_pos"][:, :N_JOINTS] += offsets.astype(np.float32)
+            batch = {**preprocess_observation(stacked), "task": instructions}
+            actions = loaded.postprocessor(policy.select_action(loaded.preprocessor(batch))).cpu().numpy()
+            if oracle == "controller":  # The policy's first action has localized.
+                controllers = make_controllers(policy, envs)
+        if controllers:
+            actions = np.stack([controller.act() for controller in controllers])
+        steps = [env.step(action) for env, action in zip(envs, actions, strict=True)]
         observations, infos = [step[0] for step in steps], [step[-1] for step in steps]
     if callback is not None:
         callback(envs, observations)

@@ -28,6 +28,7 @@ from gym_deltaco.seeding import episode_seed
 from gym_deltaco.tasks import get_task, select_tasks
 from lerobot_deltaco.atomic_files import atomic_write
 from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.evaluation.sealed import SEALED, sealed_seed, sealed_splits
 
 SCHEMA = pa.schema(
     {
@@ -44,12 +45,17 @@ SCHEMA = pa.schema(
         "right_object": pa.bool_(),
         "right_container": pa.bool_(),
         "p_pick": pa.float32(),
+        "pick_error": pa.float32(),
+        "place_error": pa.float32(),
+        "failure": pa.string(),
     }
 )
+_ADDED = ("pick_error", "place_error", "failure")  # which older records do not have
 TEMPLATES = "templates"
 _KEY = b"deltaco"
 
 Counterfactual = Literal["none", "demonstration", "instruction"]
+Oracle = Literal["none", "location", "controller"]
 
 
 @dataclass(frozen=True)
@@ -60,8 +66,9 @@ class EvaluationPlan:
         tasks: Tasks: a task set, or indices and ranges, such as 4,50-73.
         trials: Number of episodes of each task.
         seed: Seed of the scenes: trial i has the scene that `lerobot-eval` shows for its seed `seed` + i.
-        scene_split: Number of a split of scenes, for records that are older than the protocol: the scenes
-            then derive from the seed, this number, the task and the trial.
+        scene_split: "sealed" for the scenes that a release opens. Or number of a split of scenes, for records
+            that are older than the protocol: the scenes then derive from the seed, this number, the task and
+            the trial.
         scene: Settings of the scenes.
         counterfactual: Input that is replaced by another task's: none, demonstration or instruction. That
             task asks for another object of the scene and for the other container, if there is such a task.
@@ -73,6 +80,8 @@ class EvaluationPlan:
             sentences that are not held out for any task.
         instruction: A sentence that replaces the instruction of every task.
         joint_noise: Standard deviation of the noise on each joint angle that the policy observes, degrees.
+        oracle: What the benchmark does in place of the policy: none; location, it says where to pick and
+            place; or controller, its scripted expert moves the arm to where the policy would pick and place.
 
     Raises:
         UserError: An argument is invalid; the message says what is valid.
@@ -81,7 +90,7 @@ class EvaluationPlan:
     tasks: str = "scenario_a_test"
     trials: int = 4
     seed: int = 1000
-    scene_split: int | None = None
+    scene_split: int | str | None = None
     scene: SceneConfig = field(default_factory=SceneConfig)
     counterfactual: Counterfactual = "none"
     without: Counterfactual = "none"
@@ -90,6 +99,7 @@ class EvaluationPlan:
     paraphrases_split: str = "all"
     instruction: str | None = None
     joint_noise: float = 0.0
+    oracle: Oracle = "none"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "scene", self.scene.for_tasks(self.tasks))
@@ -97,10 +107,17 @@ class EvaluationPlan:
         leasts = {"trials": 1, "seed": 0, "scene_split": 0, "n_demonstrations": 1, "joint_noise": 0}
         for name, least in leasts.items():
             number = getattr(self, name)
-            if number is not None and number < least:
+            if isinstance(number, int | float) and number < least:
                 raise UserError(f"`{name}` must be at least {least}. Got {number}.")
-        valid = get_args(Counterfactual)
-        for name in ("counterfactual", "without"):
+        if self.scene_split == SEALED:
+            object.__setattr__(self, "scene_split", sealed_splits()[-1])
+        if isinstance(self.scene_split, str) and self.scene_split not in sealed_splits():
+            valid_splits = ", ".join([SEALED, *sealed_splits()])
+            raise UserError(
+                f"`scene_split` must be a number or one of {valid_splits}. Got {self.scene_split!r}."
+            )
+        kinds = {"counterfactual": Counterfactual, "without": Counterfactual, "oracle": Oracle}
+        for name, valid in ((name, get_args(kind)) for name, kind in kinds.items()):
             if getattr(self, name) not in valid:
                 raise UserError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
         if self.wording != TEMPLATES and "instruction" in (self.counterfactual, self.without):
@@ -115,7 +132,13 @@ class EvaluationPlan:
         return select_tasks(self.tasks)
 
     def scene_seed(self, task_id: int, trial: int) -> int:
-        """Returns the seed of an episode's reset."""
+        """Returns the seed of an episode's reset.
+
+        Raises:
+            UserError: The scenes are sealed.
+        """
+        if isinstance(self.scene_split, str):
+            return episode_seed(sealed_seed(self.scene_split), "evaluation", task_id, self.seed, trial)
         if self.scene_split is None:
             return episode_seed(0, "evaluation", task_id, 0, self.seed + trial)
         return episode_seed(self.seed, "evaluation", task_id, self.scene_split, trial)
@@ -224,6 +247,8 @@ def _read(path: Path) -> list[EvaluationRecord]:
     try:
         table = pq.read_table(path)
         headers = json.loads((table.schema.metadata or {})[_KEY])
+        for name in set(_ADDED) - set(table.column_names):
+            table = table.append_column(name, pa.nulls(len(table), SCHEMA.field(name).type))
         rows = table.select(SCHEMA.names).to_pandas()
         records = []
         for n, header in enumerate(headers):
@@ -266,12 +291,16 @@ def scene_columns(record: EvaluationRecord) -> pd.DataFrame:
     Returns:
         A row for each episode: `seed`; `template`, the task's instruction; `objects`, indices of the three
         objects; `container_quadrants`, (i, j) of the green and the red container; `target_object` and
-        `target_container`, their numbers in the scene.
+        `target_container`, their numbers in the scene; and `success_at_end`, whether the target lies in its
+        container, released, after the last step.
     """
     tasks_and_trials = record.episodes[["task_id", "trial"]].itertuples(index=False)
     seeds = [(task_id, record.plan.scene_seed(task_id, trial)) for task_id, trial in tasks_and_trials]
     rows = [_scene(task_id, seed, record.plan.scene) for task_id, seed in seeds]
-    return pd.DataFrame(rows, index=record.episodes.index)
+    scenes = pd.DataFrame(rows, index=record.episodes.index)
+    placed = zip(record.episodes["object_containers"], scenes["target_object"], strict=True)
+    ends = np.array([containers[target] for containers, target in placed])
+    return scenes.assign(success_at_end=ends == scenes["target_container"])
 
 
 @cache  # Many evaluations have the same scenes, of which each takes a millisecond.

@@ -14,14 +14,17 @@ import tyro
 from gym_deltaco.tasks import get_task, task_kinds
 from lerobot_deltaco.atomic_files import write_text
 from lerobot_deltaco.errors import UserError
-from lerobot_deltaco.evaluation.records import read_records
+from lerobot_deltaco.evaluation.failures import FAILURES
+from lerobot_deltaco.evaluation.records import read_records, scene_columns
 from lerobot_deltaco.reports.leaderboard import CHANCE, Result, collect_results, settings_text
 from lerobot_deltaco.reports.metrics import (
     Estimate,
+    bootstrap,
+    detectable_difference,
     followed,
-    paired_difference,
     paper_rate,
     success_interval,
+    task_differences,
 )
 
 if TYPE_CHECKING:
@@ -143,6 +146,27 @@ def outcome_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]
     }
 
 
+def ladder_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
+    """Yields where episodes end, and how far locations are from the true ones, if that was recorded."""
+    episodes = result.episodes
+    if episodes["failure"].isna().any():
+        return
+    ends = pd.concat([scene_columns(record)["success_at_end"] for record in result.last])
+    errors = {}
+    for name in ("pick_error", "place_error"):
+        if episodes[name].notna().any():
+            errors[f"{name}_mm"] = "{:.1f}, {:.1f}".format(*episodes[name].quantile([0.5, 0.9]))
+    yield {
+        "oracle": result.settings["oracle"],
+        "success": float(episodes["success"].mean()),
+        "success_at_end": float(ends.mean()),
+        "picked_right": float(episodes["right_object"].mean()),
+        "placed_right": float(episodes["right_container"].mean()),
+        **{name.replace(" ", "_"): float((episodes["failure"] == name).mean()) for name in FAILURES},
+        **errors,
+    }
+
+
 def difference_rows(result: Result, results: Sequence[Result]) -> Iterator[dict[str, Any]]:
     """Yields the difference of success to another result, paired by task.
 
@@ -165,8 +189,12 @@ def difference_rows(result: Result, results: Sequence[Result]) -> Iterator[dict[
         reference = next(item for item in group if item.settings == result.settings)
         records = reference.last
     if reference is not result:
-        difference = paired_difference(result.episodes, pd.concat([record.episodes for record in records]))
-        yield {"compared_with": reference.name, "difference": difference}
+        differences = task_differences(result.episodes, pd.concat([each.episodes for each in records]))
+        yield {
+            "compared_with": reference.name,
+            "difference": bootstrap(differences) if len(differences) else None,
+            "detectable": detectable_difference(differences) if len(differences) > 1 else None,
+        }
 
 
 def counterfactual_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, Any]]:
@@ -225,10 +253,21 @@ TABLES: dict[str, tuple[RowsOf, str]] = {
         "was grasped, of these in which it was the right object, and of the episodes in which something was "
         "placed, in the right container alone.",
     ),
+    "ladder": (
+        ladder_rows,
+        "Where episodes end, as fractions of all. With the oracle location, the benchmark says where to pick "
+        "and place; with the oracle controller, its scripted expert moves the arm to where the policy would. "
+        "Success counts at any step; at the end, the object still lies in the container. Not found: the "
+        "location is nearer to another object or container. Thrown off: the object left the tray. Missed: it "
+        "was never held. Lost: it slipped. Not put down: it was still held at the end. Put down beside: it "
+        "was released elsewhere. Errors are the median and the 90th percentile: of the end effector's "
+        "position at the pick, and of the horizontal one from the container's middle at the place.",
+    ),
     "differences": (
         difference_rows,
         "Differences of success in points, paired by task. A variant is compared with the same training runs "
-        "in the settings above, another experiment with the first one in the same settings.",
+        "in the settings above, another experiment with the first one in the same settings. Detectable: the "
+        "smallest true difference that such a comparison decides with a probability of 80 %.",
     ),
     "counterfactuals": (
         counterfactual_rows,

@@ -172,6 +172,7 @@ def test_a_variant_is_compared_with_the_same_trainings():
     name = "scenario_a/deltaco"
     assert table["compared_with"].tolist() == [name, f"{name}, without instruction", name]
     # Seed 1 alone succeeds in half of the episodes, as all three seeds do.
+    assert table["detectable"].tolist() == [0.0] * 3  # for all tasks are alike
     assert table["difference"].tolist() == [Estimate(*[difference] * 3) for difference in (-0.5, 1.0, 0.5)]
 
 
@@ -191,6 +192,25 @@ def test_outcomes():
     assert row["grasped_anything"] == 0.75
     assert row["right_object_of_grasped"] == pytest.approx(1 / 3)
     assert row["right_container_of_placed"] == 0.5
+
+
+def test_the_ladder_counts_failures_if_they_were_recorded():
+    failures = ["none", "none", "not found", "missed"]
+    columns = {
+        "failure": failures * 3,
+        "success": [True, True, False, False] * 3,
+        "pick_error": [1.0, 2.0, 3.0, 4.0] * 3,
+        "object_containers": [[0, 0, 0], [1, 1, 1], [-1, -1, -1], [-1, -1, -1]] * 3,
+    }
+    records = [make_record(columns=columns), make_record(plan={"oracle": "location"})]
+    (row,) = make_table(collect_results(records), report.ladder_rows).to_dict("records")
+    assert (row["oracle"], row["success"], row["not_found"], row["missed"]) == ("none", 0.5, 0.25, 0.25)
+    # Of two episodes in which all objects lie in one container, the target is there.
+    scenes = scene_columns(records[0])
+    assert row["success_at_end"] == scenes["success_at_end"].mean()
+    assert 0 < row["success_at_end"] < 0.5
+    assert row["pick_error_mm"] == "2.5, 4.0"
+    assert "place_error_mm" not in row
 
 
 def test_calibration_counts_grasps_by_the_policys_probability():

@@ -177,6 +177,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self.instruction_encoder = InstructionEncoder(len(config.known_words))
         self.training_locations: TrainingLocations | None = None
         self._held_out: dict[int, TrainingLocations] = {}
+        self._given_states: Tensor | None = None  # by `set_pick_and_place`
 
     # Training
 
@@ -307,6 +308,10 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             if demonstrations is None:
                 demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
             localization = self.localize(batch, instructions, demonstrations)
+            if (states := self._given_states) is not None:
+                locations = self.robot_states.to_image(states).clamp(-1, 1)
+                heights = self.robot_states.heights(states[:, 0])
+                localization = localization._replace(locations=locations, heights=heights)
             reference, replayed = None, torch.zeros(len(instructions), dtype=torch.bool)
             if self.config.acting == "replay":
                 reference, replayed = self._move_demonstrations(demonstrations, localization, batch)
@@ -325,6 +330,28 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if replay is not None:
             actions = torch.where(episode.replayed[:, None, None], replay[:, None], actions[:, :1])
         return actions
+
+    def reset(self) -> None:
+        """Ends the episode. The next action begins a new one."""
+        self._given_states = None
+        super().reset()
+
+    def set_pick_and_place(self, states: Tensor) -> None:
+        """Sets where to pick and place in the episodes that begin with the next action, until `reset`.
+
+        Args:
+            states: The robot's states there, as in the dataset, (batch, 2, state).
+        """
+        self._start(None)
+        self._given_states = states
+
+    @property
+    def localized_states(self) -> Tensor | None:
+        """The robot's states where the policy picks and places, as in the dataset, (batch, 2, state)."""
+        if self.localization is None:
+            return None
+        states = self.robot_states(self.localization.locations, self.localization.heights)
+        return (states - self.robot_states.state_shift) / self.robot_states.state_scale
 
     @property
     def localization(self) -> PickPlace | None:
