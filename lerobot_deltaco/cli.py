@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -66,6 +67,9 @@ _CONTINUE_TRAINING = (
 
 def main() -> None:
     """Runs the subcommand given on the command line."""
+    # Idle threads of a training would spin on the cores that other processes need, which would make each of
+    # its steps wait. The OpenMP library reads it when PyTorch is imported; worker processes inherit it.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     name, arguments = (sys.argv[1:2] or ["--help"])[0], sys.argv[2:]
     if name in ("-h", "--help"):
         _print(_overview())
