@@ -88,6 +88,16 @@ def test_idle_threads_wait_passively_unless_the_user_says_otherwise(chosen):
     assert f"OMP_WAIT_POLICY = '{chosen.get('OMP_WAIT_POLICY', 'PASSIVE').upper()}'" in result.stderr
 
 
+def test_the_version_says_which_types_lerobot_finds(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["deltaco", "--version"])
+    cli.main()
+    out = capsys.readouterr().out
+    assert re.match(r"lerobot_policy_deltaco \d.* LeRobot \d.* finds ", out)
+    assert all(
+        f"--{kind}" in out for kind in ("policy.type=deltaco,", "policy.type=deltaco_match", "env.type=")
+    )
+
+
 def test_an_unknown_command_names_the_valid_ones(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["deltaco", "trian"])
     with pytest.raises(SystemExit, match="unknown command 'trian'. The commands are collect, check"):

@@ -229,9 +229,7 @@ def test_an_observation_with_numbers_that_are_not_finite_is_an_error(make, table
 
 def test_images_must_be_in_0_to_1_and_what_is_doubtful_is_told_once(make, table, caplog):
     policy, scene = make().eval(), batch_of(table, [0])
-    with pytest.raises(
-        UserError, match=r"`observation.image` must have numbers from 0 to 1. Got \d+ to 2"
-    ):
+    with pytest.raises(UserError, match=r"`observation.image` must have numbers from 0 to 1. Got \d+ to 2"):
         found_in(policy, {**scene, OBS_IMAGE: 255 * scene[OBS_IMAGE]}, [RED], [[0]])
     assert "observation." not in caplog.text
     black, degrees = torch.zeros_like(scene[OBS_IMAGE]), scene[OBS_STATE] + 57.3
