@@ -105,14 +105,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", nargs="+", default=["toy", "gym-24-100"], choices=finding.CASES)
     parser.add_argument("--scenes", type=int, default=100)
+    parser.add_argument("--width", type=int, help="of the images, px; by default, that of the case")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     for name in arguments.cases:
-        start = time.process_time()
-        for motion, found in measure(finding.CASES[name], arguments.scenes, arguments.seed).items():
+        start, case = time.process_time(), finding.CASES[name]
+        width, height = case.size
+        if arguments.width:
+            height = round(height / width * arguments.width)
+            width = arguments.width
+        for motion, found in measure(
+            replace(case, size=(width, height)), arguments.scenes, arguments.seed
+        ).items():
             told = 100 * np.mean([each.is_significant for each in found])
-            width, height = finding.CASES[name].size
             shifts = 256 * np.array(
                 [math.hypot(each.shift[0], each.shift[1] * height / width) for each in found]
             )
