@@ -25,7 +25,7 @@ _TOLERATED = 0.06  # difference of colors in 0..1, beyond which a pixel counts a
 _STATIC = 0.03  # spread of a pixel's color over episodes, at which it counts half
 # The camera has moved if it did by this fraction of the image's width, on average over the picture, and the
 # differences become smaller by this factor.
-_MIN_MOTION, _MIN_GAIN = 0.009, 0.85
+_MIN_MOTION, _MIN_GAIN = 0.009, 0.93
 
 
 class CameraMotion(NamedTuple):
