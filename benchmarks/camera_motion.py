@@ -44,8 +44,8 @@ MOTIONS = {
 def wide(case: finding.Case) -> finding.Case:
     """Returns a case whose images have a margin around them."""
     fov = 2 * math.degrees(math.atan(MARGIN * math.tan(math.radians(case.camera.fov / 2))))
-    size = tuple(2 * round(MARGIN * side / 2) for side in case.size)
-    return replace(case, camera=replace(case.camera, fov=fov), size=size)
+    width, height = (2 * round(MARGIN * side / 2) for side in case.size)
+    return replace(case, camera=replace(case.camera, fov=fov), size=(width, height))
 
 
 def cut(image: Tensor, size: tuple[int, int], shift: float, turn: float, rng: np.random.Generator) -> Tensor:

@@ -86,10 +86,10 @@ def estimate_motion(reference: Tensor, weight: Tensor, image: Tensor, aspect: fl
         aspect: Width of a picture divided by its height, if it was scaled to another shape.
     """
     grays = [each.mean(dim=0, keepdim=True) for each in (reference, image)]
-    levels = {
-        size: (*(_details(_resized(each, size)) for each in grays), _resized(weight[None], size)[0], aspect)
-        for size in (_SMALL, _MEDIUM, _LARGE)
-    }
+    levels = {}
+    for size in (_SMALL, _MEDIUM, _LARGE):
+        details = [_details(_resized(each, size)) for each in grays]
+        levels[size] = (details[0], details[1], _resized(weight[None], size)[0], aspect)
     none = torch.zeros(1, 3, device=image.device)
     motions = torch.cat([_best_starts(*levels[_SMALL]), none])
     for _ in range(_STEPS):
@@ -149,8 +149,8 @@ def _best_starts(reference: Tensor, image: Tensor, weight: Tensor, aspect: float
     n_shifts = 2 * margin + 1
     windows = known.unfold(2, size, 1).unfold(3, size, 1)  # (turns, 2, shifts, shifts, size, size)
     costs = []
-    for row in range(n_shifts):
-        some = windows[:, :, row]
+    for down in range(n_shifts):
+        some = windows[:, :, down]
         differences = (some[:, 0] - reference).abs().clamp_max(_TOLERATED)
         weights = weight * some[:, 1]
         overlap = weights.sum(dim=(2, 3))
@@ -161,7 +161,7 @@ def _best_starts(reference: Tensor, image: Tensor, weight: Tensor, aspect: float
     turn, row, column = torch.unravel_index(best, table.shape)
     shifts = torch.stack([(column - margin) * aspect, row - margin], dim=1) * 2 / size  # of the turned image
     found = []
-    for angle, shift in zip(turns[turn], shifts, strict=True):
+    for angle, shift in zip(turns[turn].unbind(), shifts.unbind(), strict=True):
         rotation = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()]).view(2, 2)
         found.append(torch.cat([angle[None], rotation @ shift]))
     return torch.stack(found)
