@@ -1,18 +1,21 @@
 """Speed of the environment, of training and of the policies. `deltaco collect` prints its own.
 
-    python benchmarks/benchmark.py env|train|policy
+    python benchmarks/benchmark.py env|train|policy|video|contention
 
 Times are of one machine: compare figures of one run, made while nothing else uses the processor.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import os
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -27,6 +30,7 @@ def main() -> None:
     import tyro
 
     commands: dict[str, Callable[..., dict[str, float]]] = {"env": env, "train": train, "policy": policy}
+    commands |= {"video": video, "contention": contention}
     results = tyro.extras.subcommand_cli_from_dict(commands, description=(__doc__ or "").partition("\n")[0])
     width = max(map(len, results))
     sys.stdout.writelines(f"{name:{width}}  {value:12.3f}\n" for name, value in results.items())
@@ -206,6 +210,118 @@ def policy(batch_size: int = 128, seconds: float = 5.0) -> dict[str, float]:
             made.eval()
             results[f"{name}: action, ms"] = 1e3 * seconds_of(act, seconds)
     return results
+
+
+# Videos
+
+
+def video(episodes: int = 6, frames: int = 100, size: int = 480, repeats: int = 3) -> dict[str, float]:
+    """Compares reading all frames of a dataset of videos with PyAV, which decodes each file from end to end.
+
+    Args:
+        episodes: Number of episodes.
+        frames: Number of frames of each.
+        size: Height and width of the images, px.
+        repeats: Number of measurements, whose medians are taken.
+    """
+    import av
+    import torch
+    from lerobot.datasets import LeRobotDataset
+
+    from lerobot_deltaco.data.images import read_images
+
+    camera, rng = "observation.images.front", np.random.default_rng(0)
+    feature = {"dtype": "video", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
+    background = np.kron(rng.integers(0, 256, (size // 16, size // 16, 3)), np.ones((16, 16, 1)))
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "dataset"
+        dataset = LeRobotDataset.create("benchmark/video", 30, {camera: feature}, root, use_videos=True)
+        for _ in range(episodes):
+            for n in range(frames):
+                dataset.add_frame({camera: np.roll(background, n, axis=1).astype(np.uint8), "task": "move"})
+            dataset.save_episode()
+        dataset.finalize()
+        dataset = LeRobotDataset("benchmark/video", root=root, return_uint8=True)
+
+        def sequence() -> None:
+            images = torch.empty(len(dataset), 3, size, size, dtype=torch.uint8)
+            row = 0
+            for path in sorted(root.glob("videos/**/*.mp4")):
+                with av.open(path) as container:
+                    for row, frame in enumerate(container.decode(video=0), row):  # noqa: B020
+                        images[row] = torch.from_numpy(frame.to_ndarray(format="rgb24")).permute(2, 0, 1)
+                row += 1
+
+        actions = {
+            "PyAV in sequence": sequence,
+            "read_images": lambda: read_images(dataset, camera, range(len(dataset))),
+            "read_images, every third": lambda: read_images(dataset, camera, range(0, len(dataset), 3)),
+        }
+        times: dict[str, list[float]] = {name: [] for name in actions}
+        for _ in range(repeats):  # in turns, since other processes may begin or end
+            for name, action in actions.items():
+                start = time.perf_counter()
+                action()
+                times[name].append(time.perf_counter() - start)
+    medians = {name: statistics.median(values) for name, values in times.items()}
+    results = {f"{name}, ms per frame": 1e3 * value / episodes / frames for name, value in medians.items()}
+    return {**results, "ratio": medians["read_images"] / medians["PyAV in sequence"]}
+
+
+# Beside other processes
+
+
+def contention(seconds: float = 5.0) -> dict[str, float]:
+    """Compares training steps alone and beside a busy process, if idle threads spin and if they wait.
+
+    Args:
+        seconds: Duration of each of the four measurements.
+    """
+    results: dict[str, float] = {}
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))
+    }
+    for name, setting in (("spinning", {}), ("passive", {"OMP_WAIT_POLICY": "PASSIVE"})):
+        command = [sys.executable, "-c", _CONVOLUTIONS, str(seconds)]
+        for where in ("alone", "beside a busy process"):
+            with busy_process() if where != "alone" else contextlib.nullcontext():
+                output = subprocess.check_output(command, env=environment | setting, text=True)
+            results[f"{name}, {where}, ms"] = 1e3 * float(output)
+    alone, beside = results["passive, alone, ms"], results["passive, beside a busy process, ms"]
+    results["passive, alone / spinning, alone"] = alone / results["spinning, alone, ms"]
+    results["passive, beside / alone"] = beside / alone
+    return results
+
+
+# Median duration of a training step of a small network, with as many threads as cores
+_CONVOLUTIONS = """
+import statistics, sys, time
+import torch
+from torch import nn
+torch.manual_seed(0)
+widths = [3, 16, 32, 32, 32, 32]
+layers = [(nn.Conv2d(a, b, 3, padding=1), nn.ReLU()) for a, b in zip(widths, widths[1:])]
+network = nn.Sequential(*(layer for pair in layers for layer in pair))
+optimizer = torch.optim.AdamW(network.parameters())
+images, times = torch.rand(32, 3, 48, 48), []
+while sum(times) < float(sys.argv[1]) or len(times) < 3:
+    start = time.perf_counter()
+    network(images).square().mean().backward()
+    optimizer.step()
+    optimizer.zero_grad()
+    times.append(time.perf_counter() - start)
+print(statistics.median(times[len(times) // 4 :]))
+"""
+
+
+@contextlib.contextmanager
+def busy_process() -> Iterator[None]:
+    """Keeps one core busy."""
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
+        try:
+            yield
+        finally:
+            process.kill()
 
 
 if __name__ == "__main__":

@@ -1,13 +1,16 @@
-"""Writes files whole or not at all: under another name first, then renamed. Reads JSON."""
+"""Writes files whole or not at all: under another name first, then renamed. Reads JSON. Locks folders."""
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from lerobot_deltaco.errors import UserError
 
 
 @contextmanager
@@ -20,6 +23,34 @@ def atomic_write(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Prevents other processes from writing to a folder until the block, or this process, has ended.
+
+    Processes that are forked meanwhile keep the lock, too, until they end.
+
+    Args:
+        folder: The folder, which is made if it does not exist. No file is added.
+
+    Raises:
+        UserError: Another process writes to it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(
+                f"Another process is writing to {folder}. Wait until it has ended, or name another folder."
+            ) from None
+        except OSError:
+            pass  # a file system without locks
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import functools
 import importlib
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -70,9 +72,15 @@ _CONTINUE_TRAINING = (
 
 def main() -> None:
     """Runs the subcommand given on the command line."""
+    # Idle threads of a training would spin on the cores that other processes need, which would make each of
+    # its steps wait. The OpenMP library reads it when PyTorch is imported; worker processes inherit it.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     name, arguments = (sys.argv[1:2] or ["--help"])[0], sys.argv[2:]
     if name in ("-h", "--help"):
         _print(_overview())
+        return
+    if name == "--version":
+        _print(_installation())
         return
     if name not in COMMANDS:
         sys.exit(f"deltaco: unknown command {name!r}. The commands are {', '.join(COMMANDS)}.")
@@ -147,11 +155,37 @@ def _is_for_users(error: Exception) -> bool:
     return isinstance(error, UserError | OSError | MemoryError) or is_without_simulator
 
 
+def _installation() -> str:
+    """Returns the versions, and which types of this project LeRobot has found, as its commands do."""
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.envs import EnvConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    found = [
+        f"--{option}.type={choice}"
+        for option, config in (("policy", PreTrainedConfig), ("env", EnvConfig))
+        for choice, kind in config.get_known_choices().items()
+        if kind.__module__.startswith("lerobot_deltaco.")
+    ]
+    return (
+        f"lerobot_policy_deltaco {version('lerobot_policy_deltaco')}. LeRobot {version('lerobot')} finds "
+        f"{', '.join(found) or 'nothing of it: install the project again, as its README says'}."
+    )
+
+
 def _overview() -> str:
     width = max(map(len, COMMANDS))
     lines = [f"  {name:{width}}  {command.description}" for name, command in COMMANDS.items()]
     return "\n".join(
-        ["usage: deltaco COMMAND ...", "", *lines, "", "deltaco COMMAND --help shows its options."]
+        [
+            "usage: deltaco COMMAND ...",
+            "",
+            *lines,
+            "",
+            "deltaco COMMAND --help shows its options;",
+            "deltaco --version what LeRobot has found.",
+        ]
     )
 
 

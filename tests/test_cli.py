@@ -1,5 +1,6 @@
 """The command `deltaco`: quick help that lists everything, and errors in one line."""
 
+import os
 import re
 import shlex
 import subprocess
@@ -76,6 +77,25 @@ def test_the_help_of_training_describes_the_options_of_both_policies(helps):
             assert re.search(rf"^  --policy\.{option} \(default: .*\)\n +\w", text, re.MULTILINE), option
     assert "--policy.type=deltaco_match" in text
     assert "MISSING" not in text
+
+
+@pytest.mark.parametrize("chosen", [{}, {"OMP_WAIT_POLICY": "active"}])
+def test_idle_threads_wait_passively_unless_the_user_says_otherwise(chosen):
+    program = "import sys; sys.argv = ['deltaco']; from lerobot_deltaco import cli; cli.main(); import torch"
+    env = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    result = run_python(program, env={**env, **chosen, "OMP_DISPLAY_ENV": "true"})
+    # What the OpenMP library has read when PyTorch was loaded
+    assert f"OMP_WAIT_POLICY = '{chosen.get('OMP_WAIT_POLICY', 'PASSIVE').upper()}'" in result.stderr
+
+
+def test_the_version_says_which_types_lerobot_finds(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["deltaco", "--version"])
+    cli.main()
+    out = capsys.readouterr().out
+    assert re.match(r"lerobot_policy_deltaco \d.* LeRobot \d.* finds ", out)
+    assert all(
+        f"--{kind}" in out for kind in ("policy.type=deltaco,", "policy.type=deltaco_match", "env.type=")
+    )
 
 
 def test_an_unknown_command_names_the_valid_ones(monkeypatch):

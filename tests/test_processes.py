@@ -8,6 +8,7 @@ import time
 import psutil
 import pytest
 
+from lerobot_deltaco.atomic_files import only_writer
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.processes import call_in_new_process
 
@@ -51,3 +52,18 @@ def wait_until(condition, seconds=60):
     while not (value := condition()) and time.monotonic() < end:
         time.sleep(0.1)
     return value
+
+
+def test_a_folder_has_one_writer_until_it_ends_in_whatever_way(tmp_path):
+    program = (
+        "import sys, time; from pathlib import Path; from lerobot_deltaco.atomic_files import only_writer"
+    )
+    program += "\nwith only_writer(Path(sys.argv[1])): print(flush=True); time.sleep(100)"
+    writer = subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE)
+    writer.stdout.readline()
+    with pytest.raises(UserError, match=f"Another process is writing to {tmp_path}"), only_writer(tmp_path):
+        pass
+    writer.kill()
+    writer.wait()
+    with only_writer(tmp_path):
+        assert not list(tmp_path.iterdir())

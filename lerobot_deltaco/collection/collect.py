@@ -35,7 +35,7 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.seeding import episode_seed
 from gym_deltaco.sim.simulation import check_simulator
 from gym_deltaco.tasks import HELD_OUT, get_task, select_tasks
-from lerobot_deltaco.atomic_files import read_json, write_json
+from lerobot_deltaco.atomic_files import only_writer, read_json, write_json
 from lerobot_deltaco.collection import writer as dataset_writer
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.processes import end_with_parent
@@ -138,6 +138,7 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> str:
         finished, there is nothing to do.
 
     Raises:
+        UserError: Another process writes to the folder.
         CollectionError: The folder holds something else, or cannot be written to; the expert cannot do a
             task; or a worker process was killed.
         ImportError: PyBullet is not installed.
@@ -147,13 +148,8 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> str:
     try:
         _check_folder(root, plan)
         if not is_finished(root):
-            write_json(root / DESCRIPTION_FILE, _description(plan))
-            speed = f"{_collect_shards(root, plan, workers):.1f} episodes/s"
-            write_json(root / DESCRIPTION_FILE, {**_description(plan), **_outcome(root, plan)})
-            dataset_writer.number_frames(root, len(plan.shards))
-            dataset_writer.write_metadata(
-                root, dataset_features(plan.scene), plan.scene.interface.fps, ROBOT_TYPE, plan.instructions
-            )
+            with only_writer(root):
+                speed = f"{_collect_missing(root, plan, workers):.1f} episodes/s"
     except BrokenProcessPool:
         raise CollectionError(
             "A worker process was killed; the memory may be full. Finished shards are kept: run the same "
@@ -269,6 +265,18 @@ def _check_folder(root: Path, plan: CollectionPlan) -> None:
             f"{root} holds a collection of another plan ({'; '.join(differences)}). Name a new folder, or "
             "delete this one."
         )
+
+
+def _collect_missing(root: Path, plan: CollectionPlan, workers: int) -> float:
+    """Writes what a dataset lacks. Returns the number of episodes per second."""
+    write_json(root / DESCRIPTION_FILE, _description(plan))
+    speed = _collect_shards(root, plan, workers)
+    write_json(root / DESCRIPTION_FILE, {**_description(plan), **_outcome(root, plan)})
+    dataset_writer.number_frames(root, len(plan.shards))
+    dataset_writer.write_metadata(
+        root, dataset_features(plan.scene), plan.scene.interface.fps, ROBOT_TYPE, plan.instructions
+    )
+    return speed
 
 
 # Workers

@@ -21,7 +21,6 @@ from lerobot_deltaco.errors import UserError
 
 _EPISODE_COLUMNS = (
     "episode_index",
-    "tasks",
     "length",
     "dataset_from_index",
     "dataset_to_index",
@@ -152,6 +151,6 @@ def _reading(path: Path) -> Iterator[None]:
         raise
     except (OSError, ValueError, KeyError, pa.ArrowException) as error:
         raise UserError(
-            f"{path} cannot be read as Parquet: {error}. If the recording was interrupted before "
-            "`LeRobotDataset.finalize()`, the file is incomplete: record the dataset again."
+            f"{path} cannot be read as Parquet: {str(error).rstrip('.')}. If the recording was interrupted "
+            "before `LeRobotDataset.finalize()`, the file is incomplete: record the dataset again."
         ) from error

@@ -99,10 +99,12 @@ def _video_frames(dataset: LeRobotDataset, camera: str, rows: list[int]) -> Tens
     """Decodes frames of one episode from its video, (rows, 3, H, W) uint8.
 
     PyAV is installed with LeRobot, decodes in threads, and needs no FFmpeg of the system, as torchcodec does.
+    A recorded frame is a frame of the video, whatever time a clock gave it: LeRobot's recording encodes them
+    at the dataset's rate.
     """
     episode = int(column(dataset, "episode_index").reshape(-1)[rows[0]])
     start = dataset.meta.episodes[episode][f"videos/{camera}/from_timestamp"]
-    times = column(dataset, "timestamp").reshape(-1)[rows].astype(np.float64) + start
+    times = start + column(dataset, "frame_index").reshape(-1)[rows] / dataset.fps
     path = dataset.meta.root / dataset.meta.get_video_file_path(episode, camera)
     with decoding(dataset, rows[0], camera):
         return decode_video_frames(path, times.tolist(), dataset.tolerance_s, "pyav", return_uint8=True)

@@ -68,8 +68,12 @@ def open_dataset(
     return dataset
 
 
-def open_folder_or_hub(name: str) -> LeRobotDataset:
+def open_folder_or_hub(name: str, episodes: Sequence[int] | None = None) -> LeRobotDataset:
     """Opens and checks the dataset in a folder, or of an id on the Hugging Face Hub.
+
+    Args:
+        name: The folder or the id.
+        episodes: Episodes to open; None for all.
 
     Raises:
         FileNotFoundError: The folder holds no dataset.
@@ -77,13 +81,13 @@ def open_folder_or_hub(name: str) -> LeRobotDataset:
     """
     folder = Path(name)
     if not folder.exists() and len(folder.parts) == 2:
-        return open_dataset("", name, None)
+        return open_dataset("", name, None, episodes)
     if not (folder / "meta/info.json").exists():
         raise FileNotFoundError(
             f"There is no dataset in {name}: meta/info.json is missing. Check the spelling, or name one of "
             "the Hub, as USER/NAME."
         )
-    return open_dataset("", folder.resolve().name, folder)
+    return open_dataset("", folder.resolve().name, folder, episodes)
 
 
 @contextmanager
@@ -285,8 +289,10 @@ def _check_episodes(dataset: LeRobotDataset) -> None:
     meta = dataset.meta
     table = {
         name: meta.episodes[name][:]
-        for name in ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index")
+        for name in ("episode_index", "length", "dataset_from_index", "dataset_to_index")
     }
+    # LeRobot's conversion to videos leaves them out.
+    known_tasks = meta.episodes["tasks"][:] if "tasks" in meta.episodes.column_names else None
     index, frame_index, tasks = (
         column(dataset, name).reshape(-1) for name in ("index", "frame_index", "task_index")
     )
@@ -296,7 +302,7 @@ def _check_episodes(dataset: LeRobotDataset) -> None:
         rows = slice(first, last + 1)
         start, stop = table["dataset_from_index"][episode], table["dataset_to_index"][episode]
         present = [names[n] if 0 <= n < len(names) else f"number {n}" for n in np.unique(tasks[rows])]
-        known = list(table["tasks"][episode])
+        known = present if known_tasks is None else list(known_tasks[episode])
         problem = None
         if len(present) > 1:
             problem = (

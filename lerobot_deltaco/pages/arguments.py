@@ -2,10 +2,32 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
+
+# Under the name that errors advise, as in `deltaco train`
+DatasetEpisodesOption = Annotated[str | None, tyro.conf.arg(name="dataset.episodes")]
+
+
+def episode_numbers(option: str | None) -> list[int] | None:
+    """Returns the episodes that an option names; None for all.
+
+    Raises:
+        ValueError: It is not a list of numbers.
+    """
+    if option is None:
+        return None
+    try:
+        numbers = json.loads(option)
+    except ValueError:
+        numbers = None
+    if not isinstance(numbers, list) or not all(type(number) is int for number in numbers):
+        raise ValueError(f"--dataset.episodes must be a list of numbers, such as [0,1,2]. Got {option!r}.")
+    return numbers
 
 
 @dataclass(frozen=True)
@@ -40,6 +62,7 @@ class CheckArguments:
         steps: Number of training steps that it is estimated for.
         episodes: Number of episodes to show; those that are left out come first.
         out: Folder for the page.
+        dataset_episodes: Episodes to check, as for `deltaco train`, such as [0,1,2]; None for all.
     """
 
     dataset: tyro.conf.Positional[str]
@@ -48,6 +71,10 @@ class CheckArguments:
     steps: int = 8000
     episodes: int = 48
     out: Path = Path("outputs/check")
+    dataset_episodes: DatasetEpisodesOption = None
+
+    def __post_init__(self) -> None:
+        episode_numbers(self.dataset_episodes)
 
 
 @dataclass(frozen=True)
@@ -61,12 +88,17 @@ class LookArguments:
             test tasks are run.
         episodes: Number of episodes, evenly spread.
         out: Folder for the page.
+        dataset_episodes: Episodes to choose from, as for `deltaco train`, such as [0,1,2]; None for all.
     """
 
     checkpoint: tyro.conf.Positional[str]
     dataset: str | None = None
     episodes: int = 12
     out: Path = Path("outputs/look")
+    dataset_episodes: DatasetEpisodesOption = None
+
+    def __post_init__(self) -> None:
+        episode_numbers(self.dataset_episodes)
 
 
 @dataclass(frozen=True)

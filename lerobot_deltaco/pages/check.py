@@ -27,15 +27,15 @@ from torch.utils.data import default_collate
 from tqdm import tqdm
 
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
-from lerobot_deltaco.data.frames import memory_for_frames
+from lerobot_deltaco.data.frames import FramesInMemory, memory_for_frames
 from lerobot_deltaco.data.grasps import Grasp, find_grasps
 from lerobot_deltaco.data.gripper_states import GripperStates, find_gripper_states
-from lerobot_deltaco.data.images import as_uint8, resize_images
+from lerobot_deltaco.data.images import as_uint8, read_images, resize_images
 from lerobot_deltaco.data.pauses import paused_frames
-from lerobot_deltaco.data.reading import decoding, dimension_names, open_folder_or_hub
+from lerobot_deltaco.data.reading import dimension_names, episode_spans, open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
 from lerobot_deltaco.errors import UserError
-from lerobot_deltaco.pages.arguments import CheckArguments
+from lerobot_deltaco.pages.arguments import CheckArguments, episode_numbers
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
@@ -50,7 +50,7 @@ _ENOUGH = 70  # percent of the objects that are found, from which on a policy is
 # A camera stands still if at least this fraction of the edges in an episode's first image stay where they
 # are: of the benchmark's fixed cameras 0.6 to 0.8, of its wrist camera below 0.1.
 _MIN_STAYING, _COMPARED_SIZE, _EDGES, _SAME = 0.4, 48, 0.2, 0.5
-_TIMED_STEPS, _TIMED_FRAMES, _DESCRIBED_EPISODES = 3, 64, 16
+_TIMED_STEPS, _DESCRIBED_EPISODES = 3, 16
 
 
 class TrainingStart:
@@ -64,6 +64,7 @@ class TrainingStart:
         refusal: Why training would refuse; None if it would not.
         warnings: What training would warn of.
         bytes: Memory for the frames.
+        reading: Time to read the frames, s.
         policy: The policy; None if the configuration does not fit the dataset.
         bank: The episodes as demonstrations; None if they were not read.
         grasps: The grasp of each episode, or why there is none; empty if unknown.
@@ -74,6 +75,7 @@ class TrainingStart:
         self.dataset, self.config = dataset, config
         self.refusal: str | None = None
         self.bytes = 0
+        self.reading = 0.0
         self.policy: DeltacoMatchPolicy | None = None
         self.bank: DemonstrationBank | None = None
         self.grasps: list[Grasp | str] = []
@@ -81,7 +83,7 @@ class TrainingStart:
         with _warnings() as self.warnings:
             try:
                 self._begin()
-            except (ValueError, MemoryError) as error:
+            except (UserError, MemoryError) as error:
                 self.refusal = str(error)
 
     def _begin(self) -> None:
@@ -89,7 +91,10 @@ class TrainingStart:
         size = image_size_in_memory(dataset, config)
         self.bytes = memory_for_frames(dataset, size)
         self.policy = make_policy(config, ds_meta=dataset.meta).train()
-        data = TrainingData.read(DatasetEpisodes(dataset), config.demonstration_format)
+        began = time.perf_counter()
+        frames = FramesInMemory(dataset, size)
+        self.reading = time.perf_counter() - began
+        data = TrainingData.read(frames, config.demonstration_format)
         self.bank, robot, command = data.demonstrations, data.robot, config.gripper_command
         assert robot is not None
         assert command is not None
@@ -119,17 +124,16 @@ def check(arguments: CheckArguments) -> str:
     Raises:
         ValueError: Training would refuse the dataset; the message has the reason, and the report.
     """
-    opened = open_folder_or_hub(arguments.dataset)
+    opened = open_folder_or_hub(arguments.dataset, episode_numbers(arguments.dataset_episodes))
     config = DeltacoMatchConfig(**asdict(arguments.policy))
     start = TrainingStart(opened, config)
-    meta = opened.meta
-    tasks = [names[0] for names in meta.episodes["tasks"]]
+    tasks = DatasetEpisodes(opened).episode_tasks()
     views, staying = _read_episodes(start, tasks, arguments.episodes)
     dimensions = _dimensions(start)
     facts = _facts(start, staying, dimensions)
     if start.refusal is None:
         facts += _estimates(start, arguments.batch_size, arguments.steps)
-    warnings = [*start.warnings, *_advice(start, staying)]
+    warnings = [*start.warnings, *_advice(start, tasks, staying)]
     found = Counter(
         task for task, grasp in zip(tasks, start.grasps, strict=False) if isinstance(grasp, Grasp)
     )
@@ -144,7 +148,7 @@ def check(arguments: CheckArguments) -> str:
         tasks=counts,
         dimensions=dimensions,
         views=views,
-        n_episodes=meta.total_episodes,
+        n_episodes=len(tasks),
         has_locations=start.locations is not None,
     )
     lines = [
@@ -194,20 +198,19 @@ def _read_episodes(
     chosen = left_out + others[np.linspace(0, len(others) - 1, n_others).round().astype(int)].tolist()
     gripper = config.gripper_index if start.grasps else None
     actions = np.stack(dataset.hf_dataset.with_format("numpy")[ACTION]) if gripper is not None else None
-    views, staying = [], defaultdict(list)
+    views, staying, spans = [], defaultdict(list), list(episode_spans(dataset).items())
     for episode in tqdm(chosen, desc="Reading episodes", unit="episode", leave=False):
-        row, grasp = meta.episodes[episode], grasps[episode]
-        first, last = row["dataset_from_index"], row["dataset_to_index"] - 1
+        (number, (first, last)), grasp = spans[episode], grasps[episode]
         times = np.linspace(first, last, 4).round().astype(int).tolist()
         if isinstance(grasp, Grasp):
             times = [first, grasp.grasp, grasp.release, last]
-        items = []
-        for shown in times:
-            with decoding(dataset, shown, demo_camera or ""):
-                items.append(dataset[shown])
-        for camera in cameras:
-            staying[camera].append(_staying_edges(torch.stack([item[camera] for item in items[:3]])))
-        images = [] if demo_camera is None else [item[demo_camera] for item in items]
+        try:
+            images_of = {camera: read_images(dataset, camera, times) for camera in cameras}
+        except UserError:  # which the refusal names
+            images_of = {}
+        for camera, found in images_of.items():
+            staying[camera].append(_staying_edges(found[:3]))
+        images = [] if demo_camera is None else list(images_of.get(demo_camera, ()))
         located = start.locations if isinstance(grasp, Grasp) else None
         marks = [] if located is None else list(zip(located[episode], (PICK_COLOR, PLACE_COLOR), strict=True))
         text = f"{(last - first + 1) / meta.fps:.1f} s"
@@ -223,7 +226,7 @@ def _read_episodes(
                 lines = [round(float(at[time - first]), 3) for time in times[1:3]]
         views.append(
             {
-                "number": episode,
+                "number": number,
                 "task": tasks[episode],
                 "text": text,
                 "pictures": _strip(images, marks),
@@ -280,7 +283,10 @@ def _facts(
     """Returns what a policy would take from the dataset, each fact with its name."""
     dataset, config, meta = start.dataset, start.config, start.dataset.meta
     facts = [
-        ("dataset", f"{meta.total_episodes} episodes, {meta.total_frames:,} frames, {meta.fps} per second")
+        (
+            "dataset",
+            f"{dataset.num_episodes} episodes, {dataset.num_frames:,} frames, {meta.fps} per second",
+        )
     ]
     for camera, fraction in staying.items():
         is_chosen = bool(config.image_features) and camera == config.cameras[0]
@@ -334,15 +340,10 @@ def _finding(policy: DeltacoMatchPolicy) -> str:
     return f"{matching.report} ({low:.0f} to {high:.0f} %): {verdict}"
 
 
-def _advice(start: TrainingStart, staying: dict[str, float]) -> list[str]:
+def _advice(start: TrainingStart, tasks: Sequence[str], staying: dict[str, float]) -> list[str]:
     """Returns what training does not warn of."""
-    config, tasks_of_episodes = start.config, start.dataset.meta.episodes["tasks"]
-    advice = [
-        f"Episode {episode} has {len(tasks)} tasks, of which only the first counts: {tasks[0]!r}."
-        for episode, tasks in enumerate(tasks_of_episodes)
-        if len(tasks) > 1
-    ]
-    single = [task for task, n in Counter(tasks[0] for tasks in tasks_of_episodes).items() if n == 1]
+    config, advice = start.config, list[str]()
+    single = [task for task, n in Counter(tasks).items() if n == 1]
     if single:
         advice.append(
             f"{len(single)} tasks have a single episode, which demonstrates itself, such as {single[0]!r}. "
@@ -366,11 +367,9 @@ def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[
     assert policy is not None
     assert bank is not None
     windows = resolve_delta_timestamps(config, dataset.meta)
-    timed = LeRobotDataset(dataset.repo_id, dataset.root, delta_timestamps=windows, return_uint8=True)
-    began, n_read = time.perf_counter(), min(_TIMED_FRAMES, len(dataset))
-    for n in range(n_read):
-        dataset[n]
-    reading = (time.perf_counter() - began) / n_read * len(dataset)
+    timed = LeRobotDataset(
+        dataset.repo_id, dataset.root, dataset.episodes, delta_timestamps=windows, return_uint8=True
+    )
     batch = default_collate([timed[n % len(timed)] for n in range(batch_size)])
     for camera in dataset.meta.camera_keys:
         batch[camera] = resize_images(batch[camera], config.image_size).float() / 255
@@ -391,14 +390,14 @@ def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[
     policy.feature_matching.describe(images.float() / 255, native, middle, middle)
     per_crop = (time.perf_counter() - began) / len(images)
     fit = min(len(bank), policy.feature_matching.settings.max_episodes) * N_OBJECTS * per_crop
-    total = reading + fit + steps * per_step
+    total = start.reading + fit + steps * per_step
     memory = start.bytes + psutil.Process().memory_info().rss
     return [
         (
             "time",
             f"about {total / 60:.0f} minutes on this machine ({config.device}) for {steps:,} steps of "
-            f"{batch_size}: {reading / 60:.1f} to read the frames, {fit / 60:.1f} to encode crops for the "
-            f"feature matching, {1000 * per_step:.0f} ms a step",
+            f"{batch_size}: {start.reading / 60:.1f} to read the frames, {fit / 60:.1f} to encode crops for "
+            f"the feature matching, {1000 * per_step:.0f} ms a step",
         ),
         ("memory", f"about {memory / 1e9:.1f} GB, of which the frames take {start.bytes / 1e9:.2f}"),
     ]

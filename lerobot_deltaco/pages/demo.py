@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from lerobot_deltaco.atomic_files import read_json, write_json
+from lerobot_deltaco.atomic_files import only_writer, read_json, write_json
 from lerobot_deltaco.evaluation.records import EvaluationPlan, EvaluationRecord
 from lerobot_deltaco.experiments.recipes import read_recipe
 from lerobot_deltaco.experiments.run import TrainingRun, last_checkpoint, last_step, read_run_records
@@ -50,9 +50,14 @@ def run_demo(minutes: Minutes = 8, out: Path = Path("outputs/demo")) -> Path:
         The page, `index.html`. A line about the run is appended to `records.csv` beside it.
 
     Raises:
-        UserError: A step failed.
+        UserError: A step failed, or another process writes to the folder.
     """
     os.environ.setdefault("HF_HUB_OFFLINE", "1")  # the language encoder comes as a package
+    with only_writer(out):
+        return _run_demo(minutes, out)
+
+
+def _run_demo(minutes: Minutes, out: Path) -> Path:
     episodes_per_task, steps = BUDGETS[minutes]
     settings = (
         f"data.episodes_per_task={episodes_per_task}",

@@ -19,7 +19,7 @@ from lerobot_deltaco.data.training_data import DatasetEpisodes, read_demonstrati
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import load_conditioned
-from lerobot_deltaco.pages.arguments import LookArguments
+from lerobot_deltaco.pages.arguments import LookArguments, episode_numbers
 from lerobot_deltaco.pages.html import EpisodeView, picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
 from lerobot_deltaco.pages.player import Player
@@ -57,7 +57,8 @@ def look(arguments: LookArguments) -> str:
         episodes = _benchmark_episodes(loaded, arguments.episodes)
     else:
         names = [f"Episodes with the right {what} location" for what in ("pick", "place")]
-        episodes = _dataset_episodes(loaded, open_folder_or_hub(dataset), arguments.episodes)
+        chosen = episode_numbers(arguments.dataset_episodes)
+        episodes = _dataset_episodes(loaded, open_folder_or_hub(dataset, chosen), arguments.episodes)
     judged = list(tqdm(episodes, desc="Looking", unit="episode", total=arguments.episodes))
     known = np.array([rights for _, rights in judged if rights])
     rates = [(name, int(known[:, n].sum()), len(known)) for n, name in enumerate(names) if len(known)]
@@ -92,9 +93,9 @@ def _dataset_episodes(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes:
     policy, config = loaded.policy, loaded.policy.config
     camera = config.cameras[0]
     _check_features(config, dataset)
-    tasks = [names[0] for names in dataset.meta.episodes["tasks"]]
-    form = config.demonstration_format
-    data = read_robot_data(DatasetEpisodes(dataset), form)
+    recorded_episodes, form = DatasetEpisodes(dataset), config.demonstration_format
+    tasks, indices = recorded_episodes.episode_tasks(), list(recorded_episodes.spans)
+    data = read_robot_data(recorded_episodes, form)
     assert data is not None
     assert form.gripper is not None
     opening = form.gripper.opening(data.actions)
@@ -103,7 +104,7 @@ def _dataset_episodes(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes:
     partners = {episode: _partner(tasks, episode) for episode in numbers}
     bank = None
     if config.uses_demonstrations:
-        needed = sorted(set(partners.values()))
+        needed = [indices[partner] for partner in sorted(set(partners.values()))]
         bank = read_demonstrations(DatasetEpisodes(dataset, needed), form)
     for episode in numbers:
         task, partner = tasks[episode], partners[episode]
@@ -111,13 +112,15 @@ def _dataset_episodes(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes:
         observation = {name: item[name] for name in config.input_features}
         observation |= {name: as_uint8(item[name]).float() / 255 for name in config.cameras}
         policy.reset()
-        policy.set_tasks([task], [[] if bank is None else [bank.of_episode(partner)]])
+        policy.set_tasks([task], [[] if bank is None else [bank.of_episode(indices[partner])]])
         with torch.inference_mode():
             policy.select_action(loaded.preprocessor({**observation, "task": task}))
         localization = policy.localization
-        where = f"Episode {episode}"
+        where = f"Episode {indices[episode]}"
         if bank is not None:
-            where += ", demonstrated by " + ("itself" if partner == episode else f"episode {partner}")
+            where += ", demonstrated by " + (
+                "itself" if partner == episode else f"episode {indices[partner]}"
+            )
         rights, headline, recorded = (), "No grasp found", None
         if bool(keyframes.has_grasp[episode]):
             states = keyframes.states[episode].to(config.device)

@@ -263,6 +263,6 @@ def test_folder_with_something_else_is_refused(tmp_path, collected):
     (tmp_path / "notes.txt").touch()
     with pytest.raises(CollectionError, match="is not empty: it holds notes.txt. Name a new folder"):
         collect(tmp_path, PLAN)
-    with pytest.raises(CollectionError, match="Cannot write to .*notes.txt: Not a directory"):
+    with pytest.raises(CollectionError, match="Cannot write to .*notes.txt: File exists"):
         collect(tmp_path / "notes.txt", PLAN)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

@@ -6,8 +6,10 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+from small_policies import TABLE_TASKS
 
 from lerobot_deltaco.data.reading import open_dataset, open_folder_or_hub
+from lerobot_deltaco.data.training_data import DatasetEpisodes
 from lerobot_deltaco.errors import UserError
 
 
@@ -74,7 +76,7 @@ FAULTS = {
         table_of("meta/tasks.parquet", lambda tasks: tasks.set_axis([" ", *tasks.index[1:]])),
         "has an empty task string",
     ),
-    "no_tasks": (table_of(EPISODES, lambda t: t.drop(columns="tasks")), "has no column 'tasks'"),
+    "no_length": (table_of(EPISODES, lambda t: t.drop(columns="length")), "has no column 'length'"),
     "cut_table": (cut(EPISODES), r"cannot be read as Parquet: .*finalize"),
     "cut_data": (cut(DATA), r"data.*\.parquet cannot be read as Parquet: .*finalize"),
     "rows": (
@@ -100,3 +102,9 @@ def test_a_good_dataset_opens_and_so_do_episodes_beside_damaged_ones(root):
     assert open_folder_or_hub(str(root)).meta.total_episodes == 48
     table_of(DATA, lambda t: t[t["episode_index"] < 46].reset_index(drop=True))(root)
     assert open_dataset("", "test/table", root, [0, 45]).episodes == [0, 45]
+
+
+def test_tasks_are_those_of_the_frames_if_the_table_of_episodes_has_none(root):
+    table_of(EPISODES, lambda t: t.drop(columns="tasks"))(root)  # as LeRobot's conversion to videos
+    dataset = open_folder_or_hub(str(root))
+    assert set(DatasetEpisodes(dataset).episode_tasks()) == set(TABLE_TASKS)

@@ -1,9 +1,11 @@
 """Frames in memory: they equal what LeRobot reads from the disk."""
 
 import io
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
@@ -147,6 +149,16 @@ def test_demonstrations_and_robot_data_equal_those_that_are_read(root, n_frames)
         assert torch.equal(robot.states[first : last + 1], expected_robot.states[a : b + 1])
         assert torch.equal(robot.actions[first : last + 1], expected_robot.actions[a : b + 1])
         assert torch.equal(robot.images([first, last]), expected_robot.images([a, b]))
+
+
+def test_frames_of_videos_are_those_recorded_whatever_time_a_clock_gave_them(video_root, tmp_path):
+    root = shutil.copytree(video_root, tmp_path / "clock")
+    for path in root.glob("data/*/*.parquet"):
+        frames = pd.read_parquet(path)
+        frames["timestamp"] = np.float32(0.2)
+        frames.to_parquet(path)
+    expected = FramesInMemory(read(video_root)).columns[TOP]
+    assert torch.equal(FramesInMemory(read(root)).columns[TOP], expected)
 
 
 def test_demonstrations_are_read_from_videos(video_root):

@@ -136,6 +136,7 @@ def test_a_damaged_task_bank_is_an_error(checkpoint, change, message):
     ("option", "message"),
     [
         ("image_size=32", "`image_size` 16, and cannot be used with 32"),
+        ("demo_rows=2", "`demo_rows` 1, and cannot be used with 2"),
         ("gripper=0", "`gripper` '1', and cannot be used with '0'"),
         ("gripper_closed=high", "`gripper_closed` 'low', and cannot be used with 'high'"),
         ("language_encoder=all-MiniLM-L6-v2", "`language_encoder` 'paraphrase-MiniLM-L3-v2', and cannot"),

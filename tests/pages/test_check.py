@@ -6,6 +6,7 @@ import sys
 from itertools import islice
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 from small_policies import (
@@ -82,6 +83,29 @@ def test_a_refusal_is_the_error_of_the_training(n_episodes, tmp_path, monkeypatc
         policy(before(batch_of(dataset, [0])))
     assert report.startswith(f"Training would refuse this dataset. {error.value}\n")
     assert "would refuse" in page
+
+
+def test_an_undecodable_image_is_named_and_the_episode_can_be_left_out(table, tmp_path, short_fit):
+    root = Path(shutil.copytree(table.root, tmp_path / "data"))
+    (path,) = root.glob("data/*/*.parquet")
+    frames = pd.read_parquet(path)
+    (row,) = frames.index[(frames["episode_index"] == 3) & (frames["frame_index"] == 2)]
+    images = list(frames["observation.image"])
+    images[row] = {**images[row], "bytes": images[row]["bytes"][:40]}
+    frames.assign(**{"observation.image": images}).to_parquet(path)
+    # Training decodes all frames, so it would meet the one in the middle of the episode.
+    report, page = checked(root, tmp_path / "out")
+    assert re.match("Training would refuse this dataset. The image .* in frame 2 of episode 3 ", report)
+    assert page.count("data:image/jpeg;base64") >= 4 * 47
+    rest = [n for n in range(48) if n != 3]
+    report = check(
+        CheckArguments(
+            str(root), PolicyOptions(image_size=24), out=tmp_path / "out", dataset_episodes=str(rest)
+        )
+    )
+    assert "in 47 of 47 episodes" in report
+    with pytest.raises(ValueError, match="--dataset.episodes must be a list of numbers"):
+        CheckArguments(str(root), dataset_episodes="3 4")
 
 
 def test_what_does_not_fit_is_shown_without_a_policy(tmp_path):

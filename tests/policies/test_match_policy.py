@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
 from small_policies import (
     TABLE_LENGTH,
     TABLE_SIZE,
@@ -24,6 +24,7 @@ from small_policies import (
     write_table,
 )
 
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.normalization import StateLimits
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, PickPlace
 
@@ -225,14 +226,41 @@ def test_feature_matching_takes_images_of_any_size(table):
 def test_actions_that_cannot_be_carried_out_are_errors(make, table):
     policy, scene = make().eval(), batch_of(table, [0])
     assert found_in(policy, scene, [RED], [[0]]) is not None
-    unknown = {**scene, OBS_STATE: torch.full_like(scene[OBS_STATE], torch.nan)}
-    with pytest.raises(FloatingPointError, match=r"`observation\.state` has numbers that are not finite"):
-        policy.select_action(unknown)
     with torch.no_grad():
         for weights in policy.parameters():
             weights.mul_(1e30)
     with pytest.raises(FloatingPointError, match="the weights of the checkpoint are damaged"):
         found_in(policy, scene, [RED], [[0]])
+
+
+@pytest.mark.parametrize("name", [OBS_STATE, OBS_IMAGE])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_an_observation_with_numbers_that_are_not_finite_is_an_error(make, table, name, value):
+    policy, scene = make().eval(), batch_of(table, [0])
+    found_in(policy, scene, [RED], [[0]])
+    scene[name].view(-1)[1] = value
+    with pytest.raises(FloatingPointError, match=f"`{name}` has numbers that are not finite"):
+        policy.select_action(scene)
+
+
+def test_images_must_be_in_0_to_1_and_what_is_doubtful_is_told_once(make, table, caplog):
+    policy, scene = make().eval(), batch_of(table, [0])
+    with pytest.raises(UserError, match=r"`observation.image` must have numbers from 0 to 1. Got \d+ to 2"):
+        found_in(policy, {**scene, OBS_IMAGE: 255 * scene[OBS_IMAGE]}, [RED], [[0]])
+    assert "observation." not in caplog.text
+    black, degrees = torch.zeros_like(scene[OBS_IMAGE]), scene[OBS_STATE] + 57.3
+    for _ in range(2):
+        found_in(policy, {**scene, OBS_IMAGE: black, OBS_STATE: degrees}, [RED], [[0]])
+    assert caplog.text.count("The image `observation.image` is of a single color") == 1
+    assert caplog.text.count("`observation.state` is not like that of the training: its dimension") == 1
+
+
+def test_an_empty_sentence_and_too_many_demonstrations_are_errors(make, table):
+    policy, scene = make(n_demonstrations=25).eval(), batch_of(table, [0])
+    with pytest.raises(UserError, match="`task` is empty"):
+        policy.select_action({**scene, "task": [" "]})
+    with pytest.raises(UserError, match="`n_demonstrations` is 25, but the task .* has 24"):
+        policy.select_action({**scene, "task": [RED]})
 
 
 def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):

@@ -50,6 +50,9 @@ def test_invalid_options_say_what_is_valid():
         ({"state_noise": -1}, "`state_noise` must be from 0 to 10"),
         ({"n_demonstrations": 0}, "`n_demonstrations` must be from 1"),
         ({"n_demonstrations": 5, "demo_episode": 0}, "names a single demonstration, but .* is 5"),
+        ({"temporal_ensemble_coeff": float("nan"), "n_action_steps": 1}, "coeff` must be from -0.05 to 10"),
+        ({"temporal_ensemble_coeff": float("inf"), "n_action_steps": 1}, "coeff` must be from -0.05 to 10"),
+        ({"upsampled_fraction": float("nan")}, "`upsampled_fraction` must be from 0 to 1"),
         ({"grasp_height_bias": float("nan")}, "`grasp_height_bias` must be from -10 to 10"),
         ({"frames_after_release": -1}, "`frames_after_release` must be from 0"),
     ]:

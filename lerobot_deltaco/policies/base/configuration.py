@@ -140,6 +140,10 @@ class TaskConditionedConfig(PreTrainedConfig):
             optimizer_lr=(1e-12, 10),
             optimizer_weight_decay=(0, 10),
             grad_clip_norm=(0, math.inf),
+            # Weights of a chunk's steps are exp(-coefficient * step), which must not overflow.
+            temporal_ensemble_coeff=(-0.05, 10),
+            upsampled_fraction=(0, 1),
+            scheduler_warmup_steps=(0, 10**9),
             tasks_per_batch=(0, 10**9),
             seed=(0, 2**63 - 1),
         )

@@ -13,11 +13,12 @@ import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from huggingface_hub.constants import CONFIG_NAME
+from lerobot.configs import NormalizationMode
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
@@ -30,6 +31,7 @@ from lerobot_deltaco.policies.base.instructions import InstructionEmbeddings, Pa
 from lerobot_deltaco.policies.base.losses import imitation_loss, join_action
 from lerobot_deltaco.policies.base.networks import ActionDistribution, PolicyNetwork, fuse_batch_norms
 from lerobot_deltaco.policies.base.normalization import StateLimits
+from lerobot_deltaco.policies.base.observations import ObservationChecks
 from lerobot_deltaco.policies.base.policy_card import policy_card
 from lerobot_deltaco.policies.base.sentences import read_sentences
 from lerobot_deltaco.policies.base.task_bank import (
@@ -45,7 +47,10 @@ logger = logging.getLogger(__name__)
 _ABSURD_ACTION = 100.0
 
 # Options that a policy keeps after its training, and those that only further training may change.
-_TRAINED_OPTIONS = ("image_size", "chunk_size", "num_mixture_components", "language_encoder")
+_TRAINED_OPTIONS = (
+    *("image_size", "chunk_size", "num_mixture_components", "language_encoder", "crop_size", "method"),
+    *("film", "concat", "demo_encoder", "demo_rows", "vision_encoder", "vision_image_size", "backbone"),
+)
 _DATASET_OPTIONS = ("gripper", "gripper_closed", "demo_camera")
 
 DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
@@ -92,6 +97,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             config.set_dataset_length(dataset_meta)
         config.validate_features()
         self.state_limits = StateLimits(config.state_dim, dataset_stats)
+        self._observation_checks = ObservationChecks(config.cameras)
         self.instructions: InstructionEmbeddings | None = None
         self.paraphrases = None if dataset_meta is None else _read_paraphrases(config, dataset_meta)
         self.demonstrations: DemonstrationBank | None = self._read_evaluation_bank()
@@ -149,8 +155,10 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
         Raises:
             ValueError: There is no instruction, or a task has no demonstration.
+            ObservationError: The observation has numbers that cannot be.
             FloatingPointError: The action is not finite, or absurdly large.
         """
+        self.check_observation(batch)
         # In bfloat16, in which LeRobot's training evaluates, an action would depend on the rest of the batch.
         with torch.autocast(self.step.device.type, enabled=False):
             action = self._next_action(batch)
@@ -188,6 +196,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             return self._tasks
         tasks = batch.get("task")
         if isinstance(tasks, (list, tuple)) and tasks and all(isinstance(task, str) for task in tasks):
+            if not all(task.strip() for task in tasks):
+                raise UserError(
+                    "`task` is empty. Give a sentence, such as with --task; to act on a demonstration alone, "
+                    "pass it to `set_tasks` with an empty instruction."
+                )
             return tuple(tasks), None
         raise UserError(
             "`task` must be a list with an instruction for each sample of the batch. Got "
@@ -203,7 +216,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             n_each: Number of demonstrations of each sample.
 
         Raises:
-            ValueError: There is no demonstration of a task.
+            ValueError: There are too few demonstrations of a task.
         """
         bank = self.demonstrations
         if bank is None and self.training_data is not None:
@@ -218,11 +231,27 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         found, n_taken = [], dict.fromkeys(tasks, 0)
         for task in tasks:
             known, first = bank.of_task(task), n_taken[task]
+            if len(known) < n_each:
+                raise UserError(
+                    f"`n_demonstrations` is {n_each}, but the task {task!r} has {len(known)}. Set it to at "
+                    "most that, or name a dataset that has more with --policy.demo_repo_id and "
+                    "--policy.demo_root."
+                )
             found.append([known[(first + n) % len(known)] for n in range(n_each)])
             n_taken[task] += n_each
         return found
 
     # Observations
+
+    def check_observation(self, batch: Mapping[str, Any]) -> None:
+        """Checks the numbers of an observation, as in `select_action`.
+
+        Raises:
+            ObservationError: One is not finite, or an image is not in 0..1.
+        """
+        is_normalized = self.config.normalization_mapping.get("STATE") != NormalizationMode.IDENTITY
+        states = batch.get(OBS_STATE) if is_normalized and self.config.state_dim else None
+        self._observation_checks(batch, None if states is None else states * self.state_limits.scale)
 
     def _images(self, batch: dict[str, Any]) -> Tensor:
         """Returns the images of all cameras, the demonstration camera first, (batch, cameras, 3, S, S)."""
@@ -262,14 +291,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Returns actions (batch, steps, action); an absurd one is an error."""
         if bool((action.abs() < _ABSURD_ACTION).all()):  # False for NaN
             return action
-        damaged = _not_finite(batch)
-        cause = (
-            f"In the observation, {', '.join(f'`{name}`' for name in damaged)} has numbers that are not "
-            "finite: check the sensors, and the normalization statistics of the checkpoint."
-            if damaged
-            else "The observation is finite, so the weights of the checkpoint are damaged. Fetch it again."
+        self.check_observation(batch)
+        raise FloatingPointError(
+            "The policy's action is not finite, or absurdly large. The observation is finite, so the weights "
+            "of the checkpoint are damaged. Fetch it again."
         )
-        raise FloatingPointError(f"The policy's action is not finite, or absurdly large. {cause}")
 
     # Training
 

@@ -22,6 +22,7 @@ images of the training episodes: see `fit`.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -29,6 +30,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
+from lerobot_deltaco.policies.deltaco_match.camera_motion import CameraMotion
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.matching import (
     HIDDEN_DIM,
@@ -46,6 +48,8 @@ from lerobot_deltaco.policies.deltaco_match.words import (
     understand,
     words_of,
 )
+
+logger = logging.getLogger(__name__)
 
 _MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
 # Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
@@ -213,6 +217,25 @@ class FeatureMatching(nn.Module):
         p_misdescribed = settings.p_misdescribed
         by_words = (1 - p_misdescribed) * by_words + p_misdescribed / scores.shape[1]
         return matches + by_words.log(), similarity
+
+    def camera_motion(self, scene: Tensor) -> CameraMotion | None:
+        """Returns how far the camera has moved since the training, and warns if it has.
+
+        Args:
+            scene: First image of an episode, (3, H, W) in 0..1, at full resolution.
+
+        Returns:
+            The motion; None if the camera did not stand still in the training, or it is not known.
+        """
+        motion = self.background.camera_motion(scene) if bool(self.uses_background) else None
+        if motion is not None and motion.is_significant:
+            height, width = scene.shape[-2:]
+            logger.warning(
+                "The camera seems to have moved since the training: the picture is off by %s. Locations are "
+                "those of the training's camera. Move it back, or train on episodes of where it is now.",
+                motion.describe(width, height),
+            )
+        return motion
 
     def proposals(self, scenes: Tensor, full_resolution: Tensor) -> Tensor:
         """Returns where something could be grasped in scenes, (batch, n, 2) in -1..1. See `find`."""

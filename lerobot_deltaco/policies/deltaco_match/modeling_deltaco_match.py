@@ -380,6 +380,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """
         camera = self.config.cameras[0]
         scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
+        self.feature_matching.camera_motion(batch[camera][0])  # warns
         by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
         given = self._batch_demonstrations(demonstrations, scenes.device)
         attention = last = descriptors = heights = None

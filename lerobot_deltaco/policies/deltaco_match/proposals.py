@@ -12,6 +12,11 @@ from tqdm import tqdm
 from lerobot_deltaco.policies.base.image_coordinates import cell_centers, grid_of_centers, mean_near
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu
+from lerobot_deltaco.policies.deltaco_match.camera_motion import (
+    CameraMotion,
+    estimate_motion,
+    static_reference,
+)
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
 
@@ -71,11 +76,12 @@ class Background(nn.Module):
         self.register_buffer("object_size", torch.tensor(_DEFAULT_SIZE))
         self.register_buffer("perspective", torch.zeros(2))
         self._bounds: tuple[Tensor, Tensor] | None = None  # of the remembered colors around each pixel
+        self._static: tuple[Tensor, Tensor] | None = None  # what never moved, and how clearly
         self.register_load_state_dict_post_hook(self._forget_bounds)
 
     @staticmethod
     def _forget_bounds(module: Background, _: object) -> None:
-        module._bounds = None
+        module._bounds = module._static = None
 
     def forward(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
         """Proposes objects, those that stand out most first.
@@ -98,6 +104,19 @@ class Background(nn.Module):
         """Returns how clearly each pixel stands out, (batch, 128, 128) in 0..1. See `forward`."""
         return ((self._differences(scenes, remembered) - self.contrast) / self.contrast).clamp(0, 1)
 
+    def camera_motion(self, scene: Tensor) -> CameraMotion | None:
+        """Compares a scene with what never moved; None with too few remembered images to know that.
+
+        Args:
+            scene: First image, (3, H, W), uint8 or in 0..1, at full resolution.
+        """
+        if self.n_images < _MIN_IMAGES:
+            return None
+        if self._static is None or self._static[0].device != self.images.device:
+            self._static = static_reference(self.images[: int(self.n_images)])
+        height, width = scene.shape[-2:]
+        return estimate_motion(*self._static, _scaled(scene[None].to(self.images.device))[0], width / height)
+
     def fit(self, images: Tensor, locations: Tensor) -> None:
         """Remembers images, and measures objects.
 
@@ -108,7 +127,7 @@ class Background(nn.Module):
         self.images.zero_()
         self.images[: len(images)] = _scaled(images).mul(255).round().to(self.images)
         self.n_images.fill_(len(images))
-        self._bounds = None
+        self._bounds = self._static = None
         differences = self._differences(images, torch.arange(len(images)))
         noise = _NOISE_FACTOR * differences.flatten(1).median(dim=1).values.median()
         self.contrast.copy_(noise.clamp_min(_MIN_CONTRAST))
