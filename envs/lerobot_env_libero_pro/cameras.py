@@ -9,7 +9,8 @@ import numpy as np
 # LeRobot's names of the images, and LIBERO's of the cameras.
 CAMERAS = {"image": "agentview", "image2": "robot0_eye_in_hand"}
 SUPERSAMPLING = 2  # pixels drawn per pixel and axis, which replace the multisampling that takes longer in software
-VISIBLE_GROUP = 1  # of MuJoCo's geoms; the other groups are what collides
+VISIBLE_GROUP = 1  # of MuJoCo's geoms; group 0 is what collides
+HIDDEN_GROUP = 5
 
 
 class Cameras:
@@ -56,11 +57,26 @@ class Cameras:
             data: Data of MuJoCo.
             name: Name of the image, of `CAMERAS`.
         """
+        # MuJoCo sends all meshes to the renderer, also those behind the camera: 300,000 triangles.
+        groups = self._model.geom_group.copy()
+        self._model.geom_group[self._outside(data, name)] = HIDDEN_GROUP
         self._renderer.update_scene(data, camera=CAMERAS[name], scene_option=self._options)
+        self._model.geom_group[:] = groups
         drawn = self._renderer.render()
         shape = (self.size, SUPERSAMPLING, self.size, SUPERSAMPLING, 3)
         upright = drawn.reshape(shape).mean((1, 3)).round().astype(np.uint8)
         return np.ascontiguousarray(upright[:, ::-1])
+
+    def _outside(self, data: Any, name: str) -> np.ndarray:
+        """Tells which geoms are wholly outside a camera's view, by their bounding spheres: (number of geoms,), bool."""
+        camera = data.camera(CAMERAS[name])
+        # The camera looks along its negative third axis.
+        points = (data.geom_xpos - camera.xpos) @ camera.xmat.reshape(3, 3)
+        half = np.radians(self._model.cam_fovy[camera.id]) / 2
+        # Signed distances from the four sides of the view, and from the plane of the camera.
+        sides = [sign * points[:, i] * np.cos(half) + points[:, 2] * np.sin(half) for i in (0, 1) for sign in (1, -1)]
+        radius = self._model.geom_rbound
+        return (np.max([*sides, points[:, 2]], axis=0) > radius) & (radius > 0)
 
     def pixels(self, data: Any, name: str, points: np.ndarray) -> np.ndarray:
         """Returns where points of the world are in a picture: (n, 2), column and row, in pixels from the left upper corner.

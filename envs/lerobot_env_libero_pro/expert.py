@@ -9,9 +9,15 @@ import numpy as np
 from lerobot_env_libero_pro.grasps import find_grasp, turn
 from lerobot_env_libero_pro.scene import CONTROL_FPS, Scene
 
-APPROACH = 0.08  # m above the grasp, where the hand has turned before it descends
+APPROACH = 0.08  # m above the grasp, at least, where the hand has turned before it descends
+PASSING = 0.05  # m above all objects on the way there
 CROSSING = 0.06  # m between the object's lowest point and the highest one where it goes, on the way
 RELEASE = 0.01  # m between them when the gripper opens
+# m from the robot's axis, from which on the hand tilts outwards, and m per rad: where the elbow becomes straight, the
+# controller loses the way back.
+FAR = 0.72
+TILT_LENGTH = 0.2
+MAX_TILT = 0.4  # rad
 CLOSING_STEPS = 9
 OPENING_STEPS = 6
 RISING_STEPS = 8
@@ -33,6 +39,8 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
     grasp = find_grasp(scene, target, _hand_axis(scene))
     bottom = scene.vertices(target)[:, 2].min() - scene.position(target)[2]
     rim = _rim(scene, place)
+    tallest = max(scene.vertices(name)[:, 2].max() for name in scene.task.objects)
+    above = np.array([*grasp.point[:2], max(grasp.point[2] + APPROACH, tallest + PASSING)])
 
     def hand_to(point: np.ndarray, tolerance: float, opening: float, slow: float = 1) -> Iterator[np.ndarray]:
         for _ in range(TIMEOUT):
@@ -52,8 +60,8 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
                 return
             yield _action(scene, offset, grasp.axis, 1, slow)
 
-    yield from hand_to(grasp.point + [0, 0, APPROACH], 0.01, -1)
-    yield from hand_to(grasp.point, 0.006, -1)
+    yield from hand_to(above, 0.006, -1)
+    yield from hand_to(grasp.point, 0.004, -1)
     for _ in range(CLOSING_STEPS):
         yield _action(scene, np.zeros(3), grasp.axis, 1)
     yield from object_to(rim + CROSSING, 1, level=False)
@@ -79,9 +87,13 @@ def _rim(scene: Scene, place: str) -> float:
 def _action(scene: Scene, offset: np.ndarray, axis: np.ndarray, gripper: float, slow: float = 1) -> np.ndarray:
     """Returns an action towards an offset of the hand, (3,) m, that keeps it upright and turns it to an axis."""
     rotation = scene.hand_rotation()
+    outwards = (scene.hand_position() - scene.base_position())[:2]
+    distance = np.linalg.norm(outwards)
+    tilt = np.clip((distance - FAR) / TILT_LENGTH, 0, MAX_TILT)
+    pointing = np.array([*(np.sin(tilt) * outwards / distance), -np.cos(tilt)])
     action = np.zeros(7, np.float32)
     action[:3] = np.clip(offset / 0.05, -slow, slow)
-    upright = np.cross(rotation[:, 2], [0, 0, -1])
-    action[3:6] = np.clip((upright + [0, 0, turn(axis, rotation[:2, 0])]) / 0.5, -1, 1)
+    turning = np.cross(rotation[:, 2], pointing) + [0, 0, turn(axis, rotation[:2, 0])]
+    action[3:6] = np.clip(turning / 0.5, -1, 1)
     action[6] = gripper
     return action

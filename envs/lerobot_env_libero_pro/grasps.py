@@ -9,11 +9,15 @@ import numpy as np
 from lerobot_env_libero_pro.scene import Scene
 
 OPENING = 0.077  # m between the open fingers
-CLEARANCE = 0.007  # m between them that the object must leave, in all
-REACH = 0.035  # m from an object's top down to the point between the fingertips, at most: above are the knuckles
+CLEARANCE = 0.006  # m between them that the object must leave, in all
+REACH = 0.040  # m from an object's top down to the point between the fingertips, at most: 5 mm above is the palm
 LOWEST = 0.012  # m of that point above what the object stands on
-SLAB = 0.012  # m above and below the point, which the fingertips touch
-FINGERS = ((0.036, 0.066), 0.014)  # m: where the open fingers are along their axis, and half their width across it
+HIGHEST = 0.016  # m of that point below the object's top
+PAD = 0.009  # m above and below the point that the fingertips touch
+# Half extents, m, of the open fingers and of the palm along the axis and across it, and the palm's height above the point.
+FINGERS = ((0.036, 0.068), 0.016)
+PALM = ((0.0, 0.105), 0.035)
+PALM_HEIGHT = 0.04
 ANGLES = np.radians(np.arange(0, 180, 5))
 
 
@@ -38,13 +42,11 @@ def find_grasp(scene: Scene, name: str, hand_axis: np.ndarray) -> Grasp:
         name: Name of the object.
         hand_axis: Horizontal direction in which the fingers close now, (2,).
     """
-    vertices = scene.vertices(name)
-    bottom, top = vertices[:, 2].min(), vertices[:, 2].max()
-    height = max((bottom + top) / 2, top - REACH, bottom + LOWEST)
-    slab = vertices[np.abs(vertices[:, 2] - height) < SLAB][:, :2]
-    obstacles = [scene.vertices(other)[::10] for other in scene.task.objects if other != name]
-    around = np.concatenate(obstacles) if obstacles else np.zeros((0, 3))
-    around = around[around[:, 2] > height - SLAB][:, :2]
+    solids = scene.solids(name)
+    height = _even_height(solids)
+    slab = _slab(solids, height - PAD, height + PAD)
+    others = [scene.vertices(other)[::10] for other in scene.task.objects if other != name]
+    around = np.concatenate([*others, np.zeros((0, 3))])
     candidates = across(slab, height) or at_rim(slab, height)
     return min(candidates, key=lambda grasp: _cost(grasp, around, hand_axis))
 
@@ -85,11 +87,35 @@ def turn(axis: np.ndarray, hand_axis: np.ndarray) -> float:
     return float((angle + np.pi / 2) % np.pi - np.pi / 2)
 
 
+def _slab(solids: list[np.ndarray], low: float, high: float) -> np.ndarray:
+    """Returns the corners, (n, 2), of the parts of an object that are between two heights."""
+    parts = [part[:, :2] for part in solids if part[:, 2].min() < high and part[:, 2].max() > low]
+    return np.concatenate([*parts, np.zeros((0, 2))])
+
+
+def _even_height(solids: list[np.ndarray]) -> float:
+    """Returns the lowest height in reach where the pads have an even wall between them: at an edge, objects stick."""
+    heights = np.concatenate(solids)[:, 2]
+    bottom, top = heights.min(), heights.max()
+    lowest = max((bottom + top) / 2, top - REACH, bottom + LOWEST)
+
+    def unevenness(height: float) -> float:
+        halves = [_slab(solids, height - PAD, height), _slab(solids, height, height + PAD)]
+        if any(not len(half) for half in halves):
+            return np.inf
+        lower, upper = (np.concatenate([half.min(0), half.max(0)]) for half in halves)
+        return float(np.abs(lower - upper).max().round(3))
+
+    return min(np.arange(lowest, max(lowest, top - HIGHEST) + 1e-6, 0.003), key=unevenness)
+
+
 def _cost(grasp: Grasp, around: np.ndarray, hand_axis: np.ndarray) -> float:
-    """Returns the hand's turn, rad, and 10 where a finger would come down on another object."""
-    relative = around - grasp.point[:2]
-    along = np.abs(relative @ grasp.axis)
-    beside = np.abs(relative @ [-grasp.axis[1], grasp.axis[0]])
-    (inner, outer), half_width = FINGERS
-    is_blocked = np.any((along > inner) & (along < outer) & (beside < half_width))
-    return abs(turn(grasp.axis, hand_axis)) + 10 * bool(is_blocked)
+    """Returns the hand's turn, rad, and 10 where a finger or the palm would come down on another object."""
+    relative = around - grasp.point
+    along = np.abs(relative[:, :2] @ grasp.axis)
+    beside = np.abs(relative[:, :2] @ [-grasp.axis[1], grasp.axis[0]])
+    cost = abs(turn(grasp.axis, hand_axis))
+    for ((inner, outer), half_width), height in ((FINGERS, -PAD), (PALM, PALM_HEIGHT)):
+        is_hit = (along >= inner) & (along < outer) & (beside < half_width) & (relative[:, 2] > height)
+        cost += 10 * bool(is_hit.any())
+    return cost

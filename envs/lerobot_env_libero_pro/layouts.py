@@ -14,7 +14,8 @@ STREAMS = {"training": 0, "evaluation": 1}
 AREAS = {"libero_object": ((-0.25, 0.20), (-0.32, 0.12))}
 RECEPTACLE = "basket_1"
 RECEPTACLE_AREA = ((-0.02, 0.02), (0.24, 0.28))
-GAP = 0.035  # m between two objects' outer circles, into which a finger fits
+REACH = 0.80  # m from the robot's axis
+GAP = 0.06  # m between two objects' outer circles, so that the hand fits between them
 
 
 def permuted_poses(scene: Scene, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -39,7 +40,9 @@ def permuted_poses(scene: Scene, rng: np.random.Generator) -> dict[str, np.ndarr
     np.fill_diagonal(apart, 0)
     while True:
         places = rng.uniform(*np.transpose(AREAS[base]), (len(names), 2))
-        if np.all(np.linalg.norm(places[:, None] - places, axis=2) >= apart):
+        is_apart = np.linalg.norm(places[:, None] - places, axis=2) >= apart
+        is_near = np.linalg.norm(places - scene.base_position()[:2], axis=1) < REACH
+        if is_apart.all() and is_near.all():
             break
     poses[RECEPTACLE][:2] = rng.uniform(*np.transpose(RECEPTACLE_AREA))
     for name, place in zip(names, places, strict=True):

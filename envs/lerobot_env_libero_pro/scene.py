@@ -96,6 +96,10 @@ class Scene:
         """Returns the hand's rotation matrix, (3, 3): the fingers move along its second axis, and point along its third."""
         return self.data.site_xmat[self._inner.robots[0].eef_site_id].reshape(3, 3).copy()
 
+    def base_position(self) -> np.ndarray:
+        """Returns the position of the robot's base: (3,), m."""
+        return self.data.body("robot0_base").xpos.copy()
+
     def position(self, name: str) -> np.ndarray:
         """Returns the position of an object's or a fixture's origin, or of a region's center: (3,), m."""
         if name in self._inner.obj_body_id:
@@ -114,10 +118,11 @@ class Scene:
 
     def vertices(self, name: str) -> np.ndarray:
         """Returns the vertices of what is seen of an object or a fixture: (n, 3), m."""
-        root = self._inner.obj_body_id[name]
-        bodies = [body for body in range(self.model.nbody) if root in self._ancestors(body)]
-        seen = np.flatnonzero(np.isin(self.model.geom_bodyid, bodies) & (self.model.geom_group == 1))
-        return np.concatenate([self._geom_vertices(geom) for geom in seen])
+        return np.concatenate([self._geom_vertices(geom) for geom in self._geoms(name, group=1)])
+
+    def solids(self, name: str) -> list[np.ndarray]:
+        """Returns the convex parts of an object or a fixture that collide, by their corners: (n, 3) each, m."""
+        return [self._geom_vertices(geom) for geom in self._geoms(name, group=0)]
 
     def lifted(self) -> tuple[str, ...]:
         """Returns the names of the movable objects that are higher than at first, by more than `LIFTED`."""
@@ -135,6 +140,13 @@ class Scene:
 
     def _joint(self, name: str) -> str:
         return self._inner.objects_dict[name].joints[0]
+
+    def _geoms(self, name: str, group: int) -> list[int]:
+        """Returns the geoms of an object or a fixture: group 1 is what is seen, group 0 what collides."""
+        root = self._inner.obj_body_id[name]
+        bodies = [body for body in range(self.model.nbody) if root in self._ancestors(body)]
+        is_part = np.isin(self.model.geom_bodyid, bodies) & (self.model.geom_group == group)
+        return np.flatnonzero(is_part).tolist()
 
     def _ancestors(self, body: int) -> set[int]:
         """Returns a body and all those that carry it, without the world."""
