@@ -55,19 +55,23 @@ class Scene:
         self.data: Any = self._inner.sim.data._data
         self._heights: dict[str, float] = {}
 
-    def reset(self, state: np.ndarray, seed: int, poses: dict[str, np.ndarray] | None = None) -> None:
+    def reset(
+        self, seed: int, state: np.ndarray | None = None, poses: dict[str, np.ndarray] | None = None
+    ) -> None:
         """Puts the scene into a state, and lets it settle.
 
         Args:
+            seed: Seed of what LIBERO draws: places in the regions of the BDDL file. A state overrides those of
+                movable objects, but leaves those of fixtures.
             state: A state of `Task.initial_states`.
-            seed: Seed of the places of fixtures, which LIBERO's states leave open.
             poses: Positions and quaternions, (7,), of movable objects that stand elsewhere than in the state.
         """
         with _seeded(seed):
             self._inner.reset()
         # Which robosuite forgets: what the fingers did last in the episode before.
         self._inner.robots[0].gripper.current_action[:] = 0
-        self._env.set_state(state)
+        if state is not None:
+            self._env.set_state(state)
         for name, pose in (poses or {}).items():
             self._inner.sim.data.set_joint_qpos(self._joint(name), pose)
         self._inner.sim.forward()
@@ -130,9 +134,13 @@ class Scene:
             name for name, height in self._heights.items() if self.position(name)[2] > height + LIFTED
         )
 
+    def holds(self, predicate: tuple[str, ...]) -> bool:
+        """Tells whether a predicate holds now, such as ("in", "milk_1", "basket_1_contain_region")."""
+        return bool(self._inner._eval_predicate(predicate))
+
     def is_success(self) -> bool:
         """Tells whether the goal holds now."""
-        return bool(self._env.check_success())
+        return all(self.holds(predicate) for predicate in self.task.goal)
 
     def close(self) -> None:
         """Frees the simulator."""
