@@ -1,4 +1,4 @@
-"""LIBERO-PRO for LeRobot: `--env.type=libero_pro`. LeRobot imports installed distributions of this name by itself."""
+"""LIBERO-PRO for LeRobot: `--env.type=libero_pro`. LeRobot imports the installed distribution itself."""
 
 from lerobot_env_libero_pro.config import LiberoProConfig
 from lerobot_env_libero_pro.env import LiberoProEnv

@@ -8,7 +8,9 @@ import numpy as np
 
 # LeRobot's names of the images, and LIBERO's of the cameras.
 CAMERAS = {"image": "agentview", "image2": "robot0_eye_in_hand"}
-SUPERSAMPLING = 2  # pixels drawn per pixel and axis, which replace the multisampling that takes longer in software
+SUPERSAMPLING = (
+    2  # pixels drawn per pixel and axis, which replace the multisampling that takes longer in software
+)
 VISIBLE_GROUP = 1  # of MuJoCo's geoms; group 0 is what collides
 HIDDEN_GROUP = 5
 
@@ -16,8 +18,8 @@ HIDDEN_GROUP = 5
 class Cameras:
     """Draws pictures of a scene.
 
-    **Pictures are mirrored**, left and right exchanged, as in LeRobot's datasets of LIBERO: there, images that
-    robosuite gives upside down are turned by 180 degrees.
+    **Pictures are mirrored**, left and right exchanged, as in LeRobot's datasets of LIBERO: LeRobot turns by
+    180 degrees what robosuite gives upside down.
 
     Args:
         model: Model of MuJoCo.
@@ -40,8 +42,8 @@ class Cameras:
             self._renderer = mujoco.Renderer(model, side, side)
         except Exception as error:
             raise RuntimeError(
-                "MuJoCo cannot draw. Without a GPU, on Debian and Ubuntu: `apt-get install libegl1 libgl1-mesa-dri` "
-                "for MUJOCO_GL=egl, or `apt-get install libosmesa6` for MUJOCO_GL=osmesa."
+                "MuJoCo cannot draw. Without a GPU, on Debian and Ubuntu: `apt-get install libegl1 "
+                "libgl1-mesa-dri` for MUJOCO_GL=egl, or `apt-get install libosmesa6` for MUJOCO_GL=osmesa."
             ) from error
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._renderer.scene.flags[flag] = False
@@ -68,18 +70,22 @@ class Cameras:
         return np.ascontiguousarray(upright[:, ::-1])
 
     def _outside(self, data: Any, name: str) -> np.ndarray:
-        """Tells which geoms are wholly outside a camera's view, by their bounding spheres: (number of geoms,), bool."""
+        """Tells which geoms' bounding spheres are outside a camera's view: (number of geoms,), bool."""
         camera = data.camera(CAMERAS[name])
         # The camera looks along its negative third axis.
         points = (data.geom_xpos - camera.xpos) @ camera.xmat.reshape(3, 3)
         half = np.radians(self._model.cam_fovy[camera.id]) / 2
         # Signed distances from the four sides of the view, and from the plane of the camera.
-        sides = [sign * points[:, i] * np.cos(half) + points[:, 2] * np.sin(half) for i in (0, 1) for sign in (1, -1)]
+        sides = [
+            sign * points[:, i] * np.cos(half) + points[:, 2] * np.sin(half)
+            for i in (0, 1)
+            for sign in (1, -1)
+        ]
         radius = self._model.geom_rbound
         return (np.max([*sides, points[:, 2]], axis=0) > radius) & (radius > 0)
 
     def pixels(self, data: Any, name: str, points: np.ndarray) -> np.ndarray:
-        """Returns where points of the world are in a picture: (n, 2), column and row, in pixels from the left upper corner.
+        """Returns where points are in a picture: (n, 2), column and row, pixels from the upper left corner.
 
         Args:
             data: Data of MuJoCo.

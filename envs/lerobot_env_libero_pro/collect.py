@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import tyro
 from tqdm import tqdm
 
@@ -59,8 +58,9 @@ def main(
     Args:
         root: Folder of the dataset, new, or that of an interrupted recording with the same arguments.
         suite: Name of the suite.
-        layouts: Objects where the suite puts them at random, or anywhere, kept apart. Standard layouts are drawn anew:
-            none is one of the 50 states of the evaluation. In permuted layouts, each object in turn is the target.
+        layouts: Objects where the suite puts them at random, or anywhere, kept apart. Standard layouts are
+            drawn anew: none is one of the 50 states of the evaluation. In permuted layouts, each object in turn
+            is the target.
         episodes_per_task: Number of episodes of each sentence.
         task_ids: Numbers of the suite's tasks; all by default.
         exclude_objects: Objects that are never a target, such as bbq_sauce. They still lie in scenes.
@@ -159,13 +159,20 @@ def _open(root: Path, image_size: int) -> Any:
         "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)},
     }
     return LeRobotDataset.create(
-        "local/libero_pro", fps=CONTROL_FPS, root=root, features=features, robot_type="panda", use_videos=False
+        "local/libero_pro",
+        fps=CONTROL_FPS,
+        root=root,
+        features=features,
+        robot_type="panda",
+        use_videos=False,
     )
 
 
 def _check_objects(names: set[str], known: set[str]) -> None:
     if unknown := names - known:
-        raise ValueError(f"No object is called {', '.join(sorted(unknown))}. Objects: {', '.join(sorted(known))}.")
+        raise ValueError(
+            f"No object is called {', '.join(sorted(unknown))}. Objects: {', '.join(sorted(known))}."
+        )
 
 
 def _category(name: str) -> str:

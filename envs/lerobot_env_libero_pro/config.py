@@ -24,8 +24,8 @@ class LiberoProConfig(EnvConfig):
     """`--env.type=libero_pro`: tasks of a suite of LIBERO or LIBERO-PRO.
 
     Args:
-        suite: Name of the suite: libero_object, libero_spatial, libero_goal or libero_10; with _swap, _task, _object
-            or _lan, what LIBERO-PRO makes of it; libero_object_temp_x0.1 to _y0.5.
+        suite: Name of the suite: libero_object, libero_spatial, libero_goal or libero_10; with _swap, _task,
+            _object or _lan, what LIBERO-PRO makes of it; libero_object_temp_x0.1 to _y0.5.
         task_ids: Numbers of the tasks; all by default.
         image_size: Width and height of the images, pixels.
         layouts: `standard`, or `permuted`: see `LiberoProEnv`.

@@ -21,13 +21,13 @@ class LiberoProEnv(gym.Env):
     |---|---|---|
     | `pixels/image` | (size, size, 3), uint8 | agentview, mirrored as in LeRobot's datasets of LIBERO |
     | `pixels/image2` | (size, size, 3), uint8 | the wrist camera, likewise |
-    | `agent_pos` | (8,), float32 | `STATE_NAMES`: hand's position, m; axis times angle, rad; both fingers, m |
+    | `agent_pos` | (8,), float32 | hand's position, m; axis times angle, rad; both fingers, m |
 
-    An action, (7,) float32 within [-1, 1], is a displacement in units of 0.05 m, a rotation in units of 0.5 rad, and
-    the gripper, which closes at 1 and opens at -1 (`ACTION_NAMES`); 20 a second.
+    An action, (7,) float32 within [-1, 1], is a displacement in units of 0.05 m, a rotation in units of 0.5
+    rad, and the gripper, which closes at 1 and opens at -1; 20 a second.
 
-    A reset puts the scene into one of the benchmark's 50 initial states, `seed` modulo 50, so that 50 consecutive
-    seeds meet each once, and lets it settle for ten steps. Resets with the same seed agree to the last bit.
+    A reset puts the scene into one of the benchmark's 50 initial states, `seed` modulo 50, so that 50
+    consecutive seeds meet each once, and lets it settle for ten steps. Resets with the same seed agree to the last bit.
 
     What a policy must not see is in `info`, after each reset and step, for an oracle or to count:
 
@@ -42,10 +42,10 @@ class LiberoProEnv(gym.Env):
     Args:
         task: The task, from `load_tasks`.
         image_size: Width and height of the images, pixels.
-        layouts: `standard`: the initial states. `permuted`: the same objects at random places, kept apart, by the
-            seed. No seed gives a layout of the training data.
-        stop_at_success: Whether an episode ends at the first success, as in LeRobot. Otherwise it lasts until the
-            horizon, so that success at the last step can be told from success at any.
+        layouts: `standard`: the initial states. `permuted`: the same objects at random places, kept apart, by
+            the seed. No seed gives a layout of the training data.
+        stop_at_success: Whether an episode ends at the first success, as in LeRobot. Otherwise it lasts until
+            the horizon, so that success at the last step can be told from success at any.
 
     Raises:
         ValueError: There are no such layouts.

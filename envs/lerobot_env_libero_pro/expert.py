@@ -13,10 +13,9 @@ APPROACH = 0.08  # m above the grasp, at least, where the hand has turned before
 PASSING = 0.05  # m above all objects on the way there
 CROSSING = 0.06  # m between the object's lowest point and the highest one where it goes, on the way
 RELEASE = 0.01  # m between them when the gripper opens
-# m from the robot's axis, from which on the hand tilts outwards, and m per rad: where the elbow becomes straight, the
-# controller loses the way back.
-FAR = 0.72
-TILT_LENGTH = 0.2
+# Far out, the hand tilts: where the elbow becomes straight, the controller loses the way back.
+FAR = 0.72  # m from the robot's axis, where the tilt begins
+TILT_LENGTH = 0.2  # m per rad
 MAX_TILT = 0.4  # rad
 CLOSING_STEPS = 9
 OPENING_STEPS = 6
@@ -27,9 +26,9 @@ TIMEOUT = 3 * CONTROL_FPS  # actions after which a stage ends anyway
 def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray]:
     """Yields the actions, (7,) float32, that put an object where it is to go. The caller carries each out.
 
-    The hand approaches from above, turns to the object's narrow side, descends, closes, lifts, crosses high enough,
-    lowers the object, releases it above what is below it, and rises. From the grasp on it is the object's origin
-    that is steered, since the goals of LIBERO test that point.
+    The hand approaches from above, turns to the object's narrow side, descends, closes, lifts, crosses high
+    enough, lowers the object, releases it above what is below it, and rises. From the grasp on, it is the
+    object's origin that is steered, since the goals of LIBERO test that point.
 
     Args:
         scene: The scene, which the caller steps.
@@ -81,11 +80,13 @@ def _hand_axis(scene: Scene) -> np.ndarray:
 def _rim(scene: Scene, place: str) -> float:
     """Returns the height, m, above which an object can cross where it is to go."""
     owner = scene.owner(place)
-    return float(scene.vertices(owner)[:, 2].max())
+    return float(scene.position(place)[2] if owner is None else scene.vertices(owner)[:, 2].max())
 
 
-def _action(scene: Scene, offset: np.ndarray, axis: np.ndarray, gripper: float, slow: float = 1) -> np.ndarray:
-    """Returns an action towards an offset of the hand, (3,) m, that keeps it upright and turns it to an axis."""
+def _action(
+    scene: Scene, offset: np.ndarray, axis: np.ndarray, gripper: float, slow: float = 1
+) -> np.ndarray:
+    """Returns an action that moves the hand by an offset, (3,) m, keeps it upright and turns it."""
     rotation = scene.hand_rotation()
     outwards = (scene.hand_position() - scene.base_position())[:2]
     distance = np.linalg.norm(outwards)

@@ -10,11 +10,13 @@ from lerobot_env_libero_pro.scene import Scene
 
 OPENING = 0.077  # m between the open fingers
 CLEARANCE = 0.006  # m between them that the object must leave, in all
-REACH = 0.040  # m from an object's top down to the point between the fingertips, at most: 5 mm above is the palm
+REACH = (
+    0.040  # m from an object's top down to the point between the fingertips, at most: 5 mm above is the palm
+)
 LOWEST = 0.012  # m of that point above what the object stands on
 HIGHEST = 0.016  # m of that point below the object's top
 PAD = 0.009  # m above and below the point that the fingertips touch
-# Half extents, m, of the open fingers and of the palm along the axis and across it, and the palm's height above the point.
+# Half extents along the axis and across it, m, of the open fingers and of the palm, and the palm's height.
 FINGERS = ((0.036, 0.068), 0.016)
 PALM = ((0.0, 0.105), 0.035)
 PALM_HEIGHT = 0.04
@@ -82,7 +84,7 @@ def at_rim(slab: np.ndarray, height: float) -> list[Grasp]:
 
 
 def turn(axis: np.ndarray, hand_axis: np.ndarray) -> float:
-    """Returns the angle, rad, by which the hand turns to close its fingers along an axis, at most a quarter turn."""
+    """Returns the angle by which the hand turns to close its fingers along an axis: -pi/2 to pi/2."""
     angle = np.arctan2(axis[1], axis[0]) - np.arctan2(hand_axis[1], hand_axis[0])
     return float((angle + np.pi / 2) % np.pi - np.pi / 2)
 
@@ -94,7 +96,7 @@ def _slab(solids: list[np.ndarray], low: float, high: float) -> np.ndarray:
 
 
 def _even_height(solids: list[np.ndarray]) -> float:
-    """Returns the lowest height in reach where the pads have an even wall between them: at an edge, objects stick."""
+    """Returns the lowest height in reach at which both pads meet an even wall: at an edge, objects stick."""
     heights = np.concatenate(solids)[:, 2]
     bottom, top = heights.min(), heights.max()
     lowest = max((bottom + top) / 2, top - REACH, bottom + LOWEST)

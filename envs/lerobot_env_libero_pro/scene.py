@@ -1,4 +1,4 @@
-"""A task's scene: the simulator behind positions, the robot's state, actions and success. Only this file knows robosuite."""
+"""A task's scene: positions, the robot's state, actions and success. Only this file knows robosuite."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from lerobot_env_libero_pro.suites import Task
 CONTROL_FPS = 20  # actions a second
 SETTLING_STEPS = 10  # of LIBERO's protocol, before the first action of an episode
 LIFTED = 0.04  # m above its height at first, from which on an object counts as lifted
-# Displacement of the hand in units of 0.05 m, rotation in units of 0.5 rad, and a velocity of the fingers: the
-# gripper closes at 1 and opens at -1, over about seven actions.
+# Displacement of the hand in units of 0.05 m, rotation in units of 0.5 rad, and a velocity of the fingers:
+# the gripper closes at 1 and opens at -1, over about seven actions.
 ACTION_NAMES = ("dx", "dy", "dz", "drx", "dry", "drz", "gripper")
 NO_ACTION = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
-# Position of the point between the fingertips, m; the hand's axis times angle, rad, continuous around the pose in
-# which it points downwards, (pi, 0, 0); both fingers' positions, m.
+# Position of the point between the fingertips, m; the hand's axis times angle, rad, continuous around
+# (pi, 0, 0), where it points downwards; both fingers' positions, m.
 STATE_NAMES = ("x", "y", "z", "rx", "ry", "rz", "finger_1", "finger_2")
 
 
@@ -40,7 +40,7 @@ class Scene:
         from libero.libero.envs.env_wrapper import ControlEnv
 
         self.task = task
-        # `ignore_done`, since robosuite would refuse actions after its own horizon. No cameras: see cameras.py.
+        # Else robosuite refuses actions after its own horizon. No cameras: see cameras.py.
         self._env = ControlEnv(
             bddl_file_name=str(task.bddl),
             control_freq=CONTROL_FPS,
@@ -61,8 +61,8 @@ class Scene:
         """Puts the scene into a state, and lets it settle.
 
         Args:
-            seed: Seed of what LIBERO draws: places in the regions of the BDDL file. A state overrides those of
-                movable objects, but leaves those of fixtures.
+            seed: Seed of what LIBERO draws: places in the regions of the BDDL file. A state overrides those
+                of movable objects, but leaves those of fixtures.
             state: A state of `Task.initial_states`.
             poses: Positions and quaternions, (7,), of movable objects that stand elsewhere than in the state.
         """
@@ -97,7 +97,7 @@ class Scene:
         return self.data.site_xpos[self._inner.robots[0].eef_site_id].copy()
 
     def hand_rotation(self) -> np.ndarray:
-        """Returns the hand's rotation matrix, (3, 3): the fingers move along its second axis, and point along its third."""
+        """Returns the hand's rotation, (3, 3): fingers move along its first axis and point along its third."""
         return self.data.site_xmat[self._inner.robots[0].eef_site_id].reshape(3, 3).copy()
 
     def base_position(self) -> np.ndarray:
@@ -110,11 +110,11 @@ class Scene:
             return self.data.xpos[self._inner.obj_body_id[name]].copy()
         return self.data.site(name).xpos.copy()
 
-    def owner(self, place: str) -> str:
-        """Returns the object or fixture that a region belongs to, or the object itself."""
+    def owner(self, place: str) -> str | None:
+        """Returns what a region belongs to, or the object itself. None for regions of the table."""
         if place in self._inner.obj_body_id:
             return place
-        return self._inner.object_sites_dict[place].parent_name
+        return getattr(self._inner.object_sites_dict[place], "parent_name", None)
 
     def pose(self, name: str) -> np.ndarray:
         """Returns the position and quaternion, (7,), of a movable object."""
@@ -125,7 +125,7 @@ class Scene:
         return np.concatenate([self._geom_vertices(geom) for geom in self._geoms(name, group=1)])
 
     def solids(self, name: str) -> list[np.ndarray]:
-        """Returns the convex parts of an object or a fixture that collide, by their corners: (n, 3) each, m."""
+        """Returns the convex parts of an object that collide, by their corners: (n, 3) each, m."""
         return [self._geom_vertices(geom) for geom in self._geoms(name, group=0)]
 
     def lifted(self) -> tuple[str, ...]:

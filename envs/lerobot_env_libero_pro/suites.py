@@ -29,7 +29,7 @@ class Task:
     Attributes:
         suite: Name of the suite.
         id: Number of the task in its suite, in LIBERO's order.
-        name: Name of the task's file. **Not what is asked**: perturbed suites keep the file names of the base suite.
+        name: Name of the task's file. **Not what is asked**: perturbed suites keep their base suite's names.
         sentence: What is asked, as LIBERO's environments say it: lower case, from the BDDL file.
         bddl: The BDDL file.
         objects: Names of the movable objects.
@@ -53,7 +53,7 @@ class Task:
 
     @property
     def place(self) -> str | None:
-        """Where the target is to go: an object or a region of one. None where the target is opened or switched."""
+        """Object or region where the target is to go. None where the target is opened or switched."""
         return self.goal[0][2] if len(self.goal[0]) > 2 else None
 
     @property
