@@ -59,8 +59,8 @@ def main(
         root: Folder of the dataset, new, or that of an interrupted recording with the same arguments.
         suite: Name of the suite.
         layouts: Objects where the suite puts them at random, or anywhere, kept apart. Standard layouts are
-            drawn anew: none is one of the 50 states of the evaluation. In permuted layouts, each object in turn
-            is the target.
+            drawn anew: none is one of the 50 states of the evaluation. In permuted layouts, each object in
+            turn is the target.
         episodes_per_task: Number of episodes of each sentence.
         task_ids: Numbers of the suite's tasks; all by default.
         exclude_objects: Objects that are never a target, such as bbq_sauce. They still lie in scenes.

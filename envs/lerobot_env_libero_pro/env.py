@@ -27,7 +27,8 @@ class LiberoProEnv(gym.Env):
     rad, and the gripper, which closes at 1 and opens at -1; 20 a second.
 
     A reset puts the scene into one of the benchmark's 50 initial states, `seed` modulo 50, so that 50
-    consecutive seeds meet each once, and lets it settle for ten steps. Resets with the same seed agree to the last bit.
+    consecutive seeds meet each once, and lets it settle for ten steps. Resets with the same seed agree to the
+    last bit.
 
     What a policy must not see is in `info`, after each reset and step, for an oracle or to count:
 

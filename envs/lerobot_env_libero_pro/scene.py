@@ -97,7 +97,7 @@ class Scene:
         return self.data.site_xpos[self._inner.robots[0].eef_site_id].copy()
 
     def hand_rotation(self) -> np.ndarray:
-        """Returns the hand's rotation, (3, 3): fingers move along its first axis and point along its third."""
+        """Returns the hand's rotation, (3, 3): fingers move along axis 0 and point along axis 2."""
         return self.data.site_xmat[self._inner.robots[0].eef_site_id].reshape(3, 3).copy()
 
     def base_position(self) -> np.ndarray:
