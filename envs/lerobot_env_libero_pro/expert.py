@@ -28,7 +28,7 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
 
     The hand approaches from above, turns to the object's narrow side, descends, closes, lifts, crosses high
     enough, lowers the object, releases it above what is below it, and rises. From the grasp on, it is the
-    object's origin that is steered, since the goals of LIBERO test that point.
+    object's origin that is steered, since the goals of LIBERO test that point. It gives up if it lifts nothing.
 
     Args:
         scene: The scene, which the caller steps.
@@ -64,6 +64,8 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
     for _ in range(CLOSING_STEPS):
         yield _action(scene, np.zeros(3), grasp.axis, 1)
     yield from object_to(rim + CROSSING, 1, level=False)
+    if target not in scene.lifted():
+        return
     yield from object_to(rim + CROSSING, 0.015, level=True)
     yield from object_to(rim + RELEASE, 0.01, level=True, slow=0.6)
     for _ in range(OPENING_STEPS):

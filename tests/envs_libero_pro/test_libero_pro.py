@@ -141,7 +141,7 @@ def test_observations_and_actions_are_as_the_spaces_say(env):
     assert env.observation_space.contains(observation)
     assert (reward, terminated, truncated, info["is_success"]) == (0, False, False, False)
     assert env._max_episode_steps == 280
-    assert env.task_description == "pick the chocolate pudding and place it in the basket"
+    assert env.task_description == "pick the orange juice and place it in the basket"
 
 
 def test_resets_with_the_same_seed_agree_to_the_last_bit_whatever_happened_before(env):
