@@ -28,7 +28,8 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
 
     The hand approaches from above, turns to the object's narrow side, descends, closes, lifts, crosses high
     enough, lowers the object, releases it above what is below it, and rises. From the grasp on, it is the
-    object's origin that is steered, since the goals of LIBERO test that point. It gives up if it lifts nothing.
+    object's origin that is steered, since the goals of LIBERO test that point. It gives up if it lifts
+    nothing.
 
     Args:
         scene: The scene, which the caller steps.

@@ -47,9 +47,9 @@ VARIANTS = [
     ("deltaco", {"language_encoder": "all-distilroberta-v1"}),
     ("deltaco", {"precision": "bfloat16", "grad_clip_norm": 1.0}),
     ("deltaco", {"chunk_size": 4, "n_action_steps": 3}),
-    ("deltaco_match", {}),
-    ("deltaco_match", {"chunk_size": 3, "n_action_steps": 1}),
-    ("deltaco_match", {"precision": "bfloat16", "n_demonstrations": 2}),
+    ("deltaco_match", {"acting": "network"}),
+    ("deltaco_match", {"acting": "network", "chunk_size": 3, "n_action_steps": 1}),
+    ("deltaco_match", {"acting": "network", "precision": "bfloat16", "n_demonstrations": 2}),
     ("deltaco_match", {"frames_after_release": None, "num_mixture_components": 1}),
 ]
 # Frames that are trained on, of all tasks.

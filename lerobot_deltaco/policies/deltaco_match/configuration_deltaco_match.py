@@ -23,10 +23,10 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     demonstration, an instruction, or both.
 
     Args:
-        acting: "network": the policy network acts. "replay": the demonstration's trajectory is replayed,
-            moved to where the policy picks and places; without a trajectory, the network acts. Training is
-            the same: a checkpoint acts either way. With None, training chooses "replay" for up to 200
-            episodes.
+        acting: How the policy acts. "replay": the demonstration's trajectory is replayed, moved to where the
+            policy picks and places; without a trajectory, the policy network acts. "network": it always does.
+            Training is the same: a checkpoint acts either way. With None, training chooses "replay" for up to
+            200 episodes.
         crop_size: Side of the square around an object that is compared, in the middle of the first camera's
             image and as a fraction of its side. Used only where objects do not stand out from other scenes,
             such as after a camera was moved during recording; otherwise, the size of objects is measured.
