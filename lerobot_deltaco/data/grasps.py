@@ -32,11 +32,12 @@ _MIN_DEPTH = 0.15  # of a valley below the openings at its sides, as a fraction 
 _MIN_RELATIVE_DEPTH = 0.3  # the same, as a fraction of the deepest valley's depth
 _NOISE = 4.0  # ranges of less than so many standard deviations are noise
 _CLOSED = 0.2  # fraction of the way up from the valley to an opening below which the gripper counts as closed
-_APPROACH = 30  # the state before a grasp is a 30th of the episode before the gripper begins to close
+_APPROACH = 0.15  # distance from the grasp at which the arm approaches it, of the farthest before it
 _N_REASONS = 3  # that a warning names
 # Travels of the arm, as fractions of the range of that dimension of the state which moves farthest.
 _AT_REST = 0.03  # less is no travel
 _MIN_CARRY = 0.1  # usual with a closed gripper
+_TREMBLE = 5.0  # usual changes between two frames, beyond which a dimension of the state moves
 _MIN_APPROACH = 0.05  # usual with an open gripper, on the way to an object and away from it
 _MIN_RELATIVE_TRAVEL = 0.3  # of a grasp that counts, as a fraction of the farthest travel in the episode
 _AT_HOME = 0.15  # distance from the first state of the episode within which the arm has returned to it
@@ -74,7 +75,7 @@ class Keyframes(NamedTuple):
     Attributes:
         states: States in which the gripper has closed and is about to open, (episodes, 2, state), as in the
             dataset. Zeros where there are none.
-        approach: States shortly before the gripper closes, (episodes, state).
+        approach: States on the way to where the gripper closes, (episodes, state).
         carried: Frames halfway between grasp and release, (episodes,); the first of an episode without them.
         has_grasp: Whether an episode has them, (episodes,) bool.
         missing: Why an episode has none; None if it has them.
@@ -117,11 +118,14 @@ def find_keyframes(
         usual: As for `find_grasps`.
     """
     grasps, frames = find_grasps(gripper, spans, usual, states), []
-    for (first, last), grasp in zip(spans, grasps, strict=True):
+    # A dimension that trembles counts little.
+    tremble = states.float().diff(dim=0).abs().median(dim=0).values
+    scale = (states.float().std(dim=0) + _TREMBLE * tremble).clamp_min(1e-6)
+    for (first, _), grasp in zip(spans, grasps, strict=True):
         if isinstance(grasp, str):
             frames.append((first,) * 4)
             continue
-        approach = max(grasp.closing - max(1, (last - first + 1) // _APPROACH), first)
+        approach = _last_far(states[first : grasp.closing + 1] / scale) + first
         # The command to close takes effect one step later.
         closed = min(grasp.grasp + 1, grasp.release)
         frames.append((closed, grasp.release, approach, (closed + grasp.release) // 2))
@@ -131,6 +135,12 @@ def find_keyframes(
     at = torch.where(has_grasp[:, None, None], at, 0.0)
     missing = tuple(grasp if isinstance(grasp, str) else None for grasp in grasps)
     return Keyframes(at[:, :2], at[:, 2], rows[:, 3], has_grasp, missing)
+
+
+def _last_far(states: Tensor) -> int:
+    """Returns the last frame of an approach (frames, state) in which the arm is still on its way."""
+    distance = (states - states[-1]).norm(dim=1)
+    return int((distance >= _APPROACH * distance.max()).nonzero()[-1])
 
 
 def warn_of_missing(keyframes: Keyframes, episodes: Sequence[int], consequence: str) -> None:

@@ -77,8 +77,19 @@ def test_approach_and_opening_scale_with_the_trajectory():
     # It closes in the frames 120 to 150, and opens in 180 to 210.
     assert 130 <= found.closing <= 140 <= found.grasp <= 150
     assert 180 < found.release < 190 < 200 < found.opened <= 210
-    # A 30th of the episode before the gripper begins to close.
-    assert find_keyframes(states, slow, [(0, len(slow) - 1)]).approach[0, 0] == found.closing - 10
+    # Before the last 15 % of the way.
+    way = float(found.closing)
+    assert 0.8 * way < find_keyframes(states, slow, [(0, len(slow) - 1)]).approach[0, 0] <= 0.85 * way
+
+
+def test_the_approach_is_seen_while_the_arm_is_on_its_way():
+    frames = torch.arange(60)
+    gripper = 1 - 2.0 * ((frames >= 40) & (frames < 55))
+    # The arm arrives in frame 10, and trembles for 30 frames before it grasps.
+    way = (10 - frames).clamp_min(0) + (frames - 42).clamp(0, 10)
+    states = torch.stack([way.float(), 0.01 * (frames % 2)], dim=1)
+    keyframes = find_keyframes(states, gripper, [(0, 59)])
+    assert 1 <= keyframes.approach[0, 0] <= 3
 
 
 def test_keyframes_are_the_states_after_the_commands():

@@ -254,8 +254,10 @@ def test_samples_of_a_task_take_different_demonstrations(make, dataset):
     policy(before(batch_of(dataset, [0])))
     taken = policy.banked_demonstrations([STACK, POUR, STACK, STACK, POUR])
     assert [[each.episode for each in own] for own in taken] == [[0], [3], [1], [2], [4]]
-    taken = policy.banked_demonstrations([STACK, STACK, WAVE], n_each=2)
-    assert [[each.episode for each in own] for own in taken] == [[0, 1], [2, 0], [5, 5]]
+    taken = policy.banked_demonstrations([STACK, STACK], n_each=2)
+    assert [[each.episode for each in own] for own in taken] == [[0, 1], [2, 0]]
+    with pytest.raises(ValueError, match="`n_demonstrations` is 2, but the task 'wave' has 1"):
+        policy.banked_demonstrations([STACK, WAVE], n_each=2)
 
 
 def test_a_named_episode_demonstrates_any_instruction(acting, dataset):

@@ -37,7 +37,7 @@ def test_the_warning_says_how_far_in_the_pictures_own_pixels(caplog):
     scenes = (255 * table.expand(12, -1, -1, -1)).to(torch.uint8)
     matching = FeatureMatching([], 0.17)
     assert matching.camera_motion(table) is None  # nothing is known of the training
-    matching.background.fit(scenes, torch.zeros(12, 2), generator)
+    matching.background.fit(scenes, torch.zeros(12, 2))
     matching.uses_background.fill_(True)
     assert not matching.camera_motion(table).is_significant
     assert not caplog.text
