@@ -95,6 +95,8 @@ def check(words, monkeypatch):
     command, *arguments = words
     if command == "deltaco":
         name, *arguments = arguments
+        if name == "--version":
+            return
         if name == "train":
             parse_lerobot("lerobot-train", arguments, monkeypatch)
             return
