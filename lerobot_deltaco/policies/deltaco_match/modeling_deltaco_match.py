@@ -565,6 +565,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             end - shift,
             shift,
             ~gripper_states.is_gripper,
+            bank.tasks,
         )
         self._fit_replay(robot, ~gripper_states.is_gripper)
 

@@ -11,9 +11,11 @@ on average, and larger farther along the approach: in the benchmark, lower.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_deltaco.data.grasps import Keyframes
@@ -23,6 +25,8 @@ from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
 N_LOCATIONS = 2  # pick and place
 _N_LOCATION_FEATURES = 10
 _N_HEIGHT_FEATURES = 3  # of the first of those: 1, x, y
+_N_LEVEL_FEATURES = 6  # up to the squares
+_EPISODES_PER_TASK = 3  # at least, of tasks by which heights are compared
 _DEGREES = (0, 1, 1, 2, 2, 2, 3, 3, 3, 3)  # of these features
 _COVARIANCE_RIDGE = 1e-4
 _HEIGHT_ROUNDS = 3  # of estimating heights, and the direction in which they move states
@@ -93,6 +97,7 @@ class StateRegressor(nn.Module):
         scale: Tensor,
         shift: Tensor,
         is_arm: Tensor,
+        tasks: Sequence[str] | None = None,
     ) -> TrainingLocations:
         """Calibrates the camera and learns which state the robot has at a location.
 
@@ -105,6 +110,7 @@ class StateRegressor(nn.Module):
             shift: Shift of each dimension, (state,).
             is_arm: Dimensions of the state other than the gripper's opening, (state,) bool. At a grasp, the
                 opening depends on the object's width, and says nothing about where the object is.
+            tasks: Task of each episode; the object of a task is as high wherever it stands. None if unknown.
 
         Returns:
             The locations and heights of the episodes.
@@ -127,6 +133,10 @@ class StateRegressor(nn.Module):
             ridge = _COVARIANCE_RIDGE * len(gram) * torch.eye(len(gram), device=gram.device)
             self.location_covariance[n].copy_(torch.linalg.inv(gram + ridge))
         self._fit_heights(features[:, 0], states[:, 0], last_moves, is_arm)
+        if tasks is not None:
+            self._level(
+                features[:, 0], states[:, 0], [t for t, has in zip(tasks, has_grasp, strict=True) if has]
+            )
         return self.locate(keyframes)
 
     def locate(self, keyframes: Keyframes) -> TrainingLocations:
@@ -178,6 +188,38 @@ class StateRegressor(nn.Module):
             self.height_to_state.copy_(weights[_N_LOCATION_FEATURES:] * is_arm * kept)
             unexplained = rest - heights[:, None] * (linear @ self.height_to_state)
             self._weigh(rest, unexplained, is_open)
+
+    def _level(self, features: Tensor, states: Tensor, tasks: Sequence[str]) -> None:
+        """Makes heights comparable between locations.
+
+        What a location predicts too much along the ray, all heights there lack. It is what varies with the
+        location among the heights of one task, whose object is as high everywhere.
+
+        Args:
+            features: Features of the locations of grasps, (episodes, features).
+            states: States there, normalized, (episodes, state).
+            tasks: Task of each.
+        """
+        known = {task: n for n, task in enumerate(dict.fromkeys(tasks))}
+        task = torch.tensor([known[each] for each in tasks], device=features.device)
+        if len(tasks) < _EPISODES_PER_TASK * len(known):
+            return
+        heights = self._project(states - features @ self.location_to_state[0], features)
+        one_hot = F.one_hot(task).to(features)
+        columns = features[:, 1:_N_LEVEL_FEATURES]
+        both = torch.cat([one_hot, columns], dim=1)
+        degrees = torch.tensor([0] * len(known) + [2] * columns.shape[1], device=features.device)
+        slopes = robust_regression(both, heights[:, None], degrees, _LEAST_ERROR)[len(known) :, 0]
+        # A line times a parabola is a cubic, which the features are.
+        grid = _location_features(torch.cartesian_prod(*[torch.linspace(-1, 1, 6)] * 2).to(features))
+        level = (grid[:, 1:_N_LEVEL_FEATURES] @ slopes)[:, None]
+        moved = level * (grid[:, :_N_HEIGHT_FEATURES] @ self.height_to_state)
+        self.location_to_state[0].add_(torch.linalg.lstsq(grid, moved).solution)
+        heights = self._project(states - features @ self.location_to_state[0], features)
+        # Heights have a mean of 0 and a standard deviation of 1.
+        mean, std = heights.mean(), heights.std().clamp_min(1e-6)
+        self.location_to_state[0, :_N_HEIGHT_FEATURES] += mean * self.height_to_state
+        self.height_to_state.mul_(std)
 
     def _weigh(self, rest: Tensor, unexplained: Tensor, is_open: Tensor) -> None:
         """Weighs dimensions by how well a height explains what locations leave open of them.
