@@ -258,10 +258,12 @@ class TrajectoryReplay(nn.Module):
         is_passed = (beyond < distance) & (distance < _PASSED * tolerance)
         comes_closer = distance < reference.distance - _LEAST_APPROACH * tolerance
         waited = torch.where(comes_closer, 0, reference.waited + 1)
-        goes_on = (distance <= tolerance) | is_passed | (waited > _MAX_WAIT)
+        is_reached = (distance <= tolerance) | is_passed
+        # An arm that came no closer once, as one that sags, is not waited for again until it does.
+        goes_on = is_reached | (waited > _MAX_WAIT)
         frame = torch.where(goes_on, wanted, reference.frame)
-        waited = torch.where(goes_on, 0, waited)
-        distance = torch.where(goes_on, torch.inf, distance)
+        waited = torch.where(is_reached, 0, waited)
+        distance = torch.where(is_reached, torch.inf, distance)
         target = reference.states[rows, (frame + lag).clamp(max=last)]
         additional = target - state - reference.steps[rows, frame]
         aside = state - reference.recorded[rows, frame]
