@@ -214,7 +214,7 @@ class StateRegressor(nn.Module):
         grid = _location_features(torch.cartesian_prod(*[torch.linspace(-1, 1, 6)] * 2).to(features))
         level = (grid[:, 1:_N_LEVEL_FEATURES] @ slopes)[:, None]
         moved = level * (grid[:, :_N_HEIGHT_FEATURES] @ self.height_to_state)
-        self.location_to_state[0].add_(torch.linalg.lstsq(grid, moved).solution)
+        self.location_to_state[0].add_(torch.linalg.pinv(grid.double()).to(grid) @ moved)
         heights = self._project(states - features @ self.location_to_state[0], features)
         # Heights have a mean of 0 and a standard deviation of 1.
         mean, std = heights.mean(), heights.std().clamp_min(1e-6)
