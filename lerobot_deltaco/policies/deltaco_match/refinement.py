@@ -25,6 +25,7 @@ _OFFSET, _LOG_SCALE = 0.25, 0.1
 _P_OTHER_COLORS = 0.7
 _BATCH = 32
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
+_MAX_MOVE = 1.0  # from a proposal, in diameters
 _PEAK_RADIUS = 2.6  # of the cells around a peak whose mean is the location
 _ROUNDS = 2  # of looking
 
@@ -70,14 +71,16 @@ class GraspRefiner(nn.Module):
 
     @torch.no_grad()
     def _refine(self, images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
-        extent = _EXTENT * sizes
+        extent, proposals = _EXTENT * sizes, locations
         for _ in range(_ROUNDS):
             crops = cut_crops(images, locations[:, None], extent[:, None], _RESOLUTION)[:, 0]
             maps = self.layers(channels_last(crops))[:, 0].float()
             best, cells = maps.flatten(1).max(dim=1)
             weights = (maps - best[:, None, None]).exp()
             locations = locations + extent[:, None] * mean_near(weights, cells, _PEAK_RADIUS)
-        return locations.clamp(-1, 1)
+        # Another object would be another choice.
+        is_near = (locations - proposals).norm(dim=1) < 2 * _MAX_MOVE * sizes
+        return torch.where(is_near[:, None], locations, proposals).clamp(-1, 1)
 
     def fit(
         self,
