@@ -11,7 +11,8 @@ r"""`deltaco_match`: describes what a demonstration moved, finds it in the scene
 Localization happens once, at the start of an episode. Feature matching chooses what to pick among proposals,
 by the demonstration and by the instruction's words; the place network finds where to place it, by the
 instruction, or by the demonstration if there is none. The policy network is given both locations, and how far
-the robot's state is from the state that it would have at each of them.
+the robot's state is from the state that it would have at each of them. After training on few episodes, the
+demonstration's trajectory is replayed instead, moved to both locations.
 
 In training, feature matching is fitted first. The policy network is given the locations of each sample's own
 episode, with noise; they follow from the robot's states when the gripper closed and opened. So it does not

@@ -131,8 +131,9 @@ class TrajectoryReplay(nn.Module):
             is_arm: Dimensions of the state other than the gripper's, (state,) bool.
             gripper_index: Dimension of the action that is the gripper.
         """
-        shortest = min(len(states) for states, _ in trajectories)
-        n_lags = max(1, min(_MAX_LAG, shortest // _STEPS_PER_LAG))
+        lengths = sorted(len(states) for states, _ in trajectories)
+        # Of a usual episode: a single one that was cut short must not decide.
+        n_lags = max(1, min(_MAX_LAG, lengths[len(lengths) // 2] // _STEPS_PER_LAG))
         trajectories = [each for each in trajectories if len(each[0]) > n_lags]
         states = torch.cat([s[:-n_lags] for s, _ in trajectories]).double()
         later = [
