@@ -51,7 +51,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         num_mixture_components: Number of Gaussians of the action's distribution. One averages two actions
             that are equally good; of several, the policy cycles through the likely ones.
         gripper: Gripper's dimension of the action: an index, "auto" (of those whose name contains "gripper",
-            the one that moves most) or "none".
+            the one that moves most; for `deltaco_match` made without a dataset, the last) or "none".
         gripper_closed: Whether low or high values of the gripper's dimension mean closed.
         demo_camera: Name of the camera of demonstrations, such as "observation.images.front". By default, the
             first.

@@ -185,6 +185,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Returns whether an action for a batch begins an episode: after a reset, or for other tasks."""
         return self._episode is None or self._episode.instructions != self._tasks_of(batch)[0]
 
+    def drop_queued_actions(self) -> None:
+        """Drops the rest of the running chunks. LeRobot calls this when the task changes."""
+        self._actions.clear()
+        self._ensemble = None
+
     def _start(self, episode: Any) -> None:
         """Sets the running episode; None for none."""
         self._episode, self._ensemble, self._component_index = episode, None, 0

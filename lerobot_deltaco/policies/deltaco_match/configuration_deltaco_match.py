@@ -129,6 +129,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
                 "the feature 'observation.state' and a gripper among the action's dimensions, which "
                 "`gripper` names. Without them, train --policy.type=deltaco."
             )
+        if self.gripper == "auto" and self.action_feature is not None:
+            # Made without a dataset, which names dimensions.
+            self.gripper = str(self.action_feature.shape[0] - 1)
 
 
 @dataclass(frozen=True)
