@@ -23,7 +23,7 @@ from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.policies.base import language
-from lerobot_deltaco.policies.deltaco_match import fit, localization, modeling_deltaco_match
+from lerobot_deltaco.policies.deltaco_match import fit, localization, modeling_deltaco_match, prompts
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import (
     DeltacoMatchConfig,
     MatchingSettings,
@@ -114,7 +114,7 @@ def use_short_fit(monkeypatch, steps=2, **settings):
         **settings,
     }
     monkeypatch.setattr(modeling_deltaco_match, "fit_feature_matching", fit_once)
-    for module in (fit, localization):
+    for module in (fit, localization, prompts):
         monkeypatch.setattr(module, "crop_features", colors)
     monkeypatch.setattr(localization, "MatchingSettings", functools.partial(MatchingSettings, **short))
 

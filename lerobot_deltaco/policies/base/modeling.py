@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -22,6 +23,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
+from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.data.reading import compare_robots, open_dataset
 from lerobot_deltaco.data.training_data import DatasetEpisodes, Episodes, TrainingData
 from lerobot_deltaco.errors import UserError
@@ -53,7 +55,7 @@ _TRAINED_OPTIONS = (
 )
 _DATASET_OPTIONS = ("gripper", "gripper_closed", "demo_camera")
 
-DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
+DemonstrationsOfTasks = Sequence[Sequence[Demonstration | ObjectPrompt]]
 
 
 class TrainingDivergedError(UserError, FloatingPointError):
@@ -82,6 +84,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     model: PolicyNetwork
     config_class: ClassVar[type] = TaskConditionedConfig
     name = "task_conditioned"
+    takes_prompts: ClassVar[bool] = False  # in place of demonstrations
 
     def __init__(
         self,
@@ -130,10 +133,16 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         Args:
             instructions: Instruction of each sample; an empty string leaves it out.
             demonstrations: One or more demonstrations of each sample's task; an empty list leaves them out.
+                For `deltaco_match`, one `ObjectPrompt` may take their place.
 
         Raises:
-            ValueError: They differ in number.
+            ValueError: They differ in number, or the policy takes no prompts.
         """
+        if not self.takes_prompts and any(isinstance(each, ObjectPrompt) for each in chain(*demonstrations)):
+            raise UserError(
+                f"A policy of the type {self.name!r} needs demonstrations: a point, box or photo is for "
+                "deltaco_match."
+            )
         if len(instructions) != len(demonstrations):
             raise UserError(
                 f"There must be as many lists of demonstrations as instructions. Got {len(demonstrations)} "
@@ -176,6 +185,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
             self._actions.refill(self.predict_action_chunk(batch))
         return self._actions.pop()
 
+    def drop_queued_actions(self) -> None:
+        """Drops the rest of the running chunks. LeRobot calls this when the task changes."""
+        self._actions.clear()
+        self._ensemble = None
+
     @property
     def pick_confidence(self) -> Tensor | None:
         """Probability that the policy gave what it picks, (batch,); None if it gives none."""
@@ -184,11 +198,6 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     def _begins_episode(self, batch: dict[str, Any]) -> bool:
         """Returns whether an action for a batch begins an episode: after a reset, or for other tasks."""
         return self._episode is None or self._episode.instructions != self._tasks_of(batch)[0]
-
-    def drop_queued_actions(self) -> None:
-        """Drops the rest of the running chunks. LeRobot calls this when the task changes."""
-        self._actions.clear()
-        self._ensemble = None
 
     def _start(self, episode: Any) -> None:
         """Sets the running episode; None for none."""
