@@ -8,16 +8,15 @@ from small_policies import random_moves
 from lerobot_deltaco.policies.base.augmentation import change_colors, random_color_changes
 from lerobot_deltaco.policies.base.configuration import has_bfloat16
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
-from lerobot_deltaco.policies.deltaco_match import fit, localization
-from lerobot_deltaco.policies.deltaco_match import matching as matching_module
+from lerobot_deltaco.policies.deltaco_match import fit
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder, cut_crops
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching, fit_matching_head
 from lerobot_deltaco.policies.deltaco_match.localization import (
     Candidates,
     FeatureMatching,
     GraspHeightEstimator,
 )
-from lerobot_deltaco.policies.deltaco_match.matching import FEATURE_DIM, cut_crops
 from lerobot_deltaco.policies.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
 from lerobot_deltaco.policies.deltaco_match.proposals import N_OBJECTS, Background, fit_perspective, peaks
 from lerobot_deltaco.policies.deltaco_match.words import encode_words, understand, vocabulary_of
@@ -154,16 +153,16 @@ def matching(shapes, request):
 @pytest.fixture(scope="module", autouse=True)
 def encode_once():
     """Encodes the same crops once."""
-    features = {}
+    features, encode = {}, CropEncoder.__call__
 
-    def crop_features(*crops):
+    def encode_once(self, *crops):
         key = tuple(part.numpy().tobytes() for part in crops)
         if key not in features:
-            features[key] = matching_module.crop_features(*crops)
+            features[key] = encode(self, *crops)
         return features[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(localization, "crop_features", crop_features)
+        patch.setattr(CropEncoder, "__call__", encode_once)
         yield
 
 
@@ -261,7 +260,7 @@ def test_words_that_describe_the_container_do_not_count():
     task = torch.arange(n_scenes) % 4
     target = torch.randint(2, (n_scenes,), generator=generator)
     color = torch.where(torch.arange(2) == target[:, None], task[:, None] // 2, 1 - task[:, None] // 2)
-    features = torch.randn(n_scenes, 3, FEATURE_DIM, generator=generator)
+    features = torch.randn(n_scenes, 3, matching.encoder.feature_dim, generator=generator)
     features[:, :2, :100] += 4.0 * color[..., None]
     features[:, 2, 100:200] += 4.0
     matching.requires_grad_(True)
