@@ -14,9 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_deltaco.containers import CONTAINER_WORDS, ContainerWord
 from gym_deltaco.layout import Layout
+from gym_deltaco.objects.labels import ObjectLabel
 from gym_deltaco.sim.workspace import CONTAINER_FLOOR, TABLE_TOP, TRAY_CENTER, TRAY_HALF_EXTENTS
-from gym_deltaco.tasks import CONTAINER_WORDS, TASKS, ContainerWord, ObjectLabel, Task
+from gym_deltaco.tasks import TASKS, Task
 from lerobot_deltaco.evaluation.video import Recording, image_locations
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.policies.deltaco_match.words import understand, words_of
@@ -102,9 +104,8 @@ def asked_for(layout: Layout, sentence: str, demonstrated: Task | None) -> tuple
     tasks = [known for known in (task, demonstrated) if known is not None]
     if not tasks:
         return "Not judged: the sentence names no object, and there is no demonstration."
-    objects = {
-        n for n, item in enumerate(layout.objects) if all(known.describes(item.label) for known in tasks)
-    }
+    labels = [item.label for item in layout.objects]
+    objects = set.intersection(*(set(known.object.meant(labels)) for known in tasks))
     containers = {n for n, item in enumerate(layout.containers) if item.satisfies(word)}
     if not objects:
         both = "both the demonstration and the sentence" if len(tasks) == 2 else "that"
