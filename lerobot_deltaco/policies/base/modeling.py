@@ -46,13 +46,6 @@ logger = logging.getLogger(__name__)
 # Normalized actions are in -1..1; a policy may overshoot, but not by that much.
 _ABSURD_ACTION = 100.0
 
-# Options that a policy keeps after its training, and those that only further training may change.
-_TRAINED_OPTIONS = (
-    *("image_size", "chunk_size", "num_mixture_components", "language_encoder", "crop_size", "method"),
-    *("film", "concat", "demo_encoder", "demo_rows", "vision_encoder", "vision_image_size", "backbone"),
-)
-_DATASET_OPTIONS = ("gripper", "gripper_closed", "demo_camera")
-
 DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
 
 
@@ -475,7 +468,7 @@ def _check_options(config: TaskConditionedConfig, saved: Mapping[str, Any], is_t
     Raises:
         ValueError: One is changed.
     """
-    for name in _TRAINED_OPTIONS if is_trained else (*_TRAINED_OPTIONS, *_DATASET_OPTIONS):
+    for name in config.trained_options if is_trained else config.trained_options + config.dataset_options:
         if name in saved and getattr(config, name) != saved[name]:
             raise UserError(
                 f"The checkpoint was trained with `{name}` {saved[name]!r}, and cannot be used with "
