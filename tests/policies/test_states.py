@@ -201,20 +201,6 @@ def test_heights_are_larger_along_the_approach():
     assert np.median(cosines) > 0.99
 
 
-def test_a_location_outside_of_the_training_scenes_is_uncertain():
-    recording = record(60, 0)
-    regressor, *_ = fit_to(recording)
-    inside = regressor.uncertainty(regressor.locate(recording.keyframes).locations)
-    assert inside.median() < 0.5
-    assert (regressor.uncertainty(torch.tensor([[[0.95, 0.95]] * 2, [[-0.95, -0.95]] * 2])) > 1).all()
-    # A checkpoint that lacks it does not know.
-    state_dict = regressor.state_dict()
-    del state_dict["location_covariance"]
-    other = StateRegressor(7)
-    other.load_state_dict(state_dict)
-    assert other.uncertainty(torch.zeros(2, 2)).isnan().all()
-
-
 def test_the_object_of_a_task_is_as_high_wherever_it_stands():
     def objects(recording):
         return np.round((recording.positions[:, 2] + 0.34) / 0.08 * 9).astype(int)

@@ -12,7 +12,7 @@ on average, and larger farther along the approach: in the benchmark, lower.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -28,7 +28,6 @@ _N_HEIGHT_FEATURES = 3  # of the first of those: 1, x, y
 _N_LEVEL_FEATURES = 6  # up to the squares
 _EPISODES_PER_TASK = 3  # at least, of tasks by which heights are compared
 _DEGREES = (0, 1, 1, 2, 2, 2, 3, 3, 3, 3)  # of these features
-_COVARIANCE_RIDGE = 1e-4
 _HEIGHT_ROUNDS = 3  # of estimating heights, and the direction in which they move states
 _LEAST_ERROR = 0.02  # of a normalized state, below which errors are all alike
 _CHANCE = 2.0  # standard errors of a correlation that are taken for chance
@@ -67,7 +66,6 @@ class StateRegressor(nn.Module):
     state_scale: Tensor
     state_shift: Tensor
     rest_scale: Tensor
-    location_covariance: Tensor
 
     def __init__(self, state_dim: int) -> None:
         super().__init__()
@@ -78,15 +76,6 @@ class StateRegressor(nn.Module):
         self.register_buffer("state_scale", torch.ones(state_dim))
         self.register_buffer("state_shift", torch.zeros(state_dim))
         self.register_buffer("rest_scale", torch.zeros(state_dim))
-        # Of `location_to_state`, for residuals with a standard deviation of 1; zeros if it is not known.
-        covariance = torch.zeros(N_LOCATIONS, _N_LOCATION_FEATURES, _N_LOCATION_FEATURES)
-        self.register_buffer("location_covariance", covariance)
-        self.register_load_state_dict_pre_hook(self._add_covariance)
-
-    @staticmethod
-    def _add_covariance(module: StateRegressor, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
-        """Adds what checkpoints of earlier fits do not have."""
-        state_dict.setdefault(f"{prefix}location_covariance", torch.zeros_like(module.location_covariance))
 
     def fit(
         self,
@@ -129,9 +118,6 @@ class StateRegressor(nn.Module):
             self.location_to_state[n].copy_(
                 robust_regression(features[:, n], states[:, n], degrees, _LEAST_ERROR, is_arm.float())
             )
-            gram = features[:, n].T @ features[:, n]
-            ridge = _COVARIANCE_RIDGE * len(gram) * torch.eye(len(gram), device=gram.device)
-            self.location_covariance[n].copy_(torch.linalg.inv(gram + ridge))
         self._fit_heights(features[:, 0], states[:, 0], last_moves, is_arm)
         if tasks is not None:
             self._level(
@@ -234,21 +220,6 @@ class StateRegressor(nn.Module):
         # Relative to the best one, which must not be cut at less than `_MAX_REST`.
         ratio = ratio / torch.where(is_open, ratio, 1.0).min()
         self.rest_scale.copy_(torch.where(is_open, 1 / (spread * ratio), 0.0))
-
-    def uncertainty(self, locations: Tensor) -> Tensor:
-        """Returns how far locations are outside of those in training, (..., 2).
-
-        It is the standard error of the predicted state, as a multiple of what locations leave open of a
-        state: small amid the training locations; from about 1 on, the prediction is an extrapolation. NaN for
-        a policy whose checkpoint does not have it.
-
-        Args:
-            locations: Pick and place, (..., 2, 2) in -1..1.
-        """
-        features = _location_features(locations)
-        variance = torch.einsum("...gf,gfe,...ge->...g", features, self.location_covariance, features)
-        is_known = bool(self.location_covariance.any())
-        return variance.sqrt() if is_known else torch.full_like(variance, torch.nan)
 
     def heights(self, pick_states: Tensor) -> Tensor:
         """Returns the height offsets of grasps, (grasps,); NaN for a grasp that is not known.
