@@ -152,7 +152,7 @@ def describe_words(policy: DeltacoMatchPolicy, sentence: str) -> str:
     """Returns which words of an instruction a policy reads as the object's, misreads and does not know."""
     if not sentence:
         return ""
-    about = _quoted(dict(policy.feature_matching.understood(sentence)))
+    about = _quoted(dict(policy.matching.understood(sentence)))
     read = dict(zip(words_of(sentence), understand(sentence, policy.config.known_words), strict=True))
     unknown = _quoted(word for word, meaning in read.items() if meaning is None)
     others = [f"“{word}” as “{meaning}”" for word, meaning in read.items() if meaning not in (None, word)]

@@ -66,13 +66,13 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset_meta: Metadata of the training dataset; None in evaluation.
 
     Attributes:
-        model: Network that predicts actions.
+        policy_network: Network that predicts actions.
         instructions: Embeddings of instructions; None if the policy uses no sentence encoder.
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
         training_data: The training episodes; None before `prepare_training`.
     """
 
-    model: PolicyNetwork
+    policy_network: PolicyNetwork
     config_class: ClassVar[type] = TaskConditionedConfig
     name = "task_conditioned"
 
@@ -263,14 +263,14 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None, gripper_kind: str
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the imitation loss of each sample, (batch,), and its parts to log. See `imitation_loss`."""
-        log_std, is_pad = self.model.log_std, batch.get(f"{ACTION}_is_pad")
+        log_std, is_pad = self.policy_network.log_std, batch.get(f"{ACTION}_is_pad")
         return imitation_loss(
             predicted, gripper, log_std, batch[ACTION], is_pad, self.config.gripper_index, gripper_kind
         )
 
-    def _acting_network(self) -> PolicyNetwork:
-        """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
-        return self.model if self.training else fuse_batch_norms(self.model)
+    def _inference_network(self) -> PolicyNetwork:
+        """Returns the policy network; in evaluation mode, a copy that is faster for small batches."""
+        return self.policy_network if self.training else fuse_batch_norms(self.policy_network)
 
     def _sample_action(
         self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -49,17 +49,6 @@ logger = logging.getLogger(__name__)
 _MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
 # Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
 _APPEARANCE_STD = 0.7
-# What checkpoints of earlier fits do not have: they keep their proposals, crops and probabilities.
-_ADDED_STATE = (
-    "background.",
-    "compare.feature_weight",
-    "compare.objectness.",
-    "uses_background",
-    "sharpness",
-    "error_rate",
-    "held_out",
-    "refine.",
-)
 
 
 class Candidates(NamedTuple):
@@ -141,13 +130,6 @@ class FeatureMatching(nn.Module):
         self.register_buffer("held_out", torch.zeros(2, dtype=torch.int64))
         self.requires_grad_(False)
         self.eval()
-        self.register_load_state_dict_pre_hook(self._add_state)
-
-    @staticmethod
-    def _add_state(module: FeatureMatching, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
-        for name, value in module.state_dict().items():
-            if name.startswith(_ADDED_STATE):
-                state_dict.setdefault(prefix + name, value)
 
     def train(self, mode: bool = True) -> FeatureMatching:
         """Stays in evaluation mode."""

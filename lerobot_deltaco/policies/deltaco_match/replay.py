@@ -13,7 +13,7 @@ Nothing here looks at images.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -45,13 +45,13 @@ class Trajectory(NamedTuple):
         states: (frames, state), normalized.
         actions: (frames, action), normalized.
         grasp: Its grasp.
-        keyframes: States at the grasp and at the release, as in the dataset, (2, state).
+        grasp_states: States at the grasp and at the release, as in the dataset, (2, state).
     """
 
     states: Tensor
     actions: Tensor
     grasp: Grasp
-    keyframes: Tensor
+    grasp_states: Tensor
 
 
 class Reference(NamedTuple):
@@ -115,13 +115,6 @@ class TrajectoryReplay(nn.Module):
         self.register_buffer("action_shift", torch.zeros(action_dim))
         self.register_buffer("state_scale", torch.ones(state_dim))
         self.register_buffer("state_shift", torch.zeros(state_dim))
-        self.register_load_state_dict_pre_hook(self._add_state)
-
-    @staticmethod
-    def _add_state(module: TrajectoryReplay, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
-        """Adds what checkpoints of earlier versions do not have: they cannot replay."""
-        for name, value in module.state_dict().items():
-            state_dict.setdefault(prefix + name, value)
 
     def fit(self, trajectories: Sequence[tuple[Tensor, Tensor]], is_arm: Tensor, gripper_index: int) -> None:
         """Fits the inverse dynamics.

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.data.grasps import Keyframes
+from lerobot_deltaco.data.grasps import GraspStates
 from lerobot_deltaco.policies.deltaco_match.calibration import ImageProjection
 from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
 
@@ -79,7 +79,7 @@ class StateRegressor(nn.Module):
 
     def fit(
         self,
-        keyframes: Keyframes,
+        grasps: GraspStates,
         first: Tensor,
         carried: Tensor,
         last: Tensor,
@@ -91,7 +91,7 @@ class StateRegressor(nn.Module):
         """Calibrates the camera and learns which state the robot has at a location.
 
         Args:
-            keyframes: Keyframes of the training episodes.
+            grasps: Grasps of the training episodes.
             first: First images of the episodes, (episodes, 3, H, W) uint8.
             carried: Images halfway between grasp and release, (episodes, 3, H, W) uint8.
             last: Last images of the episodes, (episodes, 3, H, W) uint8.
@@ -104,14 +104,14 @@ class StateRegressor(nn.Module):
         Returns:
             The locations and heights of the episodes.
         """
-        has_grasp = keyframes.has_grasp
+        has_grasp = grasps.has_grasp
         first, carried, last = (images[has_grasp] for images in (first, carried, last))
-        self.to_image.fit(first, carried, last, keyframes.states[has_grasp, 0], scale * is_arm)
-        locations = self.to_image(keyframes.states).clamp(-1, 1)
+        self.to_image.fit(first, carried, last, grasps.states[has_grasp, 0], scale * is_arm)
+        locations = self.to_image(grasps.states).clamp(-1, 1)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
-        states = (keyframes.states * scale + shift)[has_grasp]  # (episodes, 2, state)
-        last_moves = states[:, 0] - (keyframes.approach * scale + shift)[has_grasp]
+        states = (grasps.states * scale + shift)[has_grasp]  # (episodes, 2, state)
+        last_moves = states[:, 0] - (grasps.approach * scale + shift)[has_grasp]
         features = _location_features(locations[has_grasp])
         degrees = torch.tensor(_DEGREES, device=states.device)
         for n in range(N_LOCATIONS):
@@ -123,13 +123,13 @@ class StateRegressor(nn.Module):
             self._level(
                 features[:, 0], states[:, 0], [t for t, has in zip(tasks, has_grasp, strict=True) if has]
             )
-        return self.locate(keyframes)
+        return self.locate(grasps)
 
-    def locate(self, keyframes: Keyframes) -> TrainingLocations:
+    def locate(self, grasps: GraspStates) -> TrainingLocations:
         """Returns the locations and heights of episodes, from the robot's states in them."""
-        has_grasp = keyframes.has_grasp
-        locations = self.to_image(keyframes.states).clamp(-1, 1)
-        heights = self.heights(keyframes.states[:, 0])
+        has_grasp = grasps.has_grasp
+        locations = self.to_image(grasps.states).clamp(-1, 1)
+        heights = self.heights(grasps.states[:, 0])
         return TrainingLocations(
             torch.where(has_grasp[:, None, None], locations, 0.0),
             torch.where(has_grasp, heights, 0.0),
