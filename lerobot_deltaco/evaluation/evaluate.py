@@ -102,12 +102,12 @@ class Evaluation:
                 self.loaded, self._envs, batch, demonstrations, monitor, plan.joint_noise, plan.oracle
             )
             localized = localized_positions(policy, plan.scene.control)
-        p_pick = policy.pick_confidence if isinstance(policy, TaskConditionedPolicy) else None
-        p_picks = [math.nan] * len(batch) if p_pick is None else p_pick.tolist()
+        confidence = policy.pick_confidence if isinstance(policy, TaskConditionedPolicy) else None
+        confidences = [math.nan] * len(batch) if confidence is None else confidence.tolist()
         positions = [None] * len(batch) if localized is None else list(localized)
         rows = []
-        for episode, info, given, p_pick, observed, position in zip(
-            batch, infos, demonstrations, p_picks, monitors, positions, strict=True
+        for episode, info, given, pick_confidence, observed, position in zip(
+            batch, infos, demonstrations, confidences, monitors, positions, strict=True
         ):
             pick_error, place_error = observed.errors(position)
             template = get_task(episode.task_id).instruction
@@ -126,7 +126,7 @@ class Evaluation:
                     "object_containers": info["object_containers"].tolist(),
                     "right_object": bool(info["right_object"]),
                     "right_container": bool(info["right_container"]),
-                    "p_pick": p_pick,
+                    "pick_confidence": pick_confidence,
                     "pick_error": pick_error,
                     "place_error": place_error,
                     "failure": NO_FAILURE if info["is_success"] else observed.failure(position),
