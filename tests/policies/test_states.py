@@ -8,7 +8,7 @@ import torch
 
 from gym_deltaco.robot.kinematics import forward, inverse
 from lerobot_deltaco.data.grasps import GraspStates
-from lerobot_deltaco.policies.deltaco_match.states import StateRegressor
+from lerobot_deltaco.policies.geometry.states import StateRegressor
 
 
 class ExactLocations(torch.nn.Module):

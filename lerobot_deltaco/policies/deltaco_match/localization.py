@@ -30,7 +30,6 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
-from lerobot_deltaco.policies.deltaco_match.camera_motion import CameraMotion
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder
 from lerobot_deltaco.policies.deltaco_match.matching import HIDDEN_DIM, Crops, MatchingHead, word_scores
@@ -43,6 +42,7 @@ from lerobot_deltaco.policies.deltaco_match.words import (
     understand,
     words_of,
 )
+from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
 
 logger = logging.getLogger(__name__)
 

@@ -48,7 +48,6 @@ from lerobot_deltaco.policies.base.augmentation import (
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork
-from lerobot_deltaco.policies.deltaco_match.calibration import MIN_EPISODES
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
 from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
@@ -58,14 +57,15 @@ from lerobot_deltaco.policies.deltaco_match.place import (
     PlaceNetwork,
     peak_locations,
 )
-from lerobot_deltaco.policies.deltaco_match.replay import Reference, Trajectory, TrajectoryReplay
-from lerobot_deltaco.policies.deltaco_match.states import N_LOCATIONS, StateRegressor, TrainingLocations
 from lerobot_deltaco.policies.deltaco_match.words import (
     INSTRUCTION_DIM,
     InstructionEncoder,
     encode_words,
     vocabulary_of,
 )
+from lerobot_deltaco.policies.geometry.calibration import MIN_EPISODES
+from lerobot_deltaco.policies.geometry.replay import Reference, Trajectory, TrajectoryReplay
+from lerobot_deltaco.policies.geometry.states import N_LOCATIONS, StateRegressor, TrainingLocations
 
 logger = logging.getLogger(__name__)
 

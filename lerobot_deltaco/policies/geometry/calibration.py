@@ -15,7 +15,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers, mean_near
-from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
+from lerobot_deltaco.policies.geometry.regression import robust_regression
 
 logger = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_deltaco.data.grasps import GraspStates
-from lerobot_deltaco.policies.deltaco_match.calibration import ImageProjection
-from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
+from lerobot_deltaco.policies.geometry.calibration import ImageProjection
+from lerobot_deltaco.policies.geometry.regression import robust_regression
 
 N_LOCATIONS = 2  # pick and place
 _N_LOCATION_FEATURES = 10
