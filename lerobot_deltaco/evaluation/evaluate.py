@@ -38,9 +38,8 @@ from lerobot_deltaco.evaluation.oracle import (
     make_controllers,
 )
 from lerobot_deltaco.evaluation.records import EvaluationPlan, Oracle
-from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
-from lerobot_deltaco.processes import end_with_parent
+from lerobot_deltaco.processes import disable_malloc_trim, end_with_parent
 
 # Most episodes that run at the same time. A policy's step costs little more for 8 than for 2, and each
 # episode needs a simulator of 50 MB, in each process.
