@@ -49,7 +49,7 @@ _ENCODER_LOSS_WEIGHT, _TEMPERATURE = 10.0, 0.1
 _AUTHORS_ENCODER_BOUND = 1e-4  # of the initial weights of the paper's demonstration encoder
 
 
-class Episode(NamedTuple):
+class RunningEpisode(NamedTuple):
     """The conditioning of the running episode, computed once."""
 
     instructions: tuple[str, ...]
@@ -176,7 +176,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         images = self._images(batch)
         if self._begins_episode(batch):
             self._start(self._begin_episode(*self._tasks_of(batch), images.device))
-        episode: Episode = self._episode
+        episode: RunningEpisode = self._episode
         concat = self._fuse_inputs(batch, episode.concat)
         return self._sample_action(batch, *episode.network(images, episode.film, concat))
 
@@ -185,7 +185,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         instructions: tuple[str, ...],
         demonstrations: DemonstrationsOfTasks | None,
         device: torch.device,
-    ) -> Episode:
+    ) -> RunningEpisode:
         """Encodes the instructions and demonstrations of an episode."""
         config = self.config
         demo: Tensor | None = None
@@ -210,7 +210,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
             film = torch.where(torch.tensor(by_language, device=device)[:, None], language, demo)
         else:
             film, concat = self._conditioning_inputs(instructions, demo, language, device)
-        return Episode(instructions, film, concat, self._inference_network())
+        return RunningEpisode(instructions, film, concat, self._inference_network())
 
     def _check_given(self, instructions: Sequence[str], demonstrations: DemonstrationsOfTasks | None) -> None:
         """Checks that no input of the method is left out; MCIL needs only one of the two."""

@@ -27,7 +27,7 @@ _BATCH = 32
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
 _MAX_MOVE = 1.0  # from a proposal, in diameters
 _PEAK_RADIUS = 2.6  # of the cells around a peak whose mean is the location
-_ROUNDS = 2  # of looking
+_N_LOOKS = 2
 
 
 class GraspRefiner(nn.Module):
@@ -72,7 +72,7 @@ class GraspRefiner(nn.Module):
     @torch.no_grad()
     def _refine(self, images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
         extent, proposals = _EXTENT * sizes, locations
-        for _ in range(_ROUNDS):
+        for _ in range(_N_LOOKS):
             crops = cut_crops(images, locations[:, None], extent[:, None], _RESOLUTION)[:, 0]
             maps = self.layers(channels_last(crops))[:, 0].float()
             best, cells = maps.flatten(1).max(dim=1)
