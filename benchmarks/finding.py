@@ -23,6 +23,7 @@ import torch.nn.functional as F  # noqa: N812
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gym_deltaco.containers import CONTAINER_COLORS
 from gym_deltaco.layout import MIN_OBJECT_DISTANCE, Layout, PlacedContainer, PlacedObject, sample_layout
 from gym_deltaco.objects.models import find_model
 from gym_deltaco.phrases import paraphrase
@@ -31,7 +32,7 @@ from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.sim.camera import Camera
 from gym_deltaco.sim.simulation import Simulation, camera_matrices
 from gym_deltaco.sim.workspace import CAMERA, QUADRANTS, TRAY_FLOOR
-from gym_deltaco.tasks import CONTAINER_COLORS, OBJECTS, get_task, select_tasks
+from gym_deltaco.tasks import OBJECTS, get_task, select_tasks
 
 N_TEST_SCENES = 60
 POLICY_SIZE = 48  # px, of the images of the policy

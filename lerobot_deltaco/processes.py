@@ -1,10 +1,13 @@
-"""Processes that end with the one that started them."""
+"""Processes that end with the one that started them, and memory that a process keeps."""
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import logging
 import multiprocessing
 import os
+import platform
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -12,6 +15,9 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from lerobot_deltaco.errors import UserError
+
+# Options of glibc's mallopt, and its largest value.
+_TRIM_THRESHOLD, _MMAP_MAX, _GREATEST = -1, -4, 2**31 - 1
 
 
 def call_in_new_process(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -52,3 +58,16 @@ def _exit_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
+
+
+@functools.cache
+def disable_malloc_trim() -> None:
+    """Prevents glibc from returning freed memory to the operating system, for the rest of the process.
+
+    Otherwise, it returns the memory of large tensors at each step and requests it again, and the system
+    clears it page by page. Without that, training steps of a small network on a CPU are 5 to 25 % faster.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_MMAP_MAX, 0)
+        mallopt(_TRIM_THRESHOLD, _GREATEST)

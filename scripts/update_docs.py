@@ -45,7 +45,7 @@ def leaderboard_tables() -> dict[str, pd.DataFrame]:
     protocol = str(EvaluationPlan().seed)
     sections: dict[str, list[tuple[tuple[bool, float], dict[str, object]]]] = {}
     for row in pd.read_csv(ROOT / "results/leaderboard.csv").itertuples():
-        tasks = "out_of_distribution" if row.section == "foreign" else "scenario_a_test"
+        tasks = "out_of_distribution" if row.section == "out_of_distribution" else "scenario_a_test"
         result = _find(row.records, row.experiment, {"tasks": tasks, "ambiguity": "container"})
         kinds = result.episodes["task_id"].map(lambda task_id: get_task(task_id).kind)
         by_kind = (

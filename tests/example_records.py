@@ -39,7 +39,7 @@ def make_record(
             "object_containers": [[1 if each else -1, -1, -1] for each in success],
             "right_object": success,
             "right_container": success,
-            "p_pick": np.nan,
+            "pick_confidence": np.nan,
             "pick_error": np.nan,
             "place_error": np.nan,
             "failure": None,

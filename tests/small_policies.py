@@ -23,12 +23,12 @@ from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.policies.base import language
-from lerobot_deltaco.policies.deltaco_match import fit, localization, modeling_deltaco_match, prompts
+from lerobot_deltaco.policies.deltaco_match import fit, localization, modeling_deltaco_match
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import (
     DeltacoMatchConfig,
     MatchingSettings,
 )
-from lerobot_deltaco.policies.deltaco_match.matching import FEATURE_DIM, cut_crops
+from lerobot_deltaco.policies.deltaco_match.crop_encoder import cut_crops
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.policies.deltaco_match.words import vocabulary_of
 from lerobot_deltaco.training.train import train
@@ -98,13 +98,17 @@ def fit_once(matching, *data, **options):
     matching.load_state_dict(_fits[key])
 
 
+class ColorEncoder:
+    """Describes crops by colors alone."""
+
+    feature_dim, color_dim = 192, 0
+
+    def __call__(self, images, locations, sizes):
+        return cut_crops(images, locations, sizes, resolution=8).flatten(2)
+
+
 def use_short_fit(monkeypatch, steps=2, **settings):
     """Fits feature matching in a few steps, to colors instead of a pretrained encoder's features."""
-
-    def colors(images, locations, sizes):
-        crops = cut_crops(images, locations, sizes, resolution=8).flatten(2)
-        return torch.nn.functional.pad(crops, (0, FEATURE_DIM - crops.shape[2]))
-
     short = {
         "proposal_steps": 2 * steps,
         "refinement_steps": steps,
@@ -114,8 +118,7 @@ def use_short_fit(monkeypatch, steps=2, **settings):
         **settings,
     }
     monkeypatch.setattr(modeling_deltaco_match, "fit_feature_matching", fit_once)
-    for module in (fit, localization, prompts):
-        monkeypatch.setattr(module, "crop_features", colors)
+    monkeypatch.setattr(localization, "CropEncoder", ColorEncoder)
     monkeypatch.setattr(localization, "MatchingSettings", functools.partial(MatchingSettings, **short))
 
 

@@ -50,6 +50,7 @@ def test_imports_go_one_way():
         (files_of("data"), {"gym_deltaco", "lerobot_deltaco.policies", *above}),
         (files_of("policies/deltaco"), {"lerobot_deltaco.policies.deltaco_match"}),
         (files_of("policies/deltaco_match"), {"lerobot_deltaco.policies.deltaco"}),
+        (files_of("policies/geometry"), {f"lerobot_deltaco.policies.deltaco{s}" for s in ("", "_match")}),
         (files_of("collection"), {"torch", "lerobot_deltaco.evaluation", "lerobot_deltaco.pages"}),
         # Networks and losses take plain numbers.
         (plain, {"lerobot", f"{BASE}.configuration", f"{BASE}.modeling"}),

@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_deltaco.containers import CONTAINER_COLORS, ContainerColor, ContainerWord
 from gym_deltaco.objects.labels import ObjectLabel, find_label
 from gym_deltaco.objects.models import find_model
 from gym_deltaco.objects.object_sets import select_objects
 from gym_deltaco.objects.objects import ObjectModel
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.sim.workspace import CONTAINER_HALF_EXTENTS, QUADRANTS, Quadrant, container_matches
-from gym_deltaco.tasks import CONTAINER_COLORS, ContainerColor, ContainerWord, Task
+from gym_deltaco.tasks import Task
 
 N_OBJECTS = 3
 MIN_OBJECT_DISTANCE = 0.065  # m
@@ -62,22 +63,23 @@ def sample_layout(task: Task, scene: SceneConfig, rng: np.random.Generator) -> L
 
     Args:
         task: Task whose instruction the scene must fit.
-        scene: Settings of the scenes, whose objects include one that fits the task.
+        scene: Settings of the scenes, whose objects include one that fits the task, and distractors.
         rng: Source of all draws.
 
     Returns:
         The layout. With ambiguity "container", exactly one object fits the instruction. With "object", two
         identical objects do; they stand on opposite sides of the tray, and the target is the one on the side
         `twin_word(task)`.
+
+    Raises:
+        ValueError: There are too few distractors, beside which an object is the one that the task asks for.
     """
-    labels = select_objects(scene.objects)
-    target = int(rng.choice([label.index for label in labels if task.describes(label)]))
+    target, others = _sample_target(task, scene, rng)
     if scene.ambiguity == "container":
-        distractors = _sample_distractors(task, find_label(target), scene, rng)
+        distractors = _sample_distractors(find_label(target), others, scene, rng)
         containers, object_quadrants = _sample_quadrants(task, rng)
     else:
-        other = int(rng.choice([label.index for label in labels if not task.describes(label)]))
-        distractors = target, other
+        distractors = target, int(rng.choice([label.index for label in others]))
         containers, object_quadrants = _sample_twin_quadrants(task, rng)
     models = [find_model(index) for index in (target, *distractors)]
     placed = _place_objects(models, object_quadrants, containers, scene.ambiguity, rng)
@@ -100,15 +102,26 @@ def twin_word(task: Task) -> ContainerWord:
     return axis[task.index % 2]
 
 
+def _sample_target(task: Task, scene: SceneConfig, rng: np.random.Generator) -> tuple[int, list[ObjectLabel]]:
+    """Draws the target, and returns its index and its possible distractors, of which there are enough."""
+    labels = select_objects(scene.objects)
+    fitting = [label.index for label in labels if task.object.describes(label)]
+    while fitting:
+        target = int(rng.choice(fitting))
+        others = task.object.distractors(find_label(target), labels)
+        if len(others) >= N_OBJECTS - 1:
+            return target, others
+        fitting.remove(target)  # such as the smallest object for "the largest"
+    raise ValueError(
+        f"Task {task.index} asks for a {task.object.phrase}, but the objects {scene.objects!r} have no "
+        "scene in which only one fits. Choose other tasks, or other `objects`."
+    )
+
+
 def _sample_distractors(
-    task: Task, target: ObjectLabel, scene: SceneConfig, rng: np.random.Generator
+    target: ObjectLabel, others: list[ObjectLabel], scene: SceneConfig, rng: np.random.Generator
 ) -> tuple[int, int]:
     """Draws two objects that the instruction does not describe, often with the target's color or shape."""
-    others = [
-        label
-        for label in select_objects(scene.objects)
-        if not task.describes(label) and label.index != target.index
-    ]
     similar = [label.index for label in others if label.color == target.color or label.shape == target.shape]
     shared_draw = rng.random() if scene.adversarial_draw == "scene" else None
     distractors: list[int] = []

@@ -95,7 +95,7 @@ class SceneConfig:
         """
         labels = select_objects(self.objects)
         for task in {task.object: task for task in map(get_task, task_ids)}.values():
-            if not any(task.describes(label) for label in labels):
+            if not any(task.object.describes(label) for label in labels):
                 raise ValueError(
                     f"Task {task.index} asks for a {task.object.phrase}, of which the objects "
                     f"{self.objects!r} have none. Choose other tasks, or other `objects`."

@@ -13,8 +13,8 @@ from functools import cached_property
 from itertools import cycle
 from numbers import Integral
 from types import MappingProxyType
-from typing import Literal
 
+from gym_deltaco.containers import CONTAINER_COLORS, CONTAINER_WORDS, ContainerWord
 from gym_deltaco.objects.labels import (
     COLOR_SHAPE_PAIRS,
     COLORS,
@@ -26,16 +26,13 @@ from gym_deltaco.objects.labels import (
 )
 from gym_deltaco.objects.object_sets import FOLDS, OBJECT_SETS
 
-ContainerColor = Literal["green", "red"]
-ContainerWord = Literal["green", "red", "front", "back", "left", "right"]
-
-CONTAINER_COLORS: tuple[ContainerColor, ...] = ("green", "red")
-CONTAINER_WORDS: tuple[ContainerWord, ...] = ("green", "red", "front", "back", "left", "right")
-
 
 @dataclass(frozen=True)
 class ObjectSpec:
-    """The object that a task asks for. A kind with a rule of its own overrides `describes`.
+    """The object that a task asks for.
+
+    A kind with a rule of its own about one object overrides `describes`. A kind with a rule about a whole
+    scene, such as "the largest", overrides `meant`, too.
 
     Attributes:
         kind: Kind of the task, such as "color", by which reports group results.
@@ -54,13 +51,30 @@ class ObjectSpec:
     index: int | None = None
 
     def describes(self, label: ObjectLabel) -> bool:
-        """Returns whether an object fits the specification."""
+        """Returns whether an object fits the specification; with a rule about scenes, whether it can."""
         return (
             self.name in (None, label.name)
             and self.color in (None, label.color)
             and self.shape in (None, label.shape)
             and self.index in (None, label.index)
         )
+
+    def meant(self, labels: Sequence[ObjectLabel]) -> list[int]:
+        """Returns the numbers of the objects of a scene that are meant: one, if it is unambiguous.
+
+        Args:
+            labels: The objects of the scene, or of a part of it.
+        """
+        return [number for number, label in enumerate(labels) if self.describes(label)]
+
+    def distractors(self, target: ObjectLabel, labels: Sequence[ObjectLabel]) -> list[ObjectLabel]:
+        """Returns the objects beside which a target is meant, and which are not meant beside it.
+
+        Args:
+            target: An object that fits.
+            labels: Objects to choose from.
+        """
+        return [label for label in labels if self.meant((target, label)) == [0]]
 
 
 @dataclass(frozen=True)
@@ -95,11 +109,7 @@ class Task:
     @cached_property
     def targets(self) -> tuple[int, ...]:
         """Indices of the paper's objects that fit the task."""
-        return tuple(label.index for label in OBJECTS if self.describes(label))
-
-    def describes(self, label: ObjectLabel) -> bool:
-        """Returns whether the task asks for an object, by its instruction or its demonstration."""
-        return self.object.describes(label)
+        return tuple(label.index for label in OBJECTS if self.object.describes(label))
 
 
 _TASKS: dict[int, Task] = {}

@@ -320,11 +320,11 @@ def _start_worker() -> None:
 def _collect_shard(root: Path, plan: CollectionPlan, shard: int) -> int:
     instructions, indices = plan.instructions, plan.shards[shard]
 
-    def episodes(env: PickPlaceEnv) -> Iterator[dataset_writer.Episode]:
+    def episodes(env: PickPlaceEnv) -> Iterator[dataset_writer.RecordedEpisode]:
         for task_id, number in map(plan.episode, indices):
             instruction = get_task(task_id).instruction
             frames = collect_episode(env, plan, task_id, number)
-            yield dataset_writer.Episode(frames, instruction, instructions.index(instruction))
+            yield dataset_writer.RecordedEpisode(frames, instruction, instructions.index(instruction))
 
     with closing(PickPlaceEnv(plan.task_ids[0], plan.scene)) as env:
         dataset_writer.write_shard(

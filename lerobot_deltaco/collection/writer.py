@@ -47,7 +47,7 @@ Features = Mapping[str, Mapping[str, Any]]  # as in info.json
 Statistics = dict[str, NDArray]  # name of a statistic to its value
 
 
-class Episode(NamedTuple):
+class RecordedEpisode(NamedTuple):
     """An episode to write.
 
     Attributes:
@@ -72,7 +72,7 @@ def is_written(root: Path, shard: int) -> bool:
 def write_shard(
     root: Path,
     shard: int,
-    episodes: Iterable[Episode],
+    episodes: Iterable[RecordedEpisode],
     features: Features,
     fps: int,
     first_episode: int,

@@ -77,10 +77,12 @@ class FramesInMemory(torch.utils.data.Dataset):
         self._first_rows = {row: n for n, row in enumerate(first.tolist())}
         self._first_images: dict[str, Tensor] = {}
         for camera in cameras:
-            native: list[Tensor] = []
-            self.columns[camera] = _camera_images(dataset, camera, image_size, set(first.tolist()), native)
-            if native:
-                self._first_images[camera] = torch.stack(native)
+            first_images: list[Tensor] = []
+            self.columns[camera] = _camera_images(
+                dataset, camera, image_size, set(first.tolist()), first_images
+            )
+            if first_images:
+                self._first_images[camera] = torch.stack(first_images)
         self._first, self._last = (
             torch.from_numpy(np.repeat(rows, last - first + 1)) for rows in (first, last)
         )
@@ -198,7 +200,7 @@ def memory_for_frames(dataset: LeRobotDataset, image_size: int | None) -> int:
 
 
 def _camera_images(
-    dataset: LeRobotDataset, camera: str, image_size: int | None, first: set[int], native: list[Tensor]
+    dataset: LeRobotDataset, camera: str, image_size: int | None, first: set[int], first_images: list[Tensor]
 ) -> Tensor:
     """Returns all images of a camera, (frames, 3, H, W) uint8.
 
@@ -207,7 +209,7 @@ def _camera_images(
         camera: Key of the images.
         image_size: Height and width to which they are scaled; None for their own.
         first: Rows of the first images of episodes.
-        native: If images are scaled, gets those of `first` at their own resolution.
+        first_images: If images are scaled, gets those of `first` at their own resolution.
     """
     n_frames = dataset.num_frames
     images: Tensor | None = None
@@ -216,7 +218,7 @@ def _camera_images(
             rows = range(start, min(start + _CHUNK, n_frames))
             chunk = read_images(dataset, camera, rows)
             if image_size is not None and chunk.shape[-2:] != (image_size, image_size):
-                native.extend(chunk[row - start].clone() for row in rows if row in first)
+                first_images.extend(chunk[row - start].clone() for row in rows if row in first)
                 chunk = resize_images(chunk, image_size)
             if images is None:
                 images = torch.empty(n_frames, *chunk.shape[1:], dtype=torch.uint8)

@@ -69,8 +69,8 @@ class _ClosedInterval(NamedTuple):
     open_until: int
 
 
-class Keyframes(NamedTuple):
-    """The robot's states at the keyframes of episodes.
+class GraspStates(NamedTuple):
+    """The robot's states at the grasps of episodes.
 
     Attributes:
         states: States in which the gripper has closed and is about to open, (episodes, 2, state), as in the
@@ -87,9 +87,9 @@ class Keyframes(NamedTuple):
     has_grasp: Tensor
     missing: tuple[str | None, ...]
 
-    def to(self, device: torch.device) -> Keyframes:
-        """Returns the keyframes on a device."""
-        return Keyframes(
+    def to(self, device: torch.device) -> GraspStates:
+        """Returns the grasps on a device."""
+        return GraspStates(
             self.states.to(device),
             self.approach.to(device),
             self.carried.to(device),
@@ -103,12 +103,12 @@ class Keyframes(NamedTuple):
         return torch.where(self.has_grasp[:, None], self.states[:, 0], torch.nan)
 
 
-def find_keyframes(
+def find_grasp_states(
     states: Tensor,
     gripper: Tensor,
     spans: Sequence[tuple[int, int]],
     usual: float | None = None,
-) -> Keyframes:
+) -> GraspStates:
     """Finds the states of the robot at the grasp and the release of episodes; see `find_grasps`.
 
     Args:
@@ -134,7 +134,7 @@ def find_keyframes(
     at = states[rows[:, :3]].float()  # (episodes, 3, state)
     at = torch.where(has_grasp[:, None, None], at, 0.0)
     missing = tuple(grasp if isinstance(grasp, str) else None for grasp in grasps)
-    return Keyframes(at[:, :2], at[:, 2], rows[:, 3], has_grasp, missing)
+    return GraspStates(at[:, :2], at[:, 2], rows[:, 3], has_grasp, missing)
 
 
 def _last_far(states: Tensor) -> int:
@@ -143,20 +143,20 @@ def _last_far(states: Tensor) -> int:
     return int((distance >= _APPROACH * distance.max()).nonzero()[-1])
 
 
-def warn_of_missing(keyframes: Keyframes, episodes: Sequence[int], consequence: str) -> None:
+def warn_of_missing(grasps: GraspStates, episodes: Sequence[int], consequence: str) -> None:
     """Warns of episodes without a grasp.
 
     Args:
-        keyframes: Keyframes of the episodes.
+        grasps: Grasps of the episodes.
         episodes: Index of each episode.
         consequence: What becomes of them, as the end of a sentence about them.
     """
     example: dict[str, int] = {}
-    for reason, episode in zip(keyframes.missing, episodes, strict=True):
+    for reason, episode in zip(grasps.missing, episodes, strict=True):
         if reason is not None:
             example.setdefault(reason, episode)
     if example:
-        counts = Counter(reason for reason in keyframes.missing if reason is not None)
+        counts = Counter(reason for reason in grasps.missing if reason is not None)
         logger.warning(
             "%d of %d episodes have no grasp, and %s: %s.",
             counts.total(),

@@ -21,7 +21,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_deltaco.data.demonstrations import DemonstrationBank, RobotData, kept_frames
-from lerobot_deltaco.data.grasps import Keyframes, find_keyframes
+from lerobot_deltaco.data.grasps import GraspStates, find_grasp_states
 from lerobot_deltaco.data.gripper import Gripper
 from lerobot_deltaco.data.images import read_images, resize_images
 from lerobot_deltaco.data.reading import check_episode_numbers, column, dimension_names, episode_spans
@@ -154,7 +154,7 @@ class TrainingData:
 
     demonstrations: DemonstrationBank
     robot: RobotData | None
-    grasps: Keyframes | None
+    grasps: GraspStates | None
 
     @classmethod
     def read(cls, episodes: Episodes, form: DemonstrationFormat) -> TrainingData:
@@ -170,7 +170,7 @@ class TrainingData:
         robot, grasps = read_robot_data(episodes, form), None
         if robot is not None and form.gripper is not None:
             opening = form.gripper.opening(robot.actions)
-            grasps = find_keyframes(robot.states, opening, robot.spans, form.gripper.usual_range)
+            grasps = find_grasp_states(robot.states, opening, robot.spans, form.gripper.usual_range)
         frames, first_images = _read_frames(episodes, form)
         objects = episodes.values(TARGET_OBJECT)
         first_rows = [first for first, _ in episodes.spans.values()]

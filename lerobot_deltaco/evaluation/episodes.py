@@ -93,7 +93,7 @@ def _counterfactual_task(candidates: Sequence[Task], scene: SceneConfig, task: T
     layout = sample_layout(task, scene, seeding.np_random(seed)[0])
 
     def fits(other: Task) -> tuple[bool, bool]:
-        objects = [n for n, item in enumerate(layout.objects) if other.describes(item.label)]
+        objects = other.object.meant([item.label for item in layout.objects])
         containers = [n for n, item in enumerate(layout.containers) if item.satisfies(other.container)]
         is_other_container = containers == [1 - layout.target_container]
         return is_other_container, len(objects) == 1 and objects != [layout.target_object]

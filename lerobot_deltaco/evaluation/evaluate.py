@@ -40,9 +40,8 @@ from lerobot_deltaco.evaluation.oracle import (
 )
 from lerobot_deltaco.evaluation.photos import take_photo
 from lerobot_deltaco.evaluation.records import EvaluationPlan, Oracle
-from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
-from lerobot_deltaco.processes import end_with_parent
+from lerobot_deltaco.processes import disable_malloc_trim, end_with_parent
 
 # Most episodes that run at the same time. A policy's step costs little more for 8 than for 2, and each
 # episode needs a simulator of 50 MB, in each process.
@@ -106,12 +105,12 @@ class Evaluation:
                 self.loaded, self._envs, batch, demonstrations, monitor, plan.joint_noise, plan.oracle
             )
             localized = localized_positions(policy, plan.scene.control)
-        p_pick = policy.pick_confidence if isinstance(policy, TaskConditionedPolicy) else None
-        p_picks = [math.nan] * len(batch) if p_pick is None else p_pick.tolist()
+        confidence = policy.pick_confidence if isinstance(policy, TaskConditionedPolicy) else None
+        confidences = [math.nan] * len(batch) if confidence is None else confidence.tolist()
         positions = [None] * len(batch) if localized is None else list(localized)
         rows = []
-        for episode, info, given, p_pick, observed, position in zip(
-            batch, infos, demonstrations, p_picks, monitors, positions, strict=True
+        for episode, info, given, pick_confidence, observed, position in zip(
+            batch, infos, demonstrations, confidences, monitors, positions, strict=True
         ):
             pick_error, place_error = observed.errors(position)
             shown = [each for each in given if isinstance(each, Demonstration)]
@@ -131,7 +130,7 @@ class Evaluation:
                     "object_containers": info["object_containers"].tolist(),
                     "right_object": bool(info["right_object"]),
                     "right_container": bool(info["right_container"]),
-                    "p_pick": p_pick,
+                    "pick_confidence": pick_confidence,
                     "pick_error": pick_error,
                     "place_error": place_error,
                     "failure": NO_FAILURE if info["is_success"] else observed.failure(position),

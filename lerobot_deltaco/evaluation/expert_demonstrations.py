@@ -12,7 +12,7 @@ from gym_deltaco.expert import record_demonstration
 from gym_deltaco.scene_config import SceneConfig
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.data.demonstrations import Demonstration
-from lerobot_deltaco.data.grasps import find_keyframes
+from lerobot_deltaco.data.grasps import find_grasp_states
 
 
 def expert_demonstration(
@@ -31,12 +31,12 @@ def expert_demonstration(
     images = np.stack([each[camera] if isinstance(each, Mapping) else each for each in pixels])
     states = torch.from_numpy(np.stack([step.observation["agent_pos"] for step in steps]))
     actions = torch.from_numpy(np.stack([step.action for step in steps]))
-    keyframes = find_keyframes(states, actions[:, -1], [(0, len(steps) - 1)])
+    grasps = find_grasp_states(states, actions[:, -1], [(0, len(steps) - 1)])
     info = steps[-1].info
     return Demonstration(
         get_task(task_id).instruction,
         torch.from_numpy(images).permute(0, 3, 1, 2),
-        keyframes.pick_states[0],
+        grasps.pick_states[0],
         target_object=int(info["objects"][info["target_object"]]),
         states=states,
         actions=actions,

@@ -44,13 +44,12 @@ SCHEMA = pa.schema(
         "object_containers": pa.list_(pa.int8()),
         "right_object": pa.bool_(),
         "right_container": pa.bool_(),
-        "p_pick": pa.float32(),
+        "pick_confidence": pa.float32(),
         "pick_error": pa.float32(),
         "place_error": pa.float32(),
         "failure": pa.string(),
     }
 )
-_ADDED = ("pick_error", "place_error", "failure")  # which older records do not have
 TEMPLATES = "templates"
 _KEY = b"deltaco"
 
@@ -255,8 +254,6 @@ def _read(path: Path) -> list[EvaluationRecord]:
     try:
         table = pq.read_table(path)
         headers = json.loads((table.schema.metadata or {})[_KEY])
-        for name in set(_ADDED) - set(table.column_names):
-            table = table.append_column(name, pa.nulls(len(table), SCHEMA.field(name).type))
         rows = table.select(SCHEMA.names).to_pandas()
         records = []
         for n, header in enumerate(headers):

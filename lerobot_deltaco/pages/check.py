@@ -216,12 +216,12 @@ def _read_episodes(
         text = f"{(last - first + 1) / meta.fps:.1f} s"
         if is_left_out[episode]:
             text += f", left out: {grasp}"
-        course, lines = "", list[float]()
+        polyline, lines = "", list[float]()
         if actions is not None:
             values = actions[first : last + 1, gripper]
             heights = 1 - (values - values.min()) / max(np.ptp(values), 1e-9)
             at = np.linspace(0, 1, len(values))
-            course = " ".join(f"{x:.3f},{y:.3f}" for x, y in zip(at, heights, strict=True))
+            polyline = " ".join(f"{x:.3f},{y:.3f}" for x, y in zip(at, heights, strict=True))
             if isinstance(grasp, Grasp):
                 lines = [round(float(at[time - first]), 3) for time in times[1:3]]
         views.append(
@@ -230,7 +230,7 @@ def _read_episodes(
                 "task": tasks[episode],
                 "text": text,
                 "pictures": _strip(images, marks),
-                "course": course,
+                "polyline": polyline,
                 "lines": lines,
             }
         )
@@ -324,7 +324,7 @@ def _facts(
 
 def _finding(policy: DeltacoMatchPolicy) -> str:
     """Returns how often the object is found where that was not learned, and what to make of it."""
-    matching = policy.feature_matching
+    matching = policy.matching
     if not bool(matching.fitted):
         return f"not tried with more than {_MAX_FITTED} episodes; training tells after its fit"
     n_right, n_all = matching.held_out.tolist()
@@ -384,12 +384,12 @@ def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[
     per_step = (time.perf_counter() - began) / _TIMED_STEPS
     # Crops of all proposals are encoded, which is most of the fit.
     images = bank.frames[:_DESCRIBED_EPISODES, 0]
-    native = images if bank.first_images is None else bank.first_images[:_DESCRIBED_EPISODES]
+    full_resolution = images if bank.first_images is None else bank.first_images[:_DESCRIBED_EPISODES]
     middle = torch.zeros(len(images), 2, device=images.device)
     began = time.perf_counter()
-    policy.feature_matching.describe(images.float() / 255, native, middle, middle)
+    policy.matching.describe(images.float() / 255, full_resolution, middle, middle)
     per_crop = (time.perf_counter() - began) / len(images)
-    fit = min(len(bank), policy.feature_matching.settings.max_episodes) * N_OBJECTS * per_crop
+    fit = min(len(bank), policy.matching.settings.max_episodes) * N_OBJECTS * per_crop
     total = start.reading + fit + steps * per_step
     memory = start.bytes + psutil.Process().memory_info().rss
     return [

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.data.demonstrations import Demonstration
-from lerobot_deltaco.data.grasps import find_keyframes
+from lerobot_deltaco.data.grasps import find_grasp_states
 from lerobot_deltaco.data.images import as_uint8
 from lerobot_deltaco.data.object_prompts import ObjectPrompt, read_prompt
 from lerobot_deltaco.data.reading import open_folder_or_hub
@@ -79,7 +79,7 @@ def look(arguments: LookArguments) -> str:
     lines = [f"{name}: {n_right} of {n}" for name, n_right, n in rates]
     if dataset is not None:
         lines.append("These say little if the policy was trained on the episodes.")
-        lines.append(f"Its fit: {loaded.policy.feature_matching.report}.")
+        lines.append(f"Its fit: {loaded.policy.matching.report}.")
     return "\n".join([*lines, f"See {page}."])
 
 
@@ -112,7 +112,7 @@ def _dataset_episodes(
     assert data is not None
     assert form.gripper is not None
     opening = form.gripper.opening(data.actions)
-    keyframes = find_keyframes(data.states, opening, data.spans, form.gripper.usual_range)
+    grasps = find_grasp_states(data.states, opening, data.spans, form.gripper.usual_range)
     numbers = _spread(len(tasks), n_episodes)
     partners = {episode: _partner(tasks, episode) for episode in numbers}
     bank = None
@@ -140,9 +140,9 @@ def _dataset_episodes(
         elif prompt is not None:
             where += ", where a point shows the object" if prompt.image is None else ", by a photo"
         rights, headline, recorded = (), "No grasp found", None
-        if bool(keyframes.has_grasp[episode]):
-            states = keyframes.states[episode].to(config.device)
-            recorded = policy.robot_states.to_image(states).clamp(-1, 1).cpu()
+        if bool(grasps.has_grasp[episode]):
+            states = grasps.states[episode].to(config.device)
+            recorded = policy.state_regressor.to_image(states).clamp(-1, 1).cpu()
             distances = (localization.locations[0].cpu() - recorded).norm(dim=1)
             rights = tuple((distances < TOLERANCE).tolist())
             pick, place = (50 * distances).tolist()

@@ -8,8 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gym_deltaco.containers import ContainerWord
 from gym_deltaco.layout import Layout
-from gym_deltaco.tasks import TASKS, ContainerWord, get_task
+from gym_deltaco.tasks import TASKS, get_task
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.pages.arguments import PlayArguments

@@ -165,7 +165,7 @@ class Player:
             raise UserError("The comparison needs a policy that takes a demonstration and an instruction.")
         _, layout = self.show_scene(choice)
         labels = [item.label for item in layout.objects]
-        fitting = [label for label in labels if get_task(choice.demo_task).describes(label)]
+        fitting = [labels[n] for n in get_task(choice.demo_task).object.meant(labels)]
         first = choice
         if len(fitting) != 1:  # the chosen demonstration does not single out an object here
             fitting = [labels[layout.target_object]]
@@ -179,7 +179,8 @@ class Player:
     def _describe_demonstration(choice: Choice, layout: Layout) -> str:
         """Returns which object of the scene the demonstration shows, or its task."""
         task = get_task(choice.demo_task)
-        names = {object_name(item.label) for item in layout.objects if task.describes(item.label)}
+        labels = [item.label for item in layout.objects]
+        names = {object_name(labels[n]) for n in task.object.meant(labels)}
         return f"The demonstration shows the {names.pop()}." if len(names) == 1 else task.instruction
 
 

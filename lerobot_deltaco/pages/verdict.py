@@ -14,9 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_deltaco.containers import CONTAINER_WORDS, ContainerWord
 from gym_deltaco.layout import Layout
+from gym_deltaco.objects.labels import ObjectLabel
 from gym_deltaco.sim.workspace import CONTAINER_FLOOR, TABLE_TOP, TRAY_CENTER, TRAY_HALF_EXTENTS
-from gym_deltaco.tasks import CONTAINER_WORDS, TASKS, ContainerWord, ObjectLabel, Task
+from gym_deltaco.tasks import TASKS, Task
 from lerobot_deltaco.evaluation.photos import image_locations
 from lerobot_deltaco.evaluation.video import Recording
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
@@ -103,9 +105,8 @@ def asked_for(layout: Layout, sentence: str, demonstrated: Task | None) -> tuple
     tasks = [known for known in (task, demonstrated) if known is not None]
     if not tasks:
         return "Not judged: the sentence names no object, and there is no demonstration."
-    objects = {
-        n for n, item in enumerate(layout.objects) if all(known.describes(item.label) for known in tasks)
-    }
+    labels = [item.label for item in layout.objects]
+    objects = set.intersection(*(set(known.object.meant(labels)) for known in tasks))
     containers = {n for n, item in enumerate(layout.containers) if item.satisfies(word)}
     if not objects:
         both = "both the demonstration and the sentence" if len(tasks) == 2 else "that"
@@ -152,7 +153,7 @@ def describe_words(policy: DeltacoMatchPolicy, sentence: str) -> str:
     """Returns which words of an instruction a policy reads as the object's, misreads and does not know."""
     if not sentence:
         return ""
-    about = _quoted(dict(policy.feature_matching.understood(sentence)))
+    about = _quoted(dict(policy.matching.understood(sentence)))
     read = dict(zip(words_of(sentence), understand(sentence, policy.config.known_words), strict=True))
     unknown = _quoted(word for word, meaning in read.items() if meaning is None)
     others = [f"“{word}” as “{meaning}”" for word, meaning in read.items() if meaning not in (None, word)]

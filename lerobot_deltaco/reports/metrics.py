@@ -15,9 +15,10 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from gym_deltaco.containers import CONTAINER_COLORS
 from gym_deltaco.objects.labels import find_label
 from gym_deltaco.sim.workspace import Quadrant, container_matches
-from gym_deltaco.tasks import CONTAINER_COLORS, Task, find_task, get_task
+from gym_deltaco.tasks import Task, find_task, get_task
 from lerobot_deltaco.evaluation.records import EvaluationRecord, scene_columns
 
 N_RESAMPLES = 10_000
@@ -147,7 +148,7 @@ def _asked_for(row: Any, task: Task | None, is_demonstration: bool) -> dict[str,
     """Returns the numbers of the objects and of the containers that a task asks for; none instead of all."""
     if task is None:
         return {"object": set(), "container": set()}
-    objects = {n for n, index in enumerate(row.objects) if task.describes(find_label(index))}
+    objects = set(task.object.meant([find_label(index) for index in row.objects]))
     if is_demonstration and task.index == row.task_id:
         # With two identical objects (ambiguity scheme ii), only an instruction describes the target's twin.
         objects = {row.target_object}

@@ -212,12 +212,12 @@ def calibration_rows(result: Result, _: Sequence[Result]) -> Iterator[dict[str, 
         return
     grasps = result.episodes[result.episodes["grasped_object"] >= 0]
     for sure, some in grasps.groupby(
-        pd.cut(grasps["p_pick"], _CONFIDENCE_BOUNDS, include_lowest=True), observed=True
+        pd.cut(grasps["pick_confidence"], _CONFIDENCE_BOUNDS, include_lowest=True), observed=True
     ):
         yield {
             "sure": f"{100 * max(sure.left, 0):.0f} to {100 * sure.right:.0f} %",
             "grasps": len(some),
-            "mean_probability": some["p_pick"].mean(),
+            "mean_probability": some["pick_confidence"].mean(),
             "right_object": some["right_object"].mean(),
         }
 

@@ -38,8 +38,8 @@ from lerobot_deltaco.data.training_data import read_robot_data
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.lerobot_versions import replaced
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig, check_image_shapes
-from lerobot_deltaco.policies.base.memory import disable_malloc_trim
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
+from lerobot_deltaco.processes import disable_malloc_trim
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
 _FPS_OF_OPTION = 24  # frames per second of `frames_after_release`

@@ -55,7 +55,7 @@ def episodes():
         for name in FEATURES:
             if name.startswith("benchmark."):
                 frames[name] = np.full(length, rng.integers(2**62))
-        made.append(writer.Episode(frames, TASKS[task_index], task_index))
+        made.append(writer.RecordedEpisode(frames, TASKS[task_index], task_index))
     return made
 
 

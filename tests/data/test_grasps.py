@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_deltaco.data.grasps import find_grasps, find_keyframes, warn_of_missing
+from lerobot_deltaco.data.grasps import find_grasp_states, find_grasps, warn_of_missing
 
 
 def grasp_frames(gripper, spans):
@@ -19,14 +19,14 @@ def test_last_grasp_that_is_released_counts():
     states = torch.tensor([0, 1, 2, 3, 4, 5, 4.5, 4, 0, 0, 0, 0, 0, 0])[:, None]
     gripper = torch.tensor([1, -1, 1, 1, -1, -1, 1, 1, -1, 1.0, 1, 1, -1, -1])
     spans = [(0, 7), (8, 10), (11, 13)]
-    keyframes = find_keyframes(states, gripper, spans)
-    assert keyframes.has_grasp.tolist() == [True, False, False]
+    grasps = find_grasp_states(states, gripper, spans)
+    assert grasps.has_grasp.tolist() == [True, False, False]
     # One step after the command to close, and the step of the command to open.
-    assert keyframes.states[0, :, 0].tolist() == [5, 4.5]
-    assert keyframes.approach[0, 0] == 2
-    assert keyframes.carried.tolist() == [5, 8, 11]
-    assert not keyframes.states[1:].any()
-    assert keyframes.pick_states[:, 0].isnan().tolist() == [False, True, True]
+    assert grasps.states[0, :, 0].tolist() == [5, 4.5]
+    assert grasps.approach[0, 0] == 2
+    assert grasps.carried.tolist() == [5, 8, 11]
+    assert not grasps.states[1:].any()
+    assert grasps.pick_states[:, 0].isnan().tolist() == [False, True, True]
     assert grasp_frames(gripper, spans) == [(4, 6), None, None]
 
 
@@ -79,7 +79,7 @@ def test_approach_and_opening_scale_with_the_trajectory():
     assert 180 < found.release < 190 < 200 < found.opened <= 210
     # Before the last 15 % of the way.
     way = float(found.closing)
-    assert 0.8 * way < find_keyframes(states, slow, [(0, len(slow) - 1)]).approach[0, 0] <= 0.85 * way
+    assert 0.8 * way < find_grasp_states(states, slow, [(0, len(slow) - 1)]).approach[0, 0] <= 0.85 * way
 
 
 def test_the_approach_is_seen_while_the_arm_is_on_its_way():
@@ -88,23 +88,23 @@ def test_the_approach_is_seen_while_the_arm_is_on_its_way():
     # The arm arrives in frame 10, and trembles for 30 frames before it grasps.
     way = (10 - frames).clamp_min(0) + (frames - 42).clamp(0, 10)
     states = torch.stack([way.float(), 0.01 * (frames % 2)], dim=1)
-    keyframes = find_keyframes(states, gripper, [(0, 59)])
-    assert 1 <= keyframes.approach[0, 0] <= 3
+    grasps = find_grasp_states(states, gripper, [(0, 59)])
+    assert 1 <= grasps.approach[0, 0] <= 3
 
 
-def test_keyframes_are_the_states_after_the_commands():
+def test_grasp_states_are_those_after_the_commands():
     frames = torch.arange(40)
     gripper = 1 - 2.0 * ((frames >= 5) & (frames < 30))
-    keyframes = find_keyframes(frames[:, None], gripper, [(0, 39)])
-    assert keyframes.states.flatten().tolist() == [6, 30]
-    assert keyframes.carried.tolist() == [18]
+    grasps = find_grasp_states(frames[:, None], gripper, [(0, 39)])
+    assert grasps.states.flatten().tolist() == [6, 30]
+    assert grasps.carried.tolist() == [18]
 
 
 def test_a_state_holds_while_the_command_is_to_stay():
     for close, stay, opened in ((0, 1, 2), (-1, 0, 1), (-2, -1, 0)):
         trajectory = [stay, opened, stay, stay, close, stay, stay, stay, opened, stay, stay]
-        trajectorys = torch.tensor([*trajectory, *trajectory]).float()
-        assert grasp_frames(trajectorys, [(0, 10), (11, 21)]) == [(4, 8), (15, 19)]
+        trajectories = torch.tensor([*trajectory, *trajectory]).float()
+        assert grasp_frames(trajectories, [(0, 10), (11, 21)]) == [(4, 8), (15, 19)]
 
 
 @pytest.mark.parametrize(
@@ -120,18 +120,20 @@ def test_a_gripper_at_rest_grasps_nothing(values, reason, caplog):
     trajectory = torch.from_numpy(ramps(*values))
     spans = [(0, len(trajectory) - 1)]
     assert find_grasps(trajectory, spans) == [reason]
-    keyframes = find_keyframes(torch.zeros(len(trajectory), 1), trajectory, spans)
-    warn_of_missing(keyframes, [7], "are not trained on")
+    grasps = find_grasp_states(torch.zeros(len(trajectory), 1), trajectory, spans)
+    warn_of_missing(grasps, [7], "are not trained on")
     refusal = f"1 of 1 episodes have no grasp, and are not trained on: in 1, such as episode 7, {reason}."
     assert refusal in caplog.text
 
 
 def test_trembles_and_noise_are_no_grasps():
-    trajectorys = [ramps(1, 0, 1), ramps(1, 0, 1), 1 - 0.05 * ramps(1, 0, 1)]
-    starts = np.cumsum([0, *map(len, trajectorys)]).tolist()
+    trajectories = [ramps(1, 0, 1), ramps(1, 0, 1), 1 - 0.05 * ramps(1, 0, 1)]
+    starts = np.cumsum([0, *map(len, trajectories)]).tolist()
     spans = [(start, end - 1) for start, end in zip(starts, starts[1:], strict=False)]
-    assert find_grasps(torch.from_numpy(np.concatenate(trajectorys)), spans)[2] == "the gripper only trembles"
-    alone, span = torch.from_numpy(trajectorys[2]), [(0, len(trajectorys[2]) - 1)]
+    assert (
+        find_grasps(torch.from_numpy(np.concatenate(trajectories)), spans)[2] == "the gripper only trembles"
+    )
+    alone, span = torch.from_numpy(trajectories[2]), [(0, len(trajectories[2]) - 1)]
     assert find_grasps(alone, span, usual=1.0) == ["the gripper only trembles"]
     noise = torch.from_numpy(np.random.default_rng(0).normal(0, 0.01, 200))
     assert find_grasps(noise, [(0, 199)]) == ["the gripper only trembles"]
@@ -160,9 +162,9 @@ def recorded(*stages, seed=0):
 def carried_from_object_to_goal(states, commands):
     """Whether the only grasp found holds from the object to the goal."""
     (found,) = find_grasps(commands, [(0, len(states) - 1)], states=states)
-    keyframes = find_keyframes(states, commands, [(0, len(states) - 1)])
+    grasps = find_grasp_states(states, commands, [(0, len(states) - 1)])
     ends = torch.tensor([OBJECT, GOAL])
-    return not isinstance(found, str) and (keyframes.states[0, :, :3] - ends).abs().max() < 0.03
+    return not isinstance(found, str) and (grasps.states[0, :, :3] - ends).abs().max() < 0.03
 
 
 PICK_AND_PLACE = [(HOME, 1), (OBJECT, 1), (OBJECT, 0.2), (LIFTED, 0.2), (ABOVE, 0.2), (GOAL, 0.2), (GOAL, 1)]
@@ -211,7 +213,7 @@ def test_an_episode_in_which_nothing_is_carried_is_left_out_and_named():
     states, commands = (torch.cat(parts) for parts in zip(*episodes, strict=True))
     n_first = len(episodes[0][0])
     spans = [(0, n_first - 1), (n_first, len(states) - 1)]
-    keyframes = find_keyframes(states, commands, spans)
-    assert keyframes.missing == (None, "the arm stands still while the gripper is closed")
+    grasps = find_grasp_states(states, commands, spans)
+    assert grasps.missing == (None, "the arm stands still while the gripper is closed")
     # Without states, only the gripper is seen.
     assert not any(isinstance(grasp, str) for grasp in find_grasps(commands, spans))

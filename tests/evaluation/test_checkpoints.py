@@ -162,18 +162,21 @@ def test_training_continues_on_other_data_than_that_of_its_checkpoint(checkpoint
 
 
 def test_weights_that_do_not_fit_are_an_error(checkpoint):
-    edit(checkpoint / "model.safetensors", lambda tensors, _: tensors.pop("model.raw_log_std"))
+    edit(checkpoint / "model.safetensors", lambda tensors, _: tensors.pop("policy_network.raw_log_std"))
     with pytest.raises(ValueError, match="not have the weights of this policy: .*raw_log_std.*config.js"):
         DeltacoPolicy.from_pretrained(checkpoint)
 
 
 def test_weights_that_are_not_finite_are_neither_loaded_nor_saved(checkpoint, make, tmp_path):
-    edit(checkpoint / "model.safetensors", lambda tensors, _: tensors["model.raw_log_std"].fill_(torch.nan))
+    edit(
+        checkpoint / "model.safetensors",
+        lambda tensors, _: tensors["policy_network.raw_log_std"].fill_(torch.nan),
+    )
     with pytest.raises(ValueError, match="is damaged: the weight model.raw_log_std has numbers that are not"):
         DeltacoPolicy.from_pretrained(checkpoint)
     policy, _, _ = make()
     with torch.no_grad():
-        policy.model.raw_log_std.fill_(torch.inf)
+        policy.policy_network.raw_log_std.fill_(torch.inf)
     with pytest.raises(TrainingDivergedError, match="weight model.raw_log_std is not finite, and no chec"):
         policy.save_pretrained(tmp_path / "new")
     assert not (tmp_path / "new" / "model.safetensors").exists()

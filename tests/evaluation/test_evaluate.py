@@ -212,7 +212,7 @@ def test_a_counterfactual_fits_the_scene():
     for episode in draw_episodes(plan)[::10]:
         other, rng = tasks[episode.instruction], seeding.np_random(episode.seed)[0]
         layout = sample_layout(get_task(episode.task_id), plan.scene, rng)
-        described = [n for n, item in enumerate(layout.objects) if other.describes(item.label)]
+        described = [n for n, item in enumerate(layout.objects) if other.object.describes(item.label)]
         assert len(described) == 1
         assert described != [layout.target_object]
         containers = [n for n, item in enumerate(layout.containers) if item.satisfies(other.container)]

@@ -132,7 +132,7 @@ def test_scenes_are_drawn_from_the_chosen_objects():
         layouts = [draw(GREEN_TASK, scene, seed) for seed in range(200)]
         assert {item.label.index for layout in layouts for item in layout.objects} == set(range(24))
     task = get_task(1005)  # black and white cup
-    matching = {label.index for label in select_objects("random:400") if task.describes(label)}
+    matching = {label.index for label in select_objects("random:400") if task.object.describes(label)}
     targets = set()
     for seed in range(100):
         layout = draw(1005, SceneConfig(objects="random:400"), seed)
@@ -145,7 +145,7 @@ def test_scenes_are_drawn_from_the_chosen_objects():
 
 def test_exactly_one_object_fits_the_instruction():
     for task, layout in draw_all("container"):
-        fits = [task.describes(item.label) for item in layout.objects]
+        fits = [task.object.describes(item.label) for item in layout.objects]
         assert fits.count(True) == 1
         assert fits.index(True) == layout.target_object
         assert len({item.label.index for item in layout.objects}) == 3
@@ -172,8 +172,8 @@ def test_target_has_an_identical_twin_on_the_other_side():
     for task, layout in draw_all("object"):
         target, twin = target_and_twin(layout)
         (third,) = (item for item in layout.objects if item.label != target.label)
-        assert task.describes(target.label)
-        assert not task.describes(third.label)
+        assert task.object.describes(target.label)
+        assert not task.object.describes(third.label)
         # The rule of the specification
         column = task.index // 50
         sides = SIDES if column < 2 else SIDES[:2] if column < 4 else SIDES[2:]

@@ -5,12 +5,13 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from gym_deltaco.containers import CONTAINER_WORDS
 from gym_deltaco.layout import sample_layout
 from gym_deltaco.objects.labels import MESHES, find_label
 from gym_deltaco.objects.models import find_model
 from gym_deltaco.objects.object_sets import select_objects
 from gym_deltaco.scene_config import SceneConfig
-from gym_deltaco.tasks import CONTAINER_WORDS, TASK_SETS, get_task
+from gym_deltaco.tasks import TASK_SETS, get_task
 from lerobot_deltaco.collection.collect import CollectionPlan, collect
 from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.evaluation.lerobot_env import DeltacoEnv
@@ -52,7 +53,7 @@ def test_task_sets_bring_their_objects():
     layout = sample_layout(get_task(TASKS[0]), plan.scene, np.random.default_rng(0))
     found = [item.label for item in layout.objects]
     assert set(found) <= set(select_objects("out_of_distribution"))
-    assert [get_task(TASKS[0]).describes(label) for label in found].count(True) == 1
+    assert [get_task(TASKS[0]).object.describes(label) for label in found].count(True) == 1
     with pytest.raises(ValueError, match="asks for a thing, of which the objects 'all' have none"):
         SceneConfig().check_tasks(TASKS[:1])
     with pytest.raises(ValueError, match="`deltaco evaluate`"):

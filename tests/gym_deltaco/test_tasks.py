@@ -155,26 +155,44 @@ from gym_deltaco.expert import expert_episode
 from gym_deltaco.layout import sample_layout
 from gym_deltaco.paraphrases import read_paraphrases
 from gym_deltaco.scene_config import DEFAULT_SCENE
-from gym_deltaco.tasks import find_task, get_task, select_tasks, task_kinds
+from gym_deltaco.tasks import Task, find_task, get_task, select_tasks, task_kinds
 from lerobot_deltaco.evaluation.records import EvaluationPlan
 
 tasks = select_tasks("10000-10011")
-assert tasks == tuple(task.index for task in OTHER_COLOR_TASKS)
-assert find_task("Put object that is not blue in left bin.") is get_task(10_009)
-assert task_kinds()[-1] == "other_color"
-for task in OTHER_COLOR_TASKS:
-    layout = sample_layout(task, DEFAULT_SCENE, np.random.default_rng(task.index))
-    fits = [item.label.color != task.object.color for item in layout.objects]
-    assert fits.count(True) == 1 and fits.index(True) == layout.target_object
+assert tasks == tuple(task.index for task in NEW_TASKS)
+assert find_task("Put tallest gray object in left bin.") is get_task(10_009)
+assert task_kinds()[-2:] == ("other_color", "tallest")
+n_gray = []
+for task in 4 * NEW_TASKS:
+    layout = sample_layout(task, DEFAULT_SCENE, np.random.default_rng((task.index, len(n_gray))))
+    others = [item for item in layout.objects if item.label.color == task.object.color]
+    target = layout.objects[layout.target_object]
+    assert task.object.meant([item.label for item in layout.objects]) == [layout.target_object]
+    if task.kind == "other_color":
+        assert len(others) == 2 and target not in others
+    else:
+        assert max(others, key=lambda item: item.model.height) is target
+        n_gray.append(len(others))
+assert set(n_gray) == {1, 2, 3}
+of_any_color = Task(1, Tallest("tallest", "tallest object"), "left")
+for seed in range(20):  # the smallest objects are never the target
+    layout = sample_layout(of_any_color, DEFAULT_SCENE, np.random.default_rng(seed))
+    heights = [item.model.height for item in layout.objects]
+    assert heights[layout.target_object] == max(heights)
 assert all(len(of_task) > 4 for of_task in read_paraphrases("grammar", "held_out", tasks).values())
 assert EvaluationPlan("10000-10011").task_ids == tasks
 env = gymnasium.make("gym_deltaco:gym_deltaco/PickPlace-v0", task_id=10_009).unwrapped
 *_, last = expert_episode(env, 10_009, 0)
 assert last.info["is_success"] and last.info["task_id"] == 10_009
-try:
-    add_tasks(10_011, [ObjectSpec("color", "red thing", color="red")])
-except ValueError as error:
-    print(error)
+Tallest.distractors = lambda self, target, labels: []
+for call in (
+    lambda: add_tasks(10_011, [ObjectSpec("color", "red thing", color="red")]),
+    lambda: sample_layout(of_any_color, DEFAULT_SCENE, np.random.default_rng(0)),
+):
+    try:
+        call()
+    except ValueError as error:
+        print(error)
 """
 
 
@@ -184,6 +202,12 @@ def test_a_new_kind_of_task_needs_one_call():
     result = run_python(example + USE_OF_THE_NEW_KIND)
     assert result.returncode == 0, result.stderr
     assert "Other tasks have the indices 10011 to 10011. Choose another `first`." in result.stdout
+    assert "asks for a tallest object, but the objects 'all' have no scene" in result.stdout
+
+
+def test_a_rule_may_use_the_geometry_of_objects():
+    program = "import sys, gym_deltaco.objects.models; print('gym_deltaco.tasks' in sys.modules)"
+    assert run_python(program).stdout.strip() == "False"
 
 
 # Seeds

@@ -86,7 +86,7 @@ def test_the_expert_records_a_demonstration_of_any_task(tmp_path):
     for task_id in (0, 134, 299):
         one, same, other = (find_demonstration(policy, get_task(task_id), scene, n) for n in (0, 0, 1))
         assert one.task == TASKS[task_id].instruction
-        assert TASKS[task_id].describes(OBJECTS[one.target_object])
+        assert TASKS[task_id].object.describes(OBJECTS[one.target_object])
         assert one.frames.shape == (2, 3, 48, 48)
         assert one.pick_state.isfinite().all()
         assert (one.frames == same.frames).all()

@@ -131,7 +131,7 @@ def test_the_outcome_says_what_was_moved_and_what_left_the_tray():
 
 def test_words_are_shown_as_the_policy_reads_them():
     policy = SimpleNamespace(
-        feature_matching=SimpleNamespace(understood=lambda _: [("blue", "blue"), ("goblett", "goblet")]),
+        matching=SimpleNamespace(understood=lambda _: [("blue", "blue"), ("goblett", "goblet")]),
         config=SimpleNamespace(known_words=["blue", "goblet", "bin"]),
     )
     assert describe_words(policy, "Blue goblett, shiny bin!") == (

@@ -5,7 +5,7 @@ import pytest
 import torch
 from small_policies import TABLE_SIZE, draw_table, random_moves, state_at
 
-from lerobot_deltaco.policies.deltaco_match.calibration import ImageProjection
+from lerobot_deltaco.policies.geometry.calibration import ImageProjection
 
 
 def stacked_images(images):

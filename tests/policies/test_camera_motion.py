@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_deltaco.policies.deltaco_match.camera_motion import CameraMotion, estimate_motion
 from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
+from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion, estimate_motion
 
 
 @pytest.mark.parametrize("case", ["toy", "gym-24-100"])

@@ -8,16 +8,15 @@ from small_policies import random_moves
 from lerobot_deltaco.policies.base.augmentation import change_colors, random_color_changes
 from lerobot_deltaco.policies.base.configuration import has_bfloat16
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
-from lerobot_deltaco.policies.deltaco_match import fit, localization
-from lerobot_deltaco.policies.deltaco_match import matching as matching_module
+from lerobot_deltaco.policies.deltaco_match import fit
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder, cut_crops
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching, fit_matching_head
 from lerobot_deltaco.policies.deltaco_match.localization import (
     Candidates,
     FeatureMatching,
     GraspHeightEstimator,
 )
-from lerobot_deltaco.policies.deltaco_match.matching import FEATURE_DIM, cut_crops
 from lerobot_deltaco.policies.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
 from lerobot_deltaco.policies.deltaco_match.proposals import N_OBJECTS, Background, fit_perspective, peaks
 from lerobot_deltaco.policies.deltaco_match.words import encode_words, understand, vocabulary_of
@@ -50,7 +49,7 @@ def test_height_of_a_demonstration_counts_as_far_as_it_can_be_trusted():
     assert change < 0.5 * (demonstrated - by_appearance)[~is_same].abs().mean()
 
 
-def test_hue_augmentation_changes_a_fraction_of_the_samples_and_leaves_gray_gray():
+def test_color_jitter_changes_a_fraction_of_the_samples_and_leaves_gray_gray():
     changes = random_color_changes(400, 0.7, torch.Generator().manual_seed(0))
     same = (changes == torch.eye(3)).all(dim=(1, 2))
     assert 0.2 < same.float().mean() < 0.4
@@ -154,16 +153,16 @@ def matching(shapes, request):
 @pytest.fixture(scope="module", autouse=True)
 def encode_once():
     """Encodes the same crops once."""
-    features = {}
+    features, encode = {}, CropEncoder.__call__
 
-    def crop_features(*crops):
+    def encode_once(self, *crops):
         key = tuple(part.numpy().tobytes() for part in crops)
         if key not in features:
-            features[key] = matching_module.crop_features(*crops)
+            features[key] = encode(self, *crops)
         return features[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(localization, "crop_features", crop_features)
+        patch.setattr(CropEncoder, "__call__", encode_once)
         yield
 
 
@@ -261,7 +260,7 @@ def test_words_that_describe_the_container_do_not_count():
     task = torch.arange(n_scenes) % 4
     target = torch.randint(2, (n_scenes,), generator=generator)
     color = torch.where(torch.arange(2) == target[:, None], task[:, None] // 2, 1 - task[:, None] // 2)
-    features = torch.randn(n_scenes, 3, FEATURE_DIM, generator=generator)
+    features = torch.randn(n_scenes, 3, matching.encoder.feature_dim, generator=generator)
     features[:, :2, :100] += 4.0 * color[..., None]
     features[:, 2, 100:200] += 4.0
     matching.requires_grad_(True)
@@ -326,25 +325,6 @@ def test_objects_of_any_size_stand_out_whether_they_were_grasped_or_not(side):
     # A training scene is not compared with itself.
     distances = (background(images[:24], torch.arange(24))[:, :, None] - locations[:24, None, :2]).norm(dim=3)
     assert (distances.amin(dim=1) < 0.6 * side / 96).float().mean() > 0.85
-
-
-def test_a_checkpoint_of_an_earlier_fit_keeps_its_proposals_and_crops():
-    matching = FeatureMatching(["cup"], 0.2)
-    matching.perspective.copy_(torch.tensor([0.0, 0.5]))
-    earlier = {
-        name: value
-        for name, value in matching.state_dict().items()
-        if not name.startswith(("background.", "compare.feature_weight", "compare.objectness"))
-        and name not in ("uses_background", "sharpness", "error_rate", "held_out")
-    }
-    loaded = FeatureMatching(["cup"], 0.2)
-    loaded.load_state_dict(earlier)
-    assert not loaded.uses_background
-    sizes = loaded.crop_sizes(torch.tensor([[0.0, 0.0], [0.0, 1.0]]))
-    torch.testing.assert_close(sizes, 0.2 * torch.tensor([0.0, 0.5]).exp())
-    del earlier["compare.hidden.weight"]
-    with pytest.raises(RuntimeError, match=r"compare\.hidden\.weight"):
-        FeatureMatching(["cup"], 0.2).load_state_dict(earlier)
 
 
 def test_crops_are_centered_and_see_the_native_resolution():

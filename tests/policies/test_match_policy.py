@@ -116,7 +116,9 @@ def test_episode_without_a_grasp_teaches_nothing(make, table):
         policy.zero_grad()
         loss, _ = policy(batch, reduction="none")
         loss[0].backward()
-        return loss.tolist(), [weight.grad for weight in policy.model.parameters() if weight.grad is not None]
+        return loss.tolist(), [
+            weight.grad for weight in policy.policy_network.parameters() if weight.grad is not None
+        ]
 
     known, gradients = losses()
     assert any(gradient.any() for gradient in gradients)
@@ -206,11 +208,11 @@ def test_validation_loss_of_held_out_episodes_is_that_at_their_recorded_location
 def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
     policy = make()
     policy.save_pretrained(tmp_path)
-    before = copy.deepcopy(policy.feature_matching.state_dict())
+    before = copy.deepcopy(policy.matching.state_dict())
     resumed = DeltacoMatchPolicy.from_pretrained(tmp_path, dataset_meta=table.meta).train()
     resumed.config.seed = 5
     resumed(batch_of(table, [0]))
-    after = resumed.feature_matching.state_dict()
+    after = resumed.matching.state_dict()
     assert all(torch.equal(before[name], value) for name, value in after.items())
     assert resumed.config.known_words == ["blue", "left", "move", "object", "red", "right", "the"]
 

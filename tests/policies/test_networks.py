@@ -56,17 +56,17 @@ def test_mode_is_the_mean_of_the_likeliest_component():
     assert ActionDistribution(means, logits).mode.tolist() == [[[2.0]], [[3.0]]]
 
 
-def test_nearly_equal_components_take_turns_as_often_as_they_are_likely():
+def test_nearly_equal_components_are_cycled_through_as_often_as_they_are_likely():
     means = torch.arange(4.0)[None, :, None, None].repeat(2, 1, 1, 1)
     logits = torch.tensor([[0.3, 0.0, 0.5, 0.2], [0.1, 0.7, 0.0, 0.2]]).log()
     predicted = ActionDistribution(means, logits)
-    turns = torch.stack([predicted.likely_mean(turn)[:, 0, 0] for turn in range(400)])
-    assert turns[0].tolist() == [2.0, 1.0]
-    assert set(turns[:, 1].tolist()) == {1.0}
-    assert set(turns[:, 0].tolist()) == {0.0, 2.0}
-    assert abs((turns[:, 0] == 0).float().mean() - 0.3 / 0.8) < 0.02
+    means = torch.stack([predicted.likely_mean(index)[:, 0, 0] for index in range(400)])
+    assert means[0].tolist() == [2.0, 1.0]
+    assert set(means[:, 1].tolist()) == {1.0}
+    assert set(means[:, 0].tolist()) == {0.0, 2.0}
+    assert abs((means[:, 0] == 0).float().mean() - 0.3 / 0.8) < 0.02
     # None waits long.
-    assert all(len(set(some.tolist())) == 2 for some in turns[:, 0].split(5))
+    assert all(len(set(some.tolist())) == 2 for some in means[:, 0].split(5))
 
 
 def test_join_action_reverts_split_action():

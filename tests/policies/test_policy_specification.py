@@ -229,7 +229,7 @@ def test_loss_matches_the_papers_formulas(dataset, method):
     if policy.config.uses_demonstrations:
         frames = policy.training_data.demonstrations.frames[rows].numpy() / 255
         demo = reference.encoder(weights_of(policy, "demo_encoder."), frames, 1, stride.demo_stride)
-    model = weights_of(policy, "model.")
+    model = weights_of(policy, "policy_network.")
     imitation = functools.partial(
         reference.imitation_loss,
         raw_log_std=model["raw_log_std"][0, 0],

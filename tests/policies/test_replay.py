@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lerobot_deltaco.data.grasps import Grasp
-from lerobot_deltaco.policies.deltaco_match.replay import Trajectory, TrajectoryReplay
+from lerobot_deltaco.policies.geometry.replay import Trajectory, TrajectoryReplay
 
 N_DIMS, GRIPPER = 3, 3
 

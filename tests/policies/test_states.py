@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from gym_deltaco.robot.kinematics import forward, inverse
-from lerobot_deltaco.data.grasps import Keyframes
-from lerobot_deltaco.policies.deltaco_match.states import StateRegressor
+from lerobot_deltaco.data.grasps import GraspStates
+from lerobot_deltaco.policies.geometry.states import StateRegressor
 
 
 class ExactLocations(torch.nn.Module):
-    """Inverts how `grasps` makes states from locations."""
+    """Inverts how `random_grasps` makes states from locations."""
 
     def fit(self, *_): ...
 
@@ -21,8 +21,8 @@ class ExactLocations(torch.nn.Module):
         return torch.stack([x, (y - z * 0.2 / 3) / (5 - x * 0.2 / 3)], dim=-1)
 
 
-def grasps(heights):
-    """Keyframes whose states are of a location, a height and the gripper's width; and the locations."""
+def random_grasps(heights):
+    """Grasps at states of a location, a height and the gripper's width; and the locations."""
     generator = torch.Generator().manual_seed(0)
     locations = torch.rand(200, 2, 2, generator=generator) * 1.6 - 0.8
     x, y = locations.unbind(dim=2)
@@ -31,58 +31,58 @@ def grasps(heights):
     states = torch.stack([2 + x, 5 * y + 0.2 * height, 3 * height + x * y, width], dim=2)
     approach = states[:, 0] - torch.tensor([0, 0.2, 3, 0])
     has_grasp = torch.arange(200) % 10 > 0
-    return Keyframes(
+    return GraspStates(
         states, approach, torch.zeros(200, dtype=torch.long), has_grasp, (None,) * 200
     ), locations
 
 
-def fitted_states(keyframes):
-    robot_states = StateRegressor(4)
-    robot_states.to_image = ExactLocations()
+def fitted_states(grasps):
+    regressor = StateRegressor(4)
+    regressor.to_image = ExactLocations()
     images = torch.zeros(200, 3, 2, 2, dtype=torch.uint8)
     scale, shift = torch.tensor([0.5, 2, 0.1, 1]), torch.tensor([1.0, 0, -1, 0])
     is_arm = torch.tensor([True, True, True, False])
     return (
-        robot_states,
-        robot_states.fit(keyframes, images, images, images, scale, shift, is_arm),
+        regressor,
+        regressor.fit(grasps, images, images, images, scale, shift, is_arm),
         (scale, shift),
     )
 
 
 def test_how_far_the_gripper_is_open_says_nothing_about_locations():
     generator = torch.Generator().manual_seed(0)
-    keyframes, _ = grasps(torch.zeros(200))
+    grasps, _ = random_grasps(torch.zeros(200))
     images = torch.randint(256, (3, 200, 3, 8, 8), generator=generator).to(torch.uint8)
-    robot_states = StateRegressor(4)
-    robot_states.fit(keyframes, *images, torch.ones(4), torch.zeros(4), torch.arange(4) < 3)
-    states = keyframes.states[:, 0]
+    regressor = StateRegressor(4)
+    regressor.fit(grasps, *images, torch.ones(4), torch.zeros(4), torch.arange(4) < 3)
+    states = grasps.states[:, 0]
     other = states + torch.tensor([0.0, 0, 0, 5])
-    assert torch.equal(robot_states.to_image(other), robot_states.to_image(states))
+    assert torch.equal(regressor.to_image(other), regressor.to_image(states))
 
 
 def test_heights_are_what_locations_do_not_tell_of_states():
     heights = torch.randn(200, generator=torch.Generator().manual_seed(1))
-    keyframes, locations = grasps(heights)
-    robot_states, known, (scale, shift) = fitted_states(keyframes)
-    found = keyframes.has_grasp
+    grasps, locations = random_grasps(heights)
+    regressor, known, (scale, shift) = fitted_states(grasps)
+    found = grasps.has_grasp
     torch.testing.assert_close(known.locations[found, 0], locations[found, 0], atol=0.1, rtol=0)
     assert not known.locations[~found].any()
     assert torch.corrcoef(torch.stack([known.heights[found], heights[found]]))[0, 1] > 0.98
     assert known.heights[found].std() == pytest.approx(1, abs=0.05)
     # Locations and heights give the states; without the heights, that of the grasp is not known.
-    true = keyframes.states * scale + shift
-    predicted = robot_states(known.locations, known.heights)
+    true = grasps.states * scale + shift
+    predicted = regressor(known.locations, known.heights)
     torch.testing.assert_close(predicted[found, 0, :3], true[found, 0, :3], atol=0.1, rtol=0)
-    error = (robot_states(known.locations, torch.zeros(200)) - predicted)[found, 0].abs().mean(dim=0)
+    error = (regressor(known.locations, torch.zeros(200)) - predicted)[found, 0].abs().mean(dim=0)
     assert error[2] > 0.1
     assert error[0] < 0.02
-    assert robot_states.heights(torch.full((1, 4), torch.nan)).isnan().all()
+    assert regressor.heights(torch.full((1, 4), torch.nan)).isnan().all()
     # All heights are zero if all grasps have the same.
-    keyframes, locations = grasps(torch.zeros(200))
-    flat = keyframes.states.clone()
+    grasps, locations = random_grasps(torch.zeros(200))
+    flat = grasps.states.clone()
     flat[..., 1], flat[..., 2], flat[..., 3] = 5 * locations[..., 1], 0, 1
-    robot_states, known, _ = fitted_states(keyframes._replace(states=flat))
-    assert not robot_states.height_to_state.any()
+    regressor, known, _ = fitted_states(grasps._replace(states=flat))
+    assert not regressor.height_to_state.any()
     assert not known.heights.any()
 
 
@@ -103,7 +103,7 @@ class Recording(NamedTuple):
     """Episodes with objects of 10 heights: first, carried and last images, and the robot's states."""
 
     images: tuple[torch.Tensor, ...]
-    keyframes: Keyframes
+    grasps: GraspStates
     positions: np.ndarray  # at the grasps, (episodes, 3)
 
 
@@ -139,7 +139,7 @@ def record(n_episodes, seed, joints=False, accidents=0):
     pick_states = states(grasps)
     both = torch.from_numpy(np.stack([pick_states, states(releases)], axis=1)).float()
     positions = np.stack([forward(state[:6])[0] for state in pick_states]) if joints else grasps
-    keyframes = Keyframes(
+    grasps = GraspStates(
         both,
         torch.from_numpy(states(approach)).float(),
         torch.zeros(n_episodes, dtype=torch.long),
@@ -147,23 +147,23 @@ def record(n_episodes, seed, joints=False, accidents=0):
         (None,) * n_episodes,
     )
     stacks = (torch.from_numpy(np.stack(image)).permute(0, 3, 1, 2).contiguous() for image in images)
-    return Recording(tuple(stacks), keyframes, positions)
+    return Recording(tuple(stacks), grasps, positions)
 
 
 def fit_to(recording, tasks=None):
     """Fits a state regressor; returns it, and the scale and shift of states."""
-    states = recording.keyframes.states
+    states = recording.grasps.states
     scale = 1 / states.flatten(0, 1).std(dim=0)
     shift = -states.flatten(0, 1).mean(dim=0) * scale
     regressor = StateRegressor(states.shape[2])
     is_arm = torch.arange(states.shape[2]) < states.shape[2] - 1
-    regressor.fit(recording.keyframes, *recording.images, scale, shift, is_arm, tasks)
+    regressor.fit(recording.grasps, *recording.images, scale, shift, is_arm, tasks)
     return regressor, scale, shift
 
 
 def errors_at_the_pick(regressor, scale, shift, recording, joints=False):
     """Errors of the state at the pick, from the location and the height, (episodes, 3) in mm."""
-    located = regressor.locate(recording.keyframes)
+    located = regressor.locate(recording.grasps)
     states = ((regressor(located.locations, located.heights) - shift) / scale)[:, 0].numpy()
     predicted = np.stack([forward(state[:6])[0] for state in states]) if joints else states[:, :3]
     return 1000 * np.abs(predicted - recording.positions)
@@ -189,10 +189,10 @@ def test_location_and_height_give_the_state_at_the_pick(joints, n_episodes, acci
 def test_heights_are_larger_along_the_approach():
     recording = record(60, 0)
     regressor, scale, shift = fit_to(recording)
-    heights = regressor.heights(recording.keyframes.states[:, 0])
+    heights = regressor.heights(recording.grasps.states[:, 0])
     assert np.corrcoef(heights, recording.positions[:, 2])[0, 1] < -0.85
     # An unknown height moves the object's middle, half as high as the grasp, along the camera's ray.
-    located = regressor.locate(recording.keyframes)
+    located = regressor.locate(recording.grasps)
     moved = (regressor(located.locations, heights + 1) - regressor(located.locations, heights)) / scale
     middle = recording.positions * [1, 1, 0.5] - [0, 0, 0.17]
     ray = (middle - EYE) * [1, 1, 2]
@@ -201,34 +201,20 @@ def test_heights_are_larger_along_the_approach():
     assert np.median(cosines) > 0.99
 
 
-def test_a_location_outside_of_the_training_scenes_is_uncertain():
-    recording = record(60, 0)
-    regressor, *_ = fit_to(recording)
-    inside = regressor.uncertainty(regressor.locate(recording.keyframes).locations)
-    assert inside.median() < 0.5
-    assert (regressor.uncertainty(torch.tensor([[[0.95, 0.95]] * 2, [[-0.95, -0.95]] * 2])) > 1).all()
-    # A checkpoint that lacks it does not know.
-    state_dict = regressor.state_dict()
-    del state_dict["location_covariance"]
-    other = StateRegressor(7)
-    other.load_state_dict(state_dict)
-    assert other.uncertainty(torch.zeros(2, 2)).isnan().all()
-
-
 def test_the_object_of_a_task_is_as_high_wherever_it_stands():
     def objects(recording):
         return np.round((recording.positions[:, 2] + 0.34) / 0.08 * 9).astype(int)
 
     def spread(regressor, recording):
-        heights, known = regressor.heights(recording.keyframes.states[:, 0]).numpy(), objects(recording)
+        heights, known = regressor.heights(recording.grasps.states[:, 0]).numpy(), objects(recording)
         return np.mean([heights[known == n].std() for n in range(10)])
 
     # In the training, tall objects stand far away.
     every, new = record(240, 3), record(100, 4)
     rows = np.flatnonzero(np.abs((every.positions[:, 0] - 0.45) / 0.3 - objects(every) / 9) < 0.35)
-    kept = [part if isinstance(part, tuple) else part[rows] for part in every.keyframes]
-    keyframes = Keyframes(*kept)._replace(missing=(None,) * len(rows))
-    training = Recording(tuple(i[rows] for i in every.images), keyframes, every.positions[rows])
+    kept = [part if isinstance(part, tuple) else part[rows] for part in every.grasps]
+    grasps = GraspStates(*kept)._replace(missing=(None,) * len(rows))
+    training = Recording(tuple(i[rows] for i in every.images), grasps, every.positions[rows])
     alike, plain = fit_to(training, [str(n) for n in objects(training)]), fit_to(training)
     assert spread(alike[0], new) < 0.8 * spread(plain[0], new)
     assert (np.median(errors_at_the_pick(*alike, new), axis=0) < 4).all()

@@ -214,7 +214,7 @@ def test_the_ladder_counts_failures_if_they_were_recorded():
 
 
 def test_calibration_counts_grasps_by_the_policys_probability():
-    columns = {"p_pick": [0.6] * 4 + [0.99] * 8, "grasped_object": [0] * 11 + [-1]}
+    columns = {"pick_confidence": [0.6] * 4 + [0.99] * 8, "grasped_object": [0] * 11 + [-1]}
     record = make_record(succeeds=lambda task_id, trial: trial == 0, columns=columns)
     table = make_table(collect_results([record]), report.calibration_rows)
     assert table["sure"].tolist() == ["50 to 70 %", "97 to 100 %"]

@@ -203,8 +203,8 @@ def test_pauses_and_frames_long_after_the_release_are_left_out(train, spy, monke
 
 def test_frames_after_the_release_are_as_many_seconds_at_any_rate():
     # Closed from 20 to 40, and open again from 50 on.
-    course = np.interp(np.arange(100), [0, 10, 20, 40, 50, 60], [1, 1, 0, 0, 1, 1])
-    actions = torch.from_numpy(np.stack([course, course], axis=1))
+    trajectory = np.interp(np.arange(100), [0, 10, 20, 40, 50, 60], [1, 1, 0, 0, 1, 1])
+    actions = torch.from_numpy(np.stack([trajectory, trajectory], axis=1))
     policy = SimpleNamespace(frames_after_release=12, gripper_command=Gripper(0))
     last = []
     for fps in (24, 48):

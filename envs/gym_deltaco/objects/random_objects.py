@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from gym_deltaco.objects.labels import RANDOM_SEED, random_label
-from gym_deltaco.objects.objects import ObjectModel, Recipe, build_model
+from gym_deltaco.objects.objects import ObjectModel, ObjectRecipe, build_model
 from gym_deltaco.objects.random_forms import FAMILIES, Form, ring_height
 from gym_deltaco.objects.solids import Color, Loft, Paint, Row
 from gym_deltaco.sim.workspace import CAMERA
@@ -46,13 +46,13 @@ def _width(row: Row) -> float:
     return float(radius[0]) if isinstance(radius, tuple) else float(radius)
 
 
-def _recipe(form: Form, color: str, rng: np.random.Generator) -> Recipe:
+def _recipe(form: Form, color: str, rng: np.random.Generator) -> ObjectRecipe:
     grasp = form.height - rng.uniform(16, 30)
     grasp = float(np.clip(grasp, max(_MIN_GRASP, form.band[0] + 4), max(_MIN_GRASP, form.band[1] - 5)))
     solids, parts = _painted(form, color, rng), _parts(form)
     for _, extra_parts in form.extras:
         parts += extra_parts
-    return Recipe(solids, parts, max(grasp, form.height - _PALM_DISTANCE), form.yaw)
+    return ObjectRecipe(solids, parts, max(grasp, form.height - _PALM_DISTANCE), form.yaw)
 
 
 # Collision parts

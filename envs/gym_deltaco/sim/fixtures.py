@@ -6,6 +6,7 @@ import functools
 
 import numpy as np
 
+from gym_deltaco.containers import ContainerColor
 from gym_deltaco.objects.solids import Color, Loft, Mesh, Row
 from gym_deltaco.sim.simulation import Box
 from gym_deltaco.sim.workspace import (
@@ -20,7 +21,6 @@ from gym_deltaco.sim.workspace import (
     TRAY_WALL_HEIGHT,
     TRAY_WALL_THICKNESS,
 )
-from gym_deltaco.tasks import ContainerColor
 
 _TABLE_COLOR: Color = (0.67, 0.62, 0.56)
 _TRAY_FLOOR_COLOR: Color = (0.60, 0.54, 0.47)

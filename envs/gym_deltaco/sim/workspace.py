@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_deltaco.containers import ContainerColor, ContainerWord
 from gym_deltaco.sim.camera import Camera, HandCamera
-from gym_deltaco.tasks import ContainerColor, ContainerWord
 
 TABLE_TOP = -0.375  # m
 TRAY_FLOOR = -0.37  # m

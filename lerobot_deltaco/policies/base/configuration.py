@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
@@ -76,6 +76,10 @@ class TaskConditionedConfig(PreTrainedConfig):
         scheduler_warmup_steps: Number of warmup steps of the cosine schedule.
         grad_clip_norm: Maximum norm of the gradient; 0 for no clipping.
     """
+
+    # Options that a policy keeps after its training, and those that only further training may change.
+    trained_options: ClassVar[tuple[str, ...]] = ("image_size", "chunk_size", "num_mixture_components")
+    dataset_options: ClassVar[tuple[str, ...]] = ("gripper", "gripper_closed", "demo_camera")
 
     paraphrases: str | None = None
     p_paraphrase: float = 1.0

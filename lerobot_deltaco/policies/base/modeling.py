@@ -48,13 +48,6 @@ logger = logging.getLogger(__name__)
 # Normalized actions are in -1..1; a policy may overshoot, but not by that much.
 _ABSURD_ACTION = 100.0
 
-# Options that a policy keeps after its training, and those that only further training may change.
-_TRAINED_OPTIONS = (
-    *("image_size", "chunk_size", "num_mixture_components", "language_encoder", "crop_size", "method"),
-    *("film", "concat", "demo_encoder", "demo_rows", "vision_encoder", "vision_image_size", "backbone"),
-)
-_DATASET_OPTIONS = ("gripper", "gripper_closed", "demo_camera")
-
 DemonstrationsOfTasks = Sequence[Sequence[Demonstration | ObjectPrompt]]
 
 
@@ -75,13 +68,13 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset_meta: Metadata of the training dataset; None in evaluation.
 
     Attributes:
-        model: Network that predicts actions.
+        policy_network: Network that predicts actions.
         instructions: Embeddings of instructions; None if the policy uses no sentence encoder.
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
         training_data: The training episodes; None before `prepare_training`.
     """
 
-    model: PolicyNetwork
+    policy_network: PolicyNetwork
     config_class: ClassVar[type] = TaskConditionedConfig
     name = "task_conditioned"
     takes_prompts: ClassVar[bool] = False  # in place of demonstrations
@@ -284,14 +277,14 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None, gripper_kind: str
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the imitation loss of each sample, (batch,), and its parts to log. See `imitation_loss`."""
-        log_std, is_pad = self.model.log_std, batch.get(f"{ACTION}_is_pad")
+        log_std, is_pad = self.policy_network.log_std, batch.get(f"{ACTION}_is_pad")
         return imitation_loss(
             predicted, gripper, log_std, batch[ACTION], is_pad, self.config.gripper_index, gripper_kind
         )
 
-    def _acting_network(self) -> PolicyNetwork:
-        """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
-        return self.model if self.training else fuse_batch_norms(self.model)
+    def _inference_network(self) -> PolicyNetwork:
+        """Returns the policy network; in evaluation mode, a copy that is faster for small batches."""
+        return self.policy_network if self.training else fuse_batch_norms(self.policy_network)
 
     def _sample_action(
         self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None
@@ -489,7 +482,7 @@ def _check_options(config: TaskConditionedConfig, saved: Mapping[str, Any], is_t
     Raises:
         ValueError: One is changed.
     """
-    for name in _TRAINED_OPTIONS if is_trained else (*_TRAINED_OPTIONS, *_DATASET_OPTIONS):
+    for name in config.trained_options if is_trained else config.trained_options + config.dataset_options:
         if name in saved and getattr(config, name) != saved[name]:
             raise UserError(
                 f"The checkpoint was trained with `{name}` {saved[name]!r}, and cannot be used with "

@@ -80,8 +80,9 @@ class ActionDistribution(NamedTuple):
     def likely_mean(self, index: int) -> Tensor:
         """Returns the mean of a likely component, (batch, steps, dims).
 
-        Components that are nearly as likely as the likeliest take turns, each as often as it is likely. Where
-        waiting is a little likelier than going on, a robot that always does the likeliest may wait forever.
+        Cycles through the components that are nearly as likely as the likeliest, each as often as it is
+        likely. Where waiting is a little likelier than going on, a robot that always does the likeliest may
+        wait forever.
 
         Args:
             index: Number of the action in the episode; at 0, it is the likeliest component's.
@@ -89,7 +90,7 @@ class ActionDistribution(NamedTuple):
         probabilities, components = self.logits.float().softmax(dim=1).sort(dim=1, descending=True)
         probabilities = torch.where(probabilities < _NEARLY * probabilities[:, :1], 0.0, probabilities)
         shares = probabilities.cumsum(dim=1) / probabilities.sum(dim=1, keepdim=True)
-        # Multiples of the golden ratio are spread evenly over 0..1: none waits long for its turn.
+        # Multiples of the golden ratio are spread evenly over 0..1: none waits long.
         chosen = (shares[:, :-1] <= index * _GOLDEN_RATIO % 1.0).sum(dim=1)
         rows = torch.arange(len(chosen), device=chosen.device)
         return self.means[rows, components[rows, chosen]]
@@ -287,7 +288,7 @@ class FullPrecisionLinear(nn.Linear):
             return super().forward(x.to(self.weight.dtype))
 
 
-class UnitHead(nn.Module):
+class NormalizedProjection(nn.Module):
     """Fully connected layers after a frozen encoder, whose output is scaled to unit length.
 
     Args:

@@ -4,7 +4,7 @@
 
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.optim.schedulers import LRSchedulerConfig
@@ -87,6 +87,12 @@ class DeltacoConfig(TaskConditionedConfig):
         drop_n_last_frames: Number of frames at the end of each episode that are left out of training.
         scheduler_name: Schedule of the learning rate: constant, or cosine, which decays to 0.
     """
+
+    trained_options: ClassVar[tuple[str, ...]] = (
+        *TaskConditionedConfig.trained_options,
+        *("method", "film", "concat", "language_encoder", "backbone"),
+        *("demo_encoder", "demo_rows", "vision_encoder", "vision_image_size"),
+    )
 
     method: str = "deltaco"
     film: str | None = None

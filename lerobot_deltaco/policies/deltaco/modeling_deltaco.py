@@ -30,8 +30,8 @@ from lerobot_deltaco.policies.base.losses import contrastive_logits, contrastive
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import (
     BACKBONES,
+    NormalizedProjection,
     PolicyNetwork,
-    UnitHead,
     initialize_as_authors,
     uniform_linear_layers,
 )
@@ -49,7 +49,7 @@ _ENCODER_LOSS_WEIGHT, _TEMPERATURE = 10.0, 0.1
 _AUTHORS_ENCODER_BOUND = 1e-4  # of the initial weights of the paper's demonstration encoder
 
 
-class Episode(NamedTuple):
+class RunningEpisode(NamedTuple):
     """The conditioning of the running episode, computed once."""
 
     instructions: tuple[str, ...]
@@ -82,11 +82,11 @@ class DeltacoPolicy(TaskConditionedPolicy):
             if dataset_meta is None:
                 raise UserError("A one-hot policy needs the tasks that it knows: set `one_hot_tasks`.")
             config.one_hot_tasks = list(dataset_meta.tasks.index)
-        self.model = _make_network(config)
+        self.policy_network = _make_network(config)
         self.demo_encoder = _make_demo_encoder(config)
         self.language_head = _make_language_head(config)
         if config.backbone == "paper":
-            initialize_as_authors(self.model)
+            initialize_as_authors(self.policy_network)
             if isinstance(self.demo_encoder, FrameGridEncoder):
                 uniform_linear_layers(self.demo_encoder, _AUTHORS_ENCODER_BOUND)
 
@@ -165,7 +165,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         self, batch: dict[str, Any], images: Tensor, film: Tensor | None, concat: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the imitation loss L_pi (equation 2) of each sample, (batch,), and its parts to log."""
-        predicted, gripper = self.model(images, film, self._fuse_inputs(batch, concat))
+        predicted, gripper = self.policy_network(images, film, self._fuse_inputs(batch, concat))
         return self._imitation_loss(batch, predicted, gripper, self.config.gripper_loss)
 
     # Acting
@@ -176,7 +176,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         images = self._images(batch)
         if self._begins_episode(batch):
             self._start(self._begin_episode(*self._tasks_of(batch), images.device))
-        episode: Episode = self._episode
+        episode: RunningEpisode = self._episode
         concat = self._fuse_inputs(batch, episode.concat)
         return self._sample_action(batch, *episode.network(images, episode.film, concat))
 
@@ -185,7 +185,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         instructions: tuple[str, ...],
         demonstrations: DemonstrationsOfTasks | None,
         device: torch.device,
-    ) -> Episode:
+    ) -> RunningEpisode:
         """Encodes the instructions and demonstrations of an episode."""
         config = self.config
         demo: Tensor | None = None
@@ -210,7 +210,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
             film = torch.where(torch.tensor(by_language, device=device)[:, None], language, demo)
         else:
             film, concat = self._conditioning_inputs(instructions, demo, language, device)
-        return Episode(instructions, film, concat, self._acting_network())
+        return RunningEpisode(instructions, film, concat, self._inference_network())
 
     def _check_given(self, instructions: Sequence[str], demonstrations: DemonstrationsOfTasks | None) -> None:
         """Checks that no input of the method is left out; MCIL needs only one of the two."""
@@ -354,25 +354,29 @@ def _make_network(config: DeltacoConfig) -> PolicyNetwork:
     )
 
 
-def _make_demo_encoder(config: DeltacoConfig) -> FrameGridEncoder | AttentionEncoder | UnitHead | None:
+def _make_demo_encoder(
+    config: DeltacoConfig,
+) -> FrameGridEncoder | AttentionEncoder | NormalizedProjection | None:
     if not config.uses_demonstrations:
         return None
     if config.demo_encoder == "pretrained":
-        return UnitHead(VISION_ENCODERS[config.vision_encoder].feature_dim, config.demo_head, config.demo_dim)
+        return NormalizedProjection(
+            VISION_ENCODERS[config.vision_encoder].feature_dim, config.demo_head, config.demo_dim
+        )
     if config.demo_encoder == "attention":
         return AttentionEncoder(config.n_demo_frames, config.embedding_dim)
     size, stride = config.image_size, BACKBONES[config.backbone].demo_stride
     return FrameGridEncoder(size, size, config.demo_rows, DEMO_COLUMNS, config.embedding_dim, stride)
 
 
-def _make_language_head(config: DeltacoConfig) -> UnitHead | None:
+def _make_language_head(config: DeltacoConfig) -> NormalizedProjection | None:
     """Makes the layers after the language encoder; in MCIL, they map both inputs into one space."""
     hidden_dims = config.language_head
     if config.method == "mcil" and hidden_dims is None:
         hidden_dims = [config.embedding_dim]
     if hidden_dims is None or not config.uses_language:
         return None
-    return UnitHead(config.embedding_dim, hidden_dims, config.embedding_dim)
+    return NormalizedProjection(config.embedding_dim, hidden_dims, config.embedding_dim)
 
 
 def one_hot(tasks: Sequence[str], known: Sequence[str], device: torch.device) -> Tensor:

@@ -3,7 +3,7 @@
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -50,6 +50,8 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             that `deltaco train` trains on, at 24 frames per second and proportionally at others; None for
             all.
     """
+
+    trained_options: ClassVar[tuple[str, ...]] = (*TaskConditionedConfig.trained_options, "crop_size")
 
     chunk_size: int | None = None
     acting: str | None = None

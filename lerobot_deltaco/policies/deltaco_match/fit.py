@@ -17,7 +17,7 @@ from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.augmentation import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
-from lerobot_deltaco.policies.deltaco_match.matching import Crops, MatchingHead, crop_features, word_scores
+from lerobot_deltaco.policies.deltaco_match.matching import Crops, MatchingHead, word_scores
 from lerobot_deltaco.policies.deltaco_match.proposals import (
     MAX_REMEMBERED,
     fit_perspective,
@@ -202,7 +202,7 @@ def _crops_of_proposals(
     little off, and of every second variant from the third on, of other colors, as of new objects.
 
     Returns:
-        (variants, scenes, n, FEATURE_DIM), (scenes,) and (scenes,).
+        (variants, scenes, n, features), (scenes,) and (scenes,).
     """
     settings = matching.settings
     n_variants = min(max(settings.variant_scenes // len(drawn), 1), settings.max_variants)
@@ -228,7 +228,7 @@ def _crops_of_proposals(
                         change = changes[n].expand(len(images), 3, 3)
                         images = change_colors(images.float() / 255, change)
                     with autocast:
-                        variants.append(crop_features(images, at, sizes).half())
+                        variants.append(matching.features(images, at, sizes).half())
                 features.append(torch.stack(variants))
                 targets.append(nearest[near])
                 kept.append(some[near.cpu()])
@@ -263,7 +263,7 @@ def fit_matching_head(
 
     Args:
         matching: What is fitted.
-        features: Features of the crops of the proposals, (variants, scenes, n, FEATURE_DIM); they are
+        features: Features of the crops of the proposals, (variants, scenes, n, features); they are
             overwritten. Every second variant from the third on has other colors.
         target: The proposal that was grasped in each scene, (scenes,).
         heights: Height offsets of the grasps, (scenes,).
@@ -421,7 +421,7 @@ class HeldOut:
 
     Args:
         matching: What is fitted.
-        features: Normalized features of the proposals of all scenes, (scenes, n, FEATURE_DIM).
+        features: Normalized features of the proposals of all scenes, (scenes, n, features).
         target: The right proposals, (scenes,).
         tasks: Task of each scene.
         encoded: Words of all sentences.

@@ -24,21 +24,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
-from lerobot_deltaco.policies.deltaco_match.camera_motion import CameraMotion
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
-from lerobot_deltaco.policies.deltaco_match.matching import (
-    HIDDEN_DIM,
-    Crops,
-    MatchingHead,
-    crop_features,
-    word_scores,
-)
+from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder
+from lerobot_deltaco.policies.deltaco_match.matching import HIDDEN_DIM, Crops, MatchingHead, word_scores
 from lerobot_deltaco.policies.deltaco_match.proposals import Background, ProposalNetwork, nearest_proposals
 from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner
 from lerobot_deltaco.policies.deltaco_match.words import (
@@ -48,23 +42,13 @@ from lerobot_deltaco.policies.deltaco_match.words import (
     understand,
     words_of,
 )
+from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
 
 logger = logging.getLogger(__name__)
 
 _MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
 # Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
 _APPEARANCE_STD = 0.7
-# What checkpoints of earlier fits do not have: they keep their proposals, crops and probabilities.
-_ADDED_STATE = (
-    "background.",
-    "compare.feature_weight",
-    "compare.objectness.",
-    "uses_background",
-    "sharpness",
-    "error_rate",
-    "held_out",
-    "refine.",
-)
 
 
 class Candidates(NamedTuple):
@@ -108,6 +92,7 @@ class FeatureMatching(nn.Module):
         settings: Constants of the method; by default, those of `MatchingSettings`.
 
     Attributes:
+        encoder: Describes crops of images.
         perspective: How the log of the apparent size of objects changes along x and y in the image, (2,).
         fitted: Whether it has been fitted, () bool.
         uses_background: Whether proposals are what stands out from the background, and crops as large as
@@ -133,7 +118,8 @@ class FeatureMatching(nn.Module):
         self.propose = ProposalNetwork()
         self.background = Background()
         self.refine = GraspRefiner()
-        self.compare = MatchingHead(len(vocabulary))
+        self.encoder = CropEncoder()
+        self.compare = MatchingHead(len(vocabulary), self.encoder.feature_dim, self.encoder.color_dim)
         self.word_weights = WordWeights(len(vocabulary))
         self.grasp_height = GraspHeightEstimator(HIDDEN_DIM)
         self.register_buffer("perspective", torch.zeros(2))
@@ -144,13 +130,6 @@ class FeatureMatching(nn.Module):
         self.register_buffer("held_out", torch.zeros(2, dtype=torch.int64))
         self.requires_grad_(False)
         self.eval()
-        self.register_load_state_dict_pre_hook(self._add_state)
-
-    @staticmethod
-    def _add_state(module: FeatureMatching, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
-        for name, value in module.state_dict().items():
-            if name.startswith(_ADDED_STATE):
-                state_dict.setdefault(prefix + name, value)
 
     def train(self, mode: bool = True) -> FeatureMatching:
         """Stays in evaluation mode."""
@@ -304,9 +283,15 @@ class FeatureMatching(nn.Module):
             if meant is not None and weight > self.settings.shown_word_weight
         ]
 
-    def features(self, full_resolution: Tensor, locations: Tensor) -> Tensor:
-        """Returns features of the crops at locations (batch, n, 2), (batch, n, FEATURE_DIM)."""
-        return crop_features(full_resolution, locations, self.crop_sizes(locations))
+    def features(self, images: Tensor, locations: Tensor, sizes: Tensor | None = None) -> Tensor:
+        """Returns features of crops, (batch, n, features).
+
+        Args:
+            images: Images at full resolution, (batch, 3, H, W), uint8 or in 0..1.
+            locations: Centers of the crops, (batch, n, 2) in -1..1.
+            sizes: Sides of the crops as fractions of the image's, (batch, n); by default, `crop_sizes`.
+        """
+        return self.encoder(images, locations, self.crop_sizes(locations) if sizes is None else sizes)
 
     def crop_sizes(self, locations: Tensor) -> Tensor:
         """Returns the sides of crops at locations (..., 2), as fractions of the image's, (...)."""

@@ -1,94 +1,22 @@
-"""Crops around proposals, and the network that compares them: descriptors, and log probabilities of words.
-
-A network that learns from a few hundred objects compares them by color. The features of a network that was
-trained on photographs tell shapes apart, too, if the object fills its view; but colors less exactly.
-"""
+"""The network that compares crops around proposals: descriptors, and log probabilities of words."""
 
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.policies.base.image_encoder import (
-    HEAD_CHANNELS,
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    EfficientNetLite0,
-)
 from lerobot_deltaco.policies.deltaco_match.words import UNKNOWN_WORD
 
-_RESOLUTION = 128  # px, of crops as the encoder sees them
-# Maps that describe a crop: at stride 16, as 4 x 4 cells, and at stride 32, as their mean.
-_FINE_CHANNELS, _FINE_CELLS, _COARSE_CHANNELS = 112, 4, 320
-_COLOR_CELLS = 8  # of a row and of a column, whose mean colors are features
-COLOR_DIM = 3 * _COLOR_CELLS**2
-FEATURE_DIM = _FINE_CHANNELS * _FINE_CELLS**2 + _COARSE_CHANNELS + HEAD_CHANNELS + COLOR_DIM
 HIDDEN_DIM = 256
 _DESCRIPTOR_DIM = 64
 _MIN_STD, _MAX_FEATURE, _MIN_PROBABILITY = 1e-3, 6.0, 1e-9
 _COLOR_WEIGHT = 2.0  # of colors among the features
 _INITIAL_SCALE = 10.0  # of cosines, as logits
 _INITIAL_GATE = (8.0, -5.0)  # slope and offset of the logit that a proposal matches, by its cosine
-
-
-def crop_features(images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
-    """Returns features of crops, (batch, n, FEATURE_DIM), the colors last.
-
-    Args:
-        images: Images (batch, 3, H, W), uint8 or in 0..1, at their own resolution.
-        locations: Centers of the crops, (batch, n, 2) in -1..1.
-        sizes: Sides of the crops as fractions of the image's, (batch, n).
-
-    Raises:
-        PretrainedWeightsError: The encoder's weights are missing.
-    """
-    crops = cut_crops(images, locations, sizes).flatten(0, 1)
-    mean, std = (
-        torch.tensor(values, device=crops.device)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD)
-    )
-    fine, coarse, last = _encoder(crops.device)((crops - mean) / std)
-    parts = [
-        F.adaptive_avg_pool2d(fine, _FINE_CELLS).flatten(1),
-        coarse.mean(dim=(2, 3)),
-        last.mean(dim=(2, 3)),
-        F.adaptive_avg_pool2d(crops, _COLOR_CELLS).flatten(1),
-    ]
-    return torch.cat([part.float() for part in parts], dim=1).unflatten(0, locations.shape[:2])
-
-
-def cut_crops(images: Tensor, locations: Tensor, sizes: Tensor, resolution: int = _RESOLUTION) -> Tensor:
-    """Returns square crops of images, enlarged; beyond an image's edge, its last pixels are repeated.
-
-    Args:
-        images: Images (batch, 3, H, W), uint8 or in 0..1.
-        locations: Centers of the crops, (batch, n, 2) in -1..1.
-        sizes: Sides of the crops as fractions of the image's, (batch, n).
-        resolution: Side of the result, px.
-
-    Returns:
-        (batch, n, 3, resolution, resolution) in 0..1.
-    """
-    if images.dtype == torch.uint8:
-        images = images.float() / 255
-    steps = (torch.arange(resolution, device=images.device) + 0.5) * 2 / resolution - 1
-    y, x = torch.meshgrid(steps, steps, indexing="ij")
-    grid = sizes[..., None, None, None] * torch.stack([x, y], dim=-1)  # (batch, n, r, r, 2)
-    grid = grid + locations[:, :, None, None]
-    # All crops of an image at once, below one another.
-    crops = F.grid_sample(
-        images, grid.flatten(1, 2), mode="bicubic", padding_mode="border", align_corners=False
-    )
-    return crops.clamp(0, 1).unflatten(2, (-1, resolution)).transpose(1, 2)
-
-
-@cache
-def _encoder(device: torch.device) -> EfficientNetLite0:
-    return EfficientNetLite0().to(device)
 
 
 class Crops(NamedTuple):
@@ -117,6 +45,8 @@ class MatchingHead(nn.Module):
 
     Args:
         n_words: Size of the vocabulary.
+        feature_dim: Number of features of a crop.
+        color_dim: Number of those that are colors, the last ones.
 
     Attributes:
         feature_weight: Weight of the features' own cosine beside that of the learned descriptors, 0..1, ().
@@ -126,13 +56,14 @@ class MatchingHead(nn.Module):
     std: Tensor
     feature_weight: Tensor
 
-    def __init__(self, n_words: int) -> None:
+    def __init__(self, n_words: int, feature_dim: int, color_dim: int) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(FEATURE_DIM))
-        self.register_buffer("std", torch.ones(FEATURE_DIM))
+        self.color_dim = color_dim
+        self.register_buffer("mean", torch.zeros(feature_dim))
+        self.register_buffer("std", torch.ones(feature_dim))
         self.register_buffer("feature_weight", torch.zeros(()))
-        self.hidden = nn.Linear(FEATURE_DIM, HIDDEN_DIM)
-        self.linear = nn.Linear(FEATURE_DIM, 2 * _DESCRIPTOR_DIM)
+        self.hidden = nn.Linear(feature_dim, HIDDEN_DIM)
+        self.linear = nn.Linear(feature_dim, 2 * _DESCRIPTOR_DIM)
         self.from_hidden = nn.Linear(HIDDEN_DIM, 2 * _DESCRIPTOR_DIM)
         self.words = nn.Linear(HIDDEN_DIM, n_words)
         self.objectness = nn.Linear(HIDDEN_DIM, 1)
@@ -142,25 +73,26 @@ class MatchingHead(nn.Module):
         self.gate = nn.Parameter(torch.tensor(_INITIAL_GATE))
 
     def set_statistics(self, features: Tensor) -> None:
-        """Sets the mean and the standard deviation of features (scenes, n, FEATURE_DIM)."""
+        """Sets the mean and the standard deviation of features (scenes, n, feature_dim)."""
         some = features[:: max(1, len(features) // 1000)].flatten(0, 1).float()
         self.mean.copy_(some.mean(dim=0))
         self.std.copy_(some.std(dim=0).clamp_min(_MIN_STD))
 
     def forward(self, features: Tensor) -> Crops:
-        """Describes crops by their features (batch, n, FEATURE_DIM)."""
+        """Describes crops by their features (batch, n, feature_dim)."""
         return self.describe(self.inputs(features))
 
     def inputs(self, features: Tensor) -> Tensor:
-        """Normalizes features, (batch, n, FEATURE_DIM)."""
+        """Normalizes features, (batch, n, feature_dim)."""
         inputs = ((features.float() - self.mean) / self.std).clamp(-_MAX_FEATURE, _MAX_FEATURE)
-        return torch.cat([inputs[..., :-COLOR_DIM], _COLOR_WEIGHT * inputs[..., -COLOR_DIM:]], dim=-1)
+        others, colors = inputs.tensor_split((inputs.shape[-1] - self.color_dim,), dim=-1)
+        return torch.cat([others, _COLOR_WEIGHT * colors], dim=-1)
 
     def describe(self, inputs: Tensor, generator: torch.Generator | None = None) -> Crops:
         """Describes crops.
 
         Args:
-            inputs: Normalized features, (batch, n, FEATURE_DIM).
+            inputs: Normalized features, (batch, n, feature_dim).
             generator: Source of dropout's draws, on the CPU; None for no dropout.
         """
         features, inputs = inputs, _dropout(inputs, generator)

@@ -49,7 +49,6 @@ from lerobot_deltaco.policies.base.augmentation import (
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork
-from lerobot_deltaco.policies.deltaco_match.calibration import MIN_EPISODES
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
 from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
@@ -60,14 +59,15 @@ from lerobot_deltaco.policies.deltaco_match.place import (
     peak_locations,
 )
 from lerobot_deltaco.policies.deltaco_match.prompts import choose_prompted, describe_prompts, prompts_of
-from lerobot_deltaco.policies.deltaco_match.replay import Reference, Trajectory, TrajectoryReplay
-from lerobot_deltaco.policies.deltaco_match.states import N_LOCATIONS, StateRegressor, TrainingLocations
 from lerobot_deltaco.policies.deltaco_match.words import (
     INSTRUCTION_DIM,
     InstructionEncoder,
     encode_words,
     vocabulary_of,
 )
+from lerobot_deltaco.policies.geometry.calibration import MIN_EPISODES
+from lerobot_deltaco.policies.geometry.replay import Reference, Trajectory, TrajectoryReplay
+from lerobot_deltaco.policies.geometry.states import N_LOCATIONS, StateRegressor, TrainingLocations
 
 logger = logging.getLogger(__name__)
 
@@ -132,9 +132,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     """The project's own policy. See `TaskConditionedPolicy` for its arguments.
 
     Attributes:
-        robot_states: The robot's states at locations.
+        state_regressor: The robot's states at locations.
         replay: Replays demonstrations, if `acting` is "replay".
-        feature_matching: Finds what to pick, and how high.
+        matching: Finds what to pick, and how high.
         attention: Finds what a demonstration moved, and where it was put.
         place: Finds where to place it.
         instruction_encoder: Embeds instructions for `place`.
@@ -160,7 +160,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             warn_of_equal_instructions(tasks, encode_words(tasks, config.known_words))
         backbone = BACKBONES["strided"]
         assert config.action_feature is not None
-        self.model = PolicyNetwork(
+        self.policy_network = PolicyNetwork(
             n_cameras=len(config.image_features),
             film_dim=0,
             # The state, and its offset from the state at each location.
@@ -173,9 +173,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             chunk_size=config.chunk_size or 1,
             n_locations=N_LOCATIONS,
         )
-        self.robot_states = StateRegressor(config.state_dim)
+        self.state_regressor = StateRegressor(config.state_dim)
         self.replay = TrajectoryReplay(config.state_dim, config.action_feature.shape[0])
-        self.feature_matching = FeatureMatching(config.known_words, config.crop_size)
+        self.matching = FeatureMatching(config.known_words, config.crop_size)
         self.attention = DemonstrationAttention()
         self.place = PlaceNetwork(INSTRUCTION_DIM)
         self.instruction_encoder = InstructionEncoder(len(config.known_words))
@@ -266,7 +266,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         An episode without a grasp has no locations, and no loss.
         """
         inputs = self._fuse_inputs(batch, located.locations, located.heights, generator)
-        predicted, gripper = self.model(images, None, inputs, located.locations)
+        predicted, gripper = self.policy_network(images, None, inputs, located.locations)
         loss, logged = self._imitation_loss(batch, predicted, gripper, _GRIPPER_LOSS)
         return torch.where(located.has_grasp, loss, 0.0), logged
 
@@ -324,13 +324,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
             localization = self.localize(batch, instructions, demonstrations)
             if (states := self._given_states) is not None:
-                locations = self.robot_states.to_image(states).clamp(-1, 1)
-                heights = self.robot_states.heights(states[:, 0])
+                locations = self.state_regressor.to_image(states).clamp(-1, 1)
+                heights = self.state_regressor.heights(states[:, 0])
                 localization = localization._replace(locations=locations, heights=heights)
             reference, replayed = None, torch.zeros(len(instructions), dtype=torch.bool)
             if self.config.acting == "replay":
                 reference, replayed = self._move_demonstrations(demonstrations, localization, batch)
-            network = self._acting_network()
+            network = self._inference_network()
             self._start(RunningEpisode(instructions, localization, network, reference, replayed))
         episode: RunningEpisode = self._episode
         replay = None
@@ -365,8 +365,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """The robot's states where the policy picks and places, as in the dataset, (batch, 2, state)."""
         if self.localization is None:
             return None
-        states = self.robot_states(self.localization.locations, self.localization.heights)
-        return (states - self.robot_states.state_shift) / self.robot_states.state_scale
+        states = self.state_regressor(self.localization.locations, self.localization.heights)
+        return (states - self.state_regressor.state_shift) / self.state_regressor.state_scale
 
     @property
     def localization(self) -> PickPlace | None:
@@ -395,13 +395,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """
         camera = self.config.cameras[0]
         scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
-        self.feature_matching.camera_motion(batch[camera][0])  # warns
+        self.matching.camera_motion(batch[camera][0])  # warns
         by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
         prompts = prompts_of(instructions, demonstrations)
         given = None if prompts else self._batch_demonstrations(demonstrations, scenes.device)
         attention = last = descriptors = heights = None
         if prompts:
-            descriptors = describe_prompts(self.feature_matching, prompts, scenes, batch[camera])
+            descriptors = describe_prompts(self.matching, prompts, scenes, batch[camera])
         elif given is None:
             if not bool(by_instruction.all()):
                 raise UserError("Neither a demonstration nor an instruction is given. Pass one of them.")
@@ -410,16 +410,19 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             ends, states = given.ends.flatten(0, 1), given.pick_states.flatten(0, 1)
             attentions = self.attention(ends)
             attended = peak_locations(attentions.clamp_min(_MIN_ATTENTION).log())[:, 0]
-            picks, first_images = self.robot_states.pick_locations(states), given.first_images.flatten(0, 1)
-            descriptors = self.feature_matching.describe(ends[:, 0], first_images, picks, attended)
+            picks, first_images = (
+                self.state_regressor.pick_locations(states),
+                given.first_images.flatten(0, 1),
+            )
+            descriptors = self.matching.describe(ends[:, 0], first_images, picks, attended)
             descriptors = descriptors.unflatten(0, (-1, n_each)).mean(dim=1)
-            heights = self.robot_states.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
+            heights = self.state_regressor.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
             attention, last = attentions[::n_each], ends[::n_each, 1]
-        candidates = self.feature_matching.find(scenes, batch[camera], instructions, descriptors, heights)
+        candidates = self.matching.find(scenes, batch[camera], instructions, descriptors, heights)
         if prompts:
-            candidates = choose_prompted(candidates, prompts, self.feature_matching.grasp_radius)
+            candidates = choose_prompted(candidates, prompts, self.matching.grasp_radius)
         proposal, confidence, height = candidates.best
-        pick = self.feature_matching.grasps(batch[camera], proposal)
+        pick = self.matching.grasps(batch[camera], proposal)
         place_maps = self._place_maps(
             scenes, by_instruction, instructions, last, None if attention is None else attention[:, 1]
         )
@@ -490,7 +493,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         state = self.state_limits(batch[OBS_STATE])
         if generator is not None:
             state = self.state_limits.add_noise(state, self.config.state_noise, generator)
-        offsets = self.robot_states(locations, heights) - state.float()[:, None]
+        offsets = self.state_regressor(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
 
     def _move_demonstrations(
@@ -511,7 +514,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         reasons = {each for each in read if isinstance(each, str)}
         if reasons and self.replay.n_trajectories:
             logger.info("The nearest training episode is replayed: %s.", "; ".join(sorted(reasons)))
-            at = self.robot_states.to_image(self.replay.keyframes).clamp(-1, 1)  # (trajectories, 2, 2)
+            at = self.state_regressor.to_image(self.replay.grasp_states).clamp(-1, 1)  # (trajectories, 2, 2)
             nearest = torch.cdist(localization.locations.flatten(1), at.flatten(1)).argmin(dim=1).tolist()
             read = [
                 self.replay.stored_trajectory(row, command) if isinstance(each, str) else each
@@ -528,13 +531,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             return None, replayed
         # The others get any one, and do not follow it.
         trajectories = [each if isinstance(each, Trajectory) else trajectories[0] for each in read]
-        states = torch.stack([each.keyframes for each in trajectories])  # (batch, 2, state)
-        demonstrated = states * self.robot_states.state_scale + self.robot_states.state_shift
-        moved = self.robot_states(localization.locations, localization.heights)
+        states = torch.stack([each.grasp_states for each in trajectories])  # (batch, 2, state)
+        demonstrated = states * self.state_regressor.state_scale + self.state_regressor.state_shift
+        moved = self.state_regressor(localization.locations, localization.heights)
         # The pick is relative to what the regression makes of the demonstration, so that the way in which it
         # grasped is kept. Where it released is chance.
-        places = self.robot_states.to_image(states).clamp(-1, 1)
-        expected = self.robot_states(places, self.robot_states.heights(states[:, 0]))
+        places = self.state_regressor.to_image(states).clamp(-1, 1)
+        expected = self.state_regressor(places, self.state_regressor.heights(states[:, 0]))
         displacements = moved - torch.stack([expected[:, 0], demonstrated[:, 1]], dim=1)
         return self.replay.start(trajectories, self.state_limits(batch[OBS_STATE]), displacements), replayed
 
@@ -552,7 +555,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             PretrainedWeightsError: The weights that feature matching needs are missing.
         """
         self.fit_locations(data)
-        if not bool(self.feature_matching.fitted):
+        if not bool(self.matching.fitted):
             self.fit_matching()
 
     def fit_locations(self, data: TrainingData) -> None:
@@ -589,7 +592,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         zero_and_one = torch.stack([torch.zeros(self.config.state_dim), torch.ones(self.config.state_dim)])
         shift, end = self._normalize_states(zero_and_one).to(robot.states.device)
         carried = robot.images_at(grasps.carried.tolist()).to(bank.frames.device)
-        self.training_locations = self.robot_states.fit(
+        self.training_locations = self.state_regressor.fit(
             grasps,
             bank.frames[:, 0],
             carried,
@@ -606,7 +609,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert self.config.gripper_index is not None
         ends = torch.stack([torch.zeros(robot.actions.shape[1]), torch.ones(robot.actions.shape[1])])
         shift, end = self._normalize(ends, ACTION)
-        replay, regressor = self.replay, self.robot_states
+        replay, regressor = self.replay, self.state_regressor
         replay.action_scale.copy_(end - shift)
         replay.action_shift.copy_(shift)
         replay.state_scale.copy_(regressor.state_scale)
@@ -635,7 +638,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert self.training_locations is not None
         bank, located = self.training_data.demonstrations, self.training_locations
         fit_feature_matching(
-            self.feature_matching,
+            self.matching,
             bank.frames[:, 0],
             bank.frames[:, -1],
             bank.frames[:, 0] if bank.first_images is None else bank.first_images,
@@ -658,7 +661,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             dataset = open_dataset("--dataset.root", meta.repo_id, meta.root, new)
             data = TrainingData.read(DatasetEpisodes(dataset, new), self.config.demonstration_format)
             assert data.grasps is not None
-            read = zip(*self.robot_states.locate(data.grasps.to(device)), strict=True)
+            read = zip(*self.state_regressor.locate(data.grasps.to(device)), strict=True)
             self._held_out.update(zip(new, starmap(TrainingLocations, read), strict=True))
         found = [
             self._held_out[episode] if row < 0 else TrainingLocations(*(part[row] for part in located))

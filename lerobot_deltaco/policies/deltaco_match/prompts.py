@@ -12,7 +12,6 @@ from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.deltaco_match.localization import Candidates, FeatureMatching
-from lerobot_deltaco.policies.deltaco_match.matching import crop_features
 from lerobot_deltaco.policies.deltaco_match.proposals import nearest_proposals
 
 _MIN_CROP = 8  # px
@@ -64,7 +63,7 @@ def describe_prompts(
                 side = float(matching.crop_sizes(torch.zeros(2, device=image.device)))
                 size = max(_MIN_CROP, round(side * height)), max(_MIN_CROP, round(side * width))
                 crop = cut_box(image, prompt.box, size)[None]
-                features = crop_features(crop, crop.new_zeros(1, 1, 2), torch.ones(1, 1, device=crop.device))
+                features = matching.features(crop, crop.new_zeros(1, 1, 2), crop.new_ones(1, 1))
             described.append(matching.compare(features).descriptors[:, 0])
     return torch.cat(described)
 

@@ -12,13 +12,13 @@ from tqdm import tqdm
 from lerobot_deltaco.policies.base.image_coordinates import cell_centers, grid_of_centers, mean_near
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu
-from lerobot_deltaco.policies.deltaco_match.camera_motion import (
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
+from lerobot_deltaco.policies.geometry.camera_motion import (
     CameraMotion,
     estimate_motion,
     static_reference,
 )
-from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
-from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
+from lerobot_deltaco.policies.geometry.regression import robust_regression
 
 N_OBJECTS = 6  # proposed in a scene by `Background`
 _SIDE = 128  # px, of the images as they are compared

@@ -15,7 +15,7 @@ from lerobot_deltaco.policies.base.augmentation import change_colors, random_col
 from lerobot_deltaco.policies.base.image_coordinates import mean_near
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu
-from lerobot_deltaco.policies.deltaco_match.matching import cut_crops
+from lerobot_deltaco.policies.deltaco_match.crop_encoder import cut_crops
 
 _RESOLUTION = 64  # px, of the enlarged surroundings
 _EXTENT = 2.0  # side of the surroundings, in diameters of a typical object
@@ -27,7 +27,7 @@ _BATCH = 32
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
 _MAX_MOVE = 1.0  # from a proposal, in diameters
 _PEAK_RADIUS = 2.6  # of the cells around a peak whose mean is the location
-_ROUNDS = 2  # of looking
+_N_LOOKS = 2
 
 
 class GraspRefiner(nn.Module):
@@ -72,7 +72,7 @@ class GraspRefiner(nn.Module):
     @torch.no_grad()
     def _refine(self, images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
         extent, proposals = _EXTENT * sizes, locations
-        for _ in range(_ROUNDS):
+        for _ in range(_N_LOOKS):
             crops = cut_crops(images, locations[:, None], extent[:, None], _RESOLUTION)[:, 0]
             maps = self.layers(channels_last(crops))[:, 0].float()
             best, cells = maps.flatten(1).max(dim=1)

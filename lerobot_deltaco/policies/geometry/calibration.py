@@ -15,7 +15,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers, mean_near
-from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
+from lerobot_deltaco.policies.geometry.regression import robust_regression
 
 logger = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ MIN_EPISODES = 2 * MIN_CLUSTERS
 _CLUSTER_ROUNDS = 10  # of k-means
 _BLUR = 1 / 24  # standard deviation, as a fraction of the image's side
 _N_STARTS, _REFINEMENTS = 5, 5
-_REACH = 1 / 8  # of a refinement around a predicted location, as a fraction of the image's side
+_MAX_REFINEMENT = 1 / 8  # distance from a predicted location, as a fraction of the image's side
 _PEAK_RADIUS = 1.5  # around a maximum, within which changes count for its location; in standard deviations
 _LEAST_ERROR = 0.02  # of a location, in -1..1, below which errors are all alike
 # Median distance of changes from where they are expected, as a fraction of that in other episodes. In
@@ -176,7 +176,7 @@ def _peaks(maps: Tensor) -> Tensor:
 
 
 def _peaks_near(maps: Tensor, locations: Tensor) -> Tensor:
-    """Returns the locations of the maxima within `_REACH` of locations (n, 2).
+    """Returns the locations of the maxima within `_MAX_REFINEMENT` of locations (n, 2).
 
     For the few locations farther outside the image, it is the top left corner, which the fit downweights as
     an outlier.
@@ -184,7 +184,7 @@ def _peaks_near(maps: Tensor, locations: Tensor) -> Tensor:
     grid = grid_of_centers(maps.shape[1], maps.shape[2], maps.device)
     peaks = []
     for some, around in zip(maps.split(512), locations.split(512), strict=True):
-        far = torch.cdist(around, grid) > 2 * _REACH  # (some, H * W)
+        far = torch.cdist(around, grid) > 2 * _MAX_REFINEMENT  # (some, H * W)
         peaks.append(_peaks(some.masked_fill(far.view_as(some), -math.inf)))
     return torch.cat(peaks)
 

@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement
 import torch
 from torch import Tensor
 
-_ROUNDS = 10  # of reweighting
+_REWEIGHTINGS = 10
 _RIDGES = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # that are compared, as fractions of the number of samples
 _OUTLIER = 2.0  # median errors at which a sample counts a quarter
 
@@ -31,7 +31,7 @@ def robust_regression(
         Weights, (features, targets).
     """
     weights = torch.ones(len(features), device=features.device)
-    for _ in range(_ROUNDS):
+    for _ in range(_REWEIGHTINGS):
         solution = _smooth_regression(features, targets, weights, degrees)
         errors = features @ solution - targets
         errors = (errors if scale is None else errors * scale).norm(dim=1)

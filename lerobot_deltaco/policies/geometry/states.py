@@ -12,15 +12,15 @@ on average, and larger farther along the approach: in the benchmark, lower.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from lerobot_deltaco.data.grasps import Keyframes
-from lerobot_deltaco.policies.deltaco_match.calibration import ImageProjection
-from lerobot_deltaco.policies.deltaco_match.regression import robust_regression
+from lerobot_deltaco.data.grasps import GraspStates
+from lerobot_deltaco.policies.geometry.calibration import ImageProjection
+from lerobot_deltaco.policies.geometry.regression import robust_regression
 
 N_LOCATIONS = 2  # pick and place
 _N_LOCATION_FEATURES = 10
@@ -28,7 +28,6 @@ _N_HEIGHT_FEATURES = 3  # of the first of those: 1, x, y
 _N_LEVEL_FEATURES = 6  # up to the squares
 _EPISODES_PER_TASK = 3  # at least, of tasks by which heights are compared
 _DEGREES = (0, 1, 1, 2, 2, 2, 3, 3, 3, 3)  # of these features
-_COVARIANCE_RIDGE = 1e-4
 _HEIGHT_ROUNDS = 3  # of estimating heights, and the direction in which they move states
 _LEAST_ERROR = 0.02  # of a normalized state, below which errors are all alike
 _CHANCE = 2.0  # standard errors of a correlation that are taken for chance
@@ -67,7 +66,6 @@ class StateRegressor(nn.Module):
     state_scale: Tensor
     state_shift: Tensor
     rest_scale: Tensor
-    location_covariance: Tensor
 
     def __init__(self, state_dim: int) -> None:
         super().__init__()
@@ -78,19 +76,10 @@ class StateRegressor(nn.Module):
         self.register_buffer("state_scale", torch.ones(state_dim))
         self.register_buffer("state_shift", torch.zeros(state_dim))
         self.register_buffer("rest_scale", torch.zeros(state_dim))
-        # Of `location_to_state`, for residuals with a standard deviation of 1; zeros if it is not known.
-        covariance = torch.zeros(N_LOCATIONS, _N_LOCATION_FEATURES, _N_LOCATION_FEATURES)
-        self.register_buffer("location_covariance", covariance)
-        self.register_load_state_dict_pre_hook(self._add_covariance)
-
-    @staticmethod
-    def _add_covariance(module: StateRegressor, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
-        """Adds what checkpoints of earlier fits do not have."""
-        state_dict.setdefault(f"{prefix}location_covariance", torch.zeros_like(module.location_covariance))
 
     def fit(
         self,
-        keyframes: Keyframes,
+        grasps: GraspStates,
         first: Tensor,
         carried: Tensor,
         last: Tensor,
@@ -102,7 +91,7 @@ class StateRegressor(nn.Module):
         """Calibrates the camera and learns which state the robot has at a location.
 
         Args:
-            keyframes: Keyframes of the training episodes.
+            grasps: Grasps of the training episodes.
             first: First images of the episodes, (episodes, 3, H, W) uint8.
             carried: Images halfway between grasp and release, (episodes, 3, H, W) uint8.
             last: Last images of the episodes, (episodes, 3, H, W) uint8.
@@ -115,35 +104,32 @@ class StateRegressor(nn.Module):
         Returns:
             The locations and heights of the episodes.
         """
-        has_grasp = keyframes.has_grasp
+        has_grasp = grasps.has_grasp
         first, carried, last = (images[has_grasp] for images in (first, carried, last))
-        self.to_image.fit(first, carried, last, keyframes.states[has_grasp, 0], scale * is_arm)
-        locations = self.to_image(keyframes.states).clamp(-1, 1)
+        self.to_image.fit(first, carried, last, grasps.states[has_grasp, 0], scale * is_arm)
+        locations = self.to_image(grasps.states).clamp(-1, 1)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
-        states = (keyframes.states * scale + shift)[has_grasp]  # (episodes, 2, state)
-        last_moves = states[:, 0] - (keyframes.approach * scale + shift)[has_grasp]
+        states = (grasps.states * scale + shift)[has_grasp]  # (episodes, 2, state)
+        last_moves = states[:, 0] - (grasps.approach * scale + shift)[has_grasp]
         features = _location_features(locations[has_grasp])
         degrees = torch.tensor(_DEGREES, device=states.device)
         for n in range(N_LOCATIONS):
             self.location_to_state[n].copy_(
                 robust_regression(features[:, n], states[:, n], degrees, _LEAST_ERROR, is_arm.float())
             )
-            gram = features[:, n].T @ features[:, n]
-            ridge = _COVARIANCE_RIDGE * len(gram) * torch.eye(len(gram), device=gram.device)
-            self.location_covariance[n].copy_(torch.linalg.inv(gram + ridge))
         self._fit_heights(features[:, 0], states[:, 0], last_moves, is_arm)
         if tasks is not None:
             self._level(
                 features[:, 0], states[:, 0], [t for t, has in zip(tasks, has_grasp, strict=True) if has]
             )
-        return self.locate(keyframes)
+        return self.locate(grasps)
 
-    def locate(self, keyframes: Keyframes) -> TrainingLocations:
+    def locate(self, grasps: GraspStates) -> TrainingLocations:
         """Returns the locations and heights of episodes, from the robot's states in them."""
-        has_grasp = keyframes.has_grasp
-        locations = self.to_image(keyframes.states).clamp(-1, 1)
-        heights = self.heights(keyframes.states[:, 0])
+        has_grasp = grasps.has_grasp
+        locations = self.to_image(grasps.states).clamp(-1, 1)
+        heights = self.heights(grasps.states[:, 0])
         return TrainingLocations(
             torch.where(has_grasp[:, None, None], locations, 0.0),
             torch.where(has_grasp, heights, 0.0),
@@ -234,21 +220,6 @@ class StateRegressor(nn.Module):
         # Relative to the best one, which must not be cut at less than `_MAX_REST`.
         ratio = ratio / torch.where(is_open, ratio, 1.0).min()
         self.rest_scale.copy_(torch.where(is_open, 1 / (spread * ratio), 0.0))
-
-    def uncertainty(self, locations: Tensor) -> Tensor:
-        """Returns how far locations are outside of those in training, (..., 2).
-
-        It is the standard error of the predicted state, as a multiple of what locations leave open of a
-        state: small amid the training locations; from about 1 on, the prediction is an extrapolation. NaN for
-        a policy whose checkpoint does not have it.
-
-        Args:
-            locations: Pick and place, (..., 2, 2) in -1..1.
-        """
-        features = _location_features(locations)
-        variance = torch.einsum("...gf,gfe,...ge->...g", features, self.location_covariance, features)
-        is_known = bool(self.location_covariance.any())
-        return variance.sqrt() if is_known else torch.full_like(variance, torch.nan)
 
     def heights(self, pick_states: Tensor) -> Tensor:
         """Returns the height offsets of grasps, (grasps,); NaN for a grasp that is not known.
