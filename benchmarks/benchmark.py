@@ -1,6 +1,6 @@
 """Speed of the environment, of training and of the policies. `deltaco collect` prints its own.
 
-    python benchmarks/benchmark.py env|train|policy|video|contention
+    python benchmarks/benchmark.py env|train|policy|latency|video|contention
 
 Times are of one machine: compare figures of one run, made while nothing else uses the processor.
 """
@@ -30,20 +30,22 @@ def main() -> None:
     import tyro
 
     commands: dict[str, Callable[..., dict[str, float]]] = {"env": env, "train": train, "policy": policy}
-    commands |= {"video": video, "contention": contention}
+    commands |= {"latency": latency, "video": video, "contention": contention}
     results = tyro.extras.subcommand_cli_from_dict(commands, description=(__doc__ or "").partition("\n")[0])
     width = max(map(len, results))
     sys.stdout.writelines(f"{name:{width}}  {value:12.3f}\n" for name, value in results.items())
 
 
-def seconds_of(action: Callable[[], object], seconds: float = 1.0) -> float:
+def seconds_of(
+    action: Callable[[], object], seconds: float = 1.0, clock: Callable[[], float] = time.perf_counter
+) -> float:
     """Returns the median duration of an action, s, over as many calls as fit into some seconds."""
     action()  # warms up
     times: list[float] = []
     while len(times) < 3 or sum(times) < seconds:
-        start = time.perf_counter()
+        start = clock()
         action()
-        times.append(time.perf_counter() - start)
+        times.append(clock() - start)
     return statistics.median(times)
 
 
@@ -209,6 +211,48 @@ def policy(batch_size: int = 128, seconds: float = 5.0) -> dict[str, float]:
             results[f"{name}: training, samples/s"] = batch_size / seconds_of(step, seconds)
             made.eval()
             results[f"{name}: action, ms"] = 1e3 * seconds_of(act, seconds)
+    return results
+
+
+def latency(checkpoint: Path = Path("checkpoints/pick_place"), seconds: float = 5.0) -> dict[str, float]:
+    """Measures what `deltaco_match` takes of one core before and between movements, in ms.
+
+    An action is `select_action` with the processors around it; finding is the first one of an episode. The
+    processor's time is measured, so that other processes hardly matter.
+
+    Args:
+        checkpoint: Folder of a policy with demonstrations.
+        seconds: Duration of each measurement.
+    """
+    import torch
+
+    from lerobot_deltaco.evaluation.checkpoints import load_policy
+    from lerobot_deltaco.lerobot_versions import action_of
+
+    torch.set_num_threads(1)
+    loaded = load_policy(checkpoint, ["--device=cpu"])
+    made: Any = loaded.policy
+    demonstration = made.demonstrations[0]
+    results: dict[str, float] = {}
+    for height, width in ((48, 48), (480, 640)):
+        generator = torch.Generator().manual_seed(0)
+        seen: dict[str, Any] = {
+            name: torch.rand(3, height, width, generator=generator) for name in made.config.image_features
+        }
+        seen |= {"observation.state": torch.zeros(made.config.state_dim), "task": demonstration.task}
+
+        def act(seen: dict[str, Any] = seen) -> None:
+            with torch.inference_mode():
+                loaded.postprocessor(action_of(made.select_action(loaded.preprocessor(dict(seen)))))
+
+        def find(act: Callable[[], None] = act) -> None:
+            made.reset()
+            act()
+
+        camera = f"camera of {width} x {height} px"
+        results[f"{camera}: find, ms"] = 1e3 * seconds_of(find, seconds, time.process_time)
+        made.config.n_action_steps = 1  # a network's prediction at every step
+        results[f"{camera}: act, ms"] = 1e3 * seconds_of(act, seconds, time.process_time)
     return results
 
 

@@ -20,6 +20,7 @@ pytestmark = pytest.mark.slow
         ["env", "--episodes", "2", "--seconds", "0.01"],
         ["train", "--batch-size", "16", "--steps", "3"],
         ["policy", "--batch-size", "16", "--seconds", "0.01"],
+        ["latency", "--checkpoint", str(ROOT / "checkpoints" / "pick_place"), "--seconds", "0.01"],
         ["video", "--episodes", "2", "--frames", "5", "--size", "64", "--repeats", "1"],
         ["contention", "--seconds", "0.01"],
     ],

@@ -46,7 +46,7 @@ def check_files(folder: Path, episodes: Sequence[int] | None = None) -> None:
     if not path.is_file():
         return
     info = _read_info(path)
-    _check_tasks(folder / "meta/tasks.parquet")
+    check_tasks(folder / "meta/tasks.parquet")
     table = _read_episodes(folder / "meta/episodes")
     if table is None:
         return
@@ -89,8 +89,12 @@ def _read_info(path: Path) -> dict[str, Any]:
     return info
 
 
-def _check_tasks(path: Path) -> None:
-    """Checks the form of meta/tasks.parquet: task strings are the index of the table."""
+def check_tasks(path: Path) -> None:
+    """Checks the form of meta/tasks.parquet: task strings are the index of the table.
+
+    Raises:
+        UserError: It has another form.
+    """
     if not path.is_file():
         return
     with _reading(path):

@@ -6,7 +6,8 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
-from small_policies import TABLE_TASKS
+from lerobot.datasets import LeRobotDataset
+from small_policies import TABLE_TASKS, small_policy
 
 from lerobot_deltaco.data.reading import open_dataset, open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes
@@ -96,6 +97,14 @@ def test_a_fault_is_named_before_the_dataset_is_opened(root, fault):
     change(root)
     with pytest.raises(UserError, match=f"(?s){message}"):
         open_folder_or_hub(str(root))
+
+
+def test_a_policy_names_a_table_of_tasks_that_lerobot_train_opens(root):
+    change, message = FAULTS["task_column"]
+    change(root)
+    dataset = LeRobotDataset("test/table", root=root)
+    with pytest.raises(UserError, match=message):
+        small_policy(dataset, "deltaco_match", prepare=False)
 
 
 def test_a_good_dataset_opens_and_so_do_episodes_beside_damaged_ones(root):

@@ -11,7 +11,7 @@ from fake_robot import CAMERA, IMAGE_SHAPE, MOTORS, FakeArm
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.policies import make_policy
 from lerobot.scripts import lerobot_rollout
-from small_policies import as_options, batch_of, small_policy, write_episodes
+from small_policies import as_options, batch_of, observation, small_policy, write_episodes
 
 from gym_deltaco.tasks import TASK_SETS, get_task
 from lerobot_deltaco.evaluation.checkpoints import load_policy
@@ -52,6 +52,27 @@ def test_processors_normalize_and_revert_it(make, dataset):
     torch.testing.assert_close(after(batch["action"]), raw["action"], atol=1e-3, rtol=0)
     for camera in dataset.meta.camera_keys:
         assert torch.equal(batch[camera], raw[camera])
+
+
+@small
+def test_the_network_that_acts_is_copied_once_for_the_same_weights(make, dataset):
+    policy, before, _ = make(method="language_only")
+    policy.eval()
+    seen = before(observation(dataset, ["wave"]))
+    actions, networks = [], []
+    for factor in (1, 1, 0.9):
+        with torch.no_grad():
+            for weight in policy.policy_network.parameters():
+                weight *= factor
+        policy.reset()
+        actions.append(policy.select_action(seen))
+        networks.append(policy._inference_network())
+    assert networks[0] is not networks[2]
+    assert torch.equal(actions[0], actions[1])
+    assert not torch.equal(actions[1], actions[2])
+    policy.reset()
+    policy.select_action(seen)
+    assert policy._inference_network() is networks[2]
 
 
 # Commands

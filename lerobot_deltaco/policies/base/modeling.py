@@ -23,6 +23,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
+from lerobot_deltaco.data.files import check_tasks
 from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.data.reading import compare_robots, open_dataset
 from lerobot_deltaco.data.training_data import DatasetEpisodes, Episodes, TrainingData
@@ -89,6 +90,8 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self.config: Any = config
         self._meta, self._stats = dataset_meta, dataset_stats
         if dataset_meta is not None:
+            # `lerobot-train` opens the dataset itself, without the checks of `open_dataset`.
+            check_tasks(dataset_meta.root / "meta/tasks.parquet")
             config.set_dataset_feature_metadata(dataset_meta.features, dataset_stats or dataset_meta.stats)
             config.set_dataset_length(dataset_meta)
         config.validate_features()
@@ -106,6 +109,8 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         # The actions of the running chunks that are still to be carried out, and the average of all chunks.
         self._actions = ActionQueues(config.n_action_steps, config.gripper_index)
         self._ensemble: ACTTemporalEnsembler | None = None
+        # The network that acts in evaluation mode, and the state of the weights that it was made from.
+        self._fused: tuple[list[tuple[int, int]], PolicyNetwork] | None = None
         # Draws are a function of the seed and the step, so that a resumed run repeats an uninterrupted one.
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
 
@@ -283,8 +288,15 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         )
 
     def _inference_network(self) -> PolicyNetwork:
-        """Returns the policy network; in evaluation mode, a copy that is faster for small batches."""
-        return self.policy_network if self.training else fuse_batch_norms(self.policy_network)
+        """Returns the network that acts: in evaluation mode, a copy that is faster for small batches."""
+        if self.training:
+            return self.policy_network
+        tensors = [*self.policy_network.parameters(), *self.policy_network.buffers()]
+        # Copying takes longer than an action. Changes in place count as versions.
+        state = [(each.data_ptr(), 0 if each.is_inference() else each._version) for each in tensors]
+        if self._fused is None or self._fused[0] != state:
+            self._fused = state, fuse_batch_norms(self.policy_network)
+        return self._fused[1]
 
     def _sample_action(
         self, batch: dict[str, Any], predicted: ActionDistribution, gripper: Tensor | None
