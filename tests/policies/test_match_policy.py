@@ -365,12 +365,18 @@ def test_the_network_acts_where_a_demonstration_cannot_be_replayed(make, table, 
     by_camera = dataclasses.replace(shown, states=None)
     still = dataclasses.replace(shown, actions=torch.ones_like(shown.actions))
     for demonstrations, message in (
-        ([], "none was given"),
+        ([], "no demonstration is given"),
         ([by_camera], "the demonstration has no states and actions of the robot"),
         ([still], "the gripper"),
     ):
-        caplog.clear()
+        with caplog.at_level("INFO"):
+            act(demonstrations)
+        assert policy._episode.replayed.all()
+        assert f"The nearest training episode is replayed: {message}" in caplog.text
+        # Without one, such as in an older checkpoint, the network acts.
+        grasp_states, policy.replay.grasp_states = policy.replay.grasp_states, torch.zeros(0, 2, 3)
         action = act(demonstrations)
+        policy.replay.grasp_states = grasp_states
         assert f"no demonstration can be replayed: {message}" in caplog.text
         policy.config.acting = "network"
         torch.testing.assert_close(act(demonstrations), action)

@@ -5,7 +5,7 @@ import time
 
 import pytest
 from fake_robot import MOTORS, FakeArm, FakeArmConfig
-from small_policies import batch_of, demos_of, small_policy
+from small_policies import batch_of, demos_of, small_policy, with_chunks
 from test_policy_lerobot import write_robot_dataset
 
 grpc = pytest.importorskip("grpc", reason="needs lerobot[async]")
@@ -28,7 +28,7 @@ def test_a_policy_server_gives_chunks_and_a_connection_is_an_episode(tmp_path, m
     dataset = write_robot_dataset(tmp_path / "tasks", ["move it to the end"] * 24)
     demos = write_robot_dataset(tmp_path / "demos", ["drop it"])
     policy, before, after = small_policy(dataset, "deltaco_match", chunk_size=4, **demos_of(demos))
-    policy(before(batch_of(dataset, [0, 7, 14, 21])))
+    policy(before(batch_of(with_chunks(dataset, policy.config), [0, 7, 14, 21])))
     for part in (policy, before, after):
         part.save_pretrained(tmp_path / "policy")
     served = policy_server.PolicyServer(PolicyServerConfig(host="127.0.0.1", port=1, fps=20))
