@@ -13,6 +13,7 @@ grpc = pytest.importorskip("grpc", reason="needs lerobot[async]")
 
 @pytest.mark.usefixtures("fake_language", "short_fit")
 def test_a_policy_server_gives_chunks_and_a_connection_is_an_episode(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where LeRobot writes the log of its server
     from concurrent import futures
 
     from lerobot.async_inference import constants, policy_server
