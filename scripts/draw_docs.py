@@ -29,11 +29,11 @@ from gym_deltaco.sim.fixtures import TABLE_BOXES, TRAY_BOXES, table_mesh, tray_m
 from gym_deltaco.sim.simulation import Simulation
 from gym_deltaco.sim.workspace import CAMERA, TRAY_CENTER, TRAY_FLOOR
 from gym_deltaco.tasks import SCENARIOS, TASK_SETS, get_task
+from lerobot_deltaco.evaluation.photos import image_locations
 from lerobot_deltaco.evaluation.records import EvaluationPlan, read_records
 from lerobot_deltaco.evaluation.video import (
     benchmark_env,
     find_demonstration,
-    image_locations,
     load_conditioned,
     record_episode,
 )

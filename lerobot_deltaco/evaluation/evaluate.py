@@ -25,6 +25,7 @@ from gym_deltaco.env import N_JOINTS, PickPlaceEnv
 from gym_deltaco.expert import Expert
 from gym_deltaco.tasks import get_task
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
+from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.episodes import EpisodeSpec, draw_episodes
@@ -37,6 +38,7 @@ from lerobot_deltaco.evaluation.oracle import (
     localized_positions,
     make_controllers,
 )
+from lerobot_deltaco.evaluation.photos import take_photo
 from lerobot_deltaco.evaluation.records import EvaluationPlan, Oracle
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
 from lerobot_deltaco.processes import disable_malloc_trim, end_with_parent
@@ -86,7 +88,9 @@ class Evaluation:
     def run(self, number: int) -> list[dict[str, Any]]:
         """Runs the episodes of a batch, and returns the row of each in the record."""
         batch = self.batches[number]
-        demonstrations = [self._demonstrations(episode) for episode in batch]
+        demonstrations = [
+            [self._photo(episode)] if self.plan.photo else self._demonstrations(episode) for episode in batch
+        ]
         monitors: list[EpisodeMonitor] = []
 
         def monitor(envs: Sequence[PickPlaceEnv], _: Any) -> None:
@@ -109,6 +113,7 @@ class Evaluation:
             batch, infos, demonstrations, confidences, monitors, positions, strict=True
         ):
             pick_error, place_error = observed.errors(position)
+            shown = [each for each in given if isinstance(each, Demonstration)]
             template = get_task(episode.task_id).instruction
             rows.append(
                 {
@@ -117,9 +122,9 @@ class Evaluation:
                     "success": bool(info["is_success"]),
                     "instruction": None if episode.instruction == template else episode.instruction,
                     "demonstration_task": episode.demonstration_task,
-                    "demonstration_episodes": [each.episode for each in given if each.episode is not None],
+                    "demonstration_episodes": [each.episode for each in shown if each.episode is not None],
                     "demonstrated_objects": [
-                        each.target_object for each in given if each.target_object is not None
+                        each.target_object for each in shown if each.target_object is not None
                     ],
                     "grasped_object": int(info["grasped_object"]),
                     "object_containers": info["object_containers"].tolist(),
@@ -155,6 +160,11 @@ class Evaluation:
             )
         return [available[(episode.trial * count + n) % len(available)] for n in range(count)]
 
+    def _photo(self, episode: EpisodeSpec) -> ObjectPrompt:
+        """Returns a photo of what an episode's task moves, in another scene."""
+        camera = self.loaded.policy.config.cameras[0].rpartition(".")[-1]
+        return take_photo(self._envs[0], episode.task_id, episode.trial, camera)
+
     @contextmanager
     def _inference(self, batch: Sequence[EpisodeSpec]) -> Iterator[None]:
         config = self.loaded.policy.config
@@ -178,7 +188,7 @@ def run_episodes(
     loaded: LoadedPolicy,
     envs: Sequence[PickPlaceEnv],
     episodes: Sequence[EpisodeSpec],
-    demonstrations: Sequence[Sequence[Demonstration]],
+    demonstrations: Sequence[Sequence[Demonstration | ObjectPrompt]],
     callback: StepCallback | None = None,
     joint_noise: float = 0.0,
     oracle: Oracle = "none",
@@ -317,6 +327,13 @@ def _bank_for(policy: Any, plan: EvaluationPlan) -> DemonstrationBank | ExpertBa
     Raises:
         UserError: The plan asks for demonstrations that the policy does not take or have.
     """
+    if plan.photo:
+        if not getattr(policy, "takes_prompts", False):
+            raise UserError(
+                f"A policy of the type {policy.config.type!r} takes no photo in place of a demonstration. "
+                "Use deltaco_match."
+            )
+        return None
     if not hasattr(policy, "set_tasks") or not getattr(policy.config, "uses_demonstrations", True):
         if plan.counterfactual == "demonstration" or plan.without == "demonstration":
             raise UserError("This policy takes no demonstrations: none can be replaced or left out.")

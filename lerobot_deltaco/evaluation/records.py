@@ -72,6 +72,8 @@ class EvaluationPlan:
         counterfactual: Input that is replaced by another task's: none, demonstration or instruction. That
             task asks for another object of the scene and for the other container, if there is such a task.
         without: Input that is left out: none, demonstration or instruction.
+        photo: Whether a photo takes the place of the demonstration: of the task's object in another scene,
+            with a point on it.
         n_demonstrations: Number of demonstrations of each task that the policy combines.
         paraphrases: CSV file with sentences for the tasks, which the trials of a task use in turn. By
             default, the instructions are the benchmark's templates.
@@ -93,6 +95,7 @@ class EvaluationPlan:
     scene: SceneConfig = field(default_factory=SceneConfig)
     counterfactual: Counterfactual = "none"
     without: Counterfactual = "none"
+    photo: bool = False
     n_demonstrations: int = 1
     paraphrases: str | None = None
     paraphrases_split: str = "all"
@@ -119,6 +122,11 @@ class EvaluationPlan:
         for name, valid in ((name, get_args(kind)) for name, kind in kinds.items()):
             if getattr(self, name) not in valid:
                 raise UserError(f"`{name}` must be one of {', '.join(valid)}. Got {getattr(self, name)!r}.")
+        if self.photo and (self.counterfactual, self.without, self.n_demonstrations) != ("none", "none", 1):
+            raise UserError(
+                "A photo takes the place of one demonstration, and needs the instruction: leave out "
+                "`counterfactual`, `without` and `n_demonstrations`."
+            )
         if self.wording != TEMPLATES and "instruction" in (self.counterfactual, self.without):
             raise UserError(
                 "An instruction that is replaced or left out is not a paraphrase: leave out `paraphrases` "

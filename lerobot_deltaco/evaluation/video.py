@@ -15,11 +15,10 @@ from gym_deltaco.control import control_of
 from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.layout import Layout
 from gym_deltaco.scene_config import SceneConfig
-from gym_deltaco.sim.simulation import camera_matrices
-from gym_deltaco.sim.workspace import CAMERA
 from gym_deltaco.tasks import Task
 from lerobot_deltaco.data.demonstrations import Demonstration, kept_frames
 from lerobot_deltaco.data.images import resize_images
+from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy, find_checkpoints, load_policy
 from lerobot_deltaco.evaluation.episodes import EpisodeSpec
@@ -56,7 +55,7 @@ def record_episode(
     task_id: int,
     seed: int,
     instruction: str,
-    demonstrations: Sequence[Demonstration],
+    demonstrations: Sequence[Demonstration | ObjectPrompt],
 ) -> Recording:
     """Runs an episode of the benchmark and records it.
 
@@ -90,13 +89,6 @@ def record_episode(
         frozenset(pair for pair in placements if pair[1] >= 0),
         info["grasped_object"],
     )
-
-
-def image_locations(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Projects points of the world, (n, 3), m, into the benchmark's camera: (n, 2) in -1..1."""
-    view, projection = (np.reshape(matrix, (4, 4)).T for matrix in camera_matrices(CAMERA))
-    x, y, _, w = projection @ view @ np.column_stack([points, np.ones(len(points))]).T
-    return np.column_stack([x, -y]) / w[:, None]
 
 
 def find_demonstration(

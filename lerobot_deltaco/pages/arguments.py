@@ -77,6 +77,40 @@ class CheckArguments:
         episode_numbers(self.dataset_episodes)
 
 
+def point_numbers(option: str | None) -> list[float] | None:
+    """Returns the point or box that an option names; None for none.
+
+    Raises:
+        ValueError: It is not a list of numbers.
+    """
+    if option is None:
+        return None
+    try:
+        numbers = json.loads(option)
+    except ValueError:
+        numbers = None
+    if not isinstance(numbers, list) or not all(type(number) in (int, float) for number in numbers):
+        raise ValueError(f"--policy.demo_point must be a list of numbers, such as [320,240]. Got {option!r}.")
+    return numbers
+
+
+@dataclass(frozen=True)
+class PromptOptions:
+    """Options of `lerobot-rollout` that show the object to pick, in place of a demonstration.
+
+    Args:
+        demo_point: Point [x, y] or box [left, top, right, bottom] on the object, px: in the first image of
+            each episode, or in `demo_photo`.
+        demo_photo: Image file that shows the object.
+    """
+
+    demo_point: str | None = None
+    demo_photo: Path | None = None
+
+    def __post_init__(self) -> None:
+        point_numbers(self.demo_point)
+
+
 @dataclass(frozen=True)
 class LookArguments:
     """Arguments of `deltaco look`.
@@ -89,6 +123,7 @@ class LookArguments:
         episodes: Number of episodes, evenly spread.
         out: Folder for the page.
         dataset_episodes: Episodes to choose from, as for `deltaco train`, such as [0,1,2]; None for all.
+        policy: What shows the object in place of other episodes.
     """
 
     checkpoint: tyro.conf.Positional[str]
@@ -96,9 +131,12 @@ class LookArguments:
     episodes: int = 12
     out: Path = Path("outputs/look")
     dataset_episodes: DatasetEpisodesOption = None
+    policy: PromptOptions = PromptOptions()
 
     def __post_init__(self) -> None:
         episode_numbers(self.dataset_episodes)
+        if self.dataset is None and self.policy != PromptOptions():
+            raise ValueError("--policy.demo_point and --policy.demo_photo need the episodes of a --dataset.")
 
 
 @dataclass(frozen=True)

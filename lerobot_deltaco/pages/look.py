@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gym_deltaco.tasks import select_tasks
+from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.data.grasps import find_grasp_states
 from lerobot_deltaco.data.images import as_uint8
+from lerobot_deltaco.data.object_prompts import ObjectPrompt, read_prompt
 from lerobot_deltaco.data.reading import open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, read_demonstrations, read_robot_data
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import load_conditioned
-from lerobot_deltaco.pages.arguments import LookArguments, episode_numbers
+from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions, episode_numbers, point_numbers
 from lerobot_deltaco.pages.html import EpisodeView, picture_uri, write_page
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
 from lerobot_deltaco.pages.player import Player
@@ -58,7 +60,8 @@ def look(arguments: LookArguments) -> str:
     else:
         names = [f"Episodes with the right {what} location" for what in ("pick", "place")]
         chosen = episode_numbers(arguments.dataset_episodes)
-        episodes = _dataset_episodes(loaded, open_folder_or_hub(dataset, chosen), arguments.episodes)
+        prompt = _prompt(arguments.policy, loaded.policy.config)
+        episodes = _dataset_episodes(loaded, open_folder_or_hub(dataset, chosen), arguments.episodes, prompt)
     judged = list(tqdm(episodes, desc="Looking", unit="episode", total=arguments.episodes))
     known = np.array([rights for _, rights in judged if rights])
     rates = [(name, int(known[:, n].sum()), len(known)) for n, name in enumerate(names) if len(known)]
@@ -88,8 +91,18 @@ def _benchmark_episodes(loaded: LoadedPolicy, n_episodes: int) -> Iterator[Judge
         yield view, (view.is_right is True,)
 
 
-def _dataset_episodes(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int) -> Iterator[Judged]:
-    """Localizes in the first images of episodes, with other episodes as demonstrations."""
+def _prompt(options: PromptOptions, config: TaskConditionedConfig) -> ObjectPrompt | None:
+    """Returns the object that options show in place of demonstrations."""
+    if options == PromptOptions():
+        return None
+    _, height, width = config.image_features[config.cameras[0]].shape
+    return read_prompt(point_numbers(options.demo_point), options.demo_photo, (width, height))
+
+
+def _dataset_episodes(
+    loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int, prompt: ObjectPrompt | None
+) -> Iterator[Judged]:
+    """Localizes in the first images of episodes, by other episodes as demonstrations or by a prompt."""
     policy, config = loaded.policy, loaded.policy.config
     camera = config.cameras[0]
     _check_features(config, dataset)
@@ -103,7 +116,7 @@ def _dataset_episodes(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes:
     numbers = _spread(len(tasks), n_episodes)
     partners = {episode: _partner(tasks, episode) for episode in numbers}
     bank = None
-    if config.uses_demonstrations:
+    if config.uses_demonstrations and prompt is None:
         needed = [indices[partner] for partner in sorted(set(partners.values()))]
         bank = read_demonstrations(DatasetEpisodes(dataset, needed), form)
     for episode in numbers:
@@ -112,7 +125,10 @@ def _dataset_episodes(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes:
         observation = {name: item[name] for name in config.input_features}
         observation |= {name: as_uint8(item[name]).float() / 255 for name in config.cameras}
         policy.reset()
-        policy.set_tasks([task], [[] if bank is None else [bank.of_episode(indices[partner])]])
+        given: list[Demonstration | ObjectPrompt] = [] if prompt is None else [prompt]
+        if bank is not None:
+            given = [bank.of_episode(indices[partner])]
+        policy.set_tasks([task], [given])
         with torch.inference_mode():
             policy.select_action(loaded.preprocessor({**observation, "task": task}))
         localization = policy.localization
@@ -121,6 +137,8 @@ def _dataset_episodes(loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes:
             where += ", demonstrated by " + (
                 "itself" if partner == episode else f"episode {indices[partner]}"
             )
+        elif prompt is not None:
+            where += ", where a point shows the object" if prompt.image is None else ", by a photo"
         rights, headline, recorded = (), "No grasp found", None
         if bool(grasps.has_grasp[episode]):
             states = grasps.states[episode].to(config.device)

@@ -19,7 +19,8 @@ from gym_deltaco.layout import Layout
 from gym_deltaco.objects.labels import ObjectLabel
 from gym_deltaco.sim.workspace import CONTAINER_FLOOR, TABLE_TOP, TRAY_CENTER, TRAY_HALF_EXTENTS
 from gym_deltaco.tasks import TASKS, Task
-from lerobot_deltaco.evaluation.video import Recording, image_locations
+from lerobot_deltaco.evaluation.photos import image_locations
+from lerobot_deltaco.evaluation.video import Recording
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.policies.deltaco_match.words import understand, words_of
 

@@ -29,7 +29,10 @@ PAPER = pd.read_csv(Path(__file__).with_name("paper_results.csv"), index_col="ex
 PAPER[["rate", "sd"]] /= 100
 _OLDER_FAMILIES = {"small_a": "scenario_a", "small_b": "scenario_b", "small_ambiguity": "ambiguity_object"}
 # Settings that never belong to the main ones of a group, other than with these values.
-_MAIN = {"counterfactual": "none", "without": "none", "oracle": "none", "wording": TEMPLATES}
+_MAIN = {
+    **{"counterfactual": "none", "without": "none", "photo": False},
+    **{"oracle": "none", "wording": TEMPLATES},
+}
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,7 @@ def _group_results(group: Sequence[EvaluationRecord]) -> list[Result]:
 
 def _settings(record: EvaluationRecord) -> dict[str, Any]:
     plan = record.plan
-    names = ("tasks", "trials", "seed", "counterfactual", "without", "oracle", "n_demonstrations")
+    names = ("tasks", "trials", "seed", "counterfactual", "without", "photo", "oracle", "n_demonstrations")
     return {
         **{name: getattr(plan, name) for name in (*names, "joint_noise")},
         **asdict(plan.scene),

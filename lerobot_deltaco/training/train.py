@@ -7,7 +7,7 @@ made here, so that the policy is given the training episodes before the first st
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.scripts import lerobot_train
@@ -36,10 +36,10 @@ from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import check_dataset_folder, missing_files_named
 from lerobot_deltaco.data.training_data import read_robot_data
 from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.lerobot_versions import replaced
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig, check_image_shapes
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
 from lerobot_deltaco.processes import disable_malloc_trim
-from lerobot_deltaco.training.lerobot_loop import replaced
 from lerobot_deltaco.training.task_batches import TaskBatchSampler
 
 _FPS_OF_OPTION = 24  # frames per second of `frames_after_release`
@@ -54,6 +54,7 @@ def train(config: TrainPipelineConfig | None = None) -> None:
     disable_malloc_trim()
     training = _InMemoryTraining()
     with replaced(
+        make_card=training.make_card,
         make_train_eval_datasets=training.make_datasets,
         make_policy=training.make_policy,
         EpisodeAwareSampler=training.make_sampler,
@@ -71,6 +72,7 @@ class _InMemoryTraining:
     def __init__(self) -> None:
         self._config: TrainPipelineConfig | None = None
         self._frames: FramesInMemory | None = None
+        self._policy: PreTrainedPolicy | None = None
 
     def make_datasets(self, config: TrainPipelineConfig) -> tuple[FramesInMemory, LeRobotDataset | None]:
         """Makes LeRobot's datasets, the first of them in memory."""
@@ -96,10 +98,23 @@ class _InMemoryTraining:
     def make_policy(self, **options: Any) -> PreTrainedPolicy:
         """Makes LeRobot's policy, and gives it the training episodes."""
         assert self._frames is not None
-        policy = make_policy(**options)
+        policy = self._policy = make_policy(**options)
         if isinstance(policy, TaskConditionedPolicy) and policy.config.uses_demonstrations:
             policy.prepare_training(self._frames)
         return policy
+
+    def make_card(
+        self,
+        own: Callable[..., Any],
+        model_cfg: PreTrainedConfig,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> Any:
+        """Returns the policy's card. The arguments are LeRobot's, after its own function."""
+        if cfg is None or not isinstance(self._policy, TaskConditionedPolicy):
+            return own(model_cfg, cfg, dataset_meta)
+        described = model_cfg.type, model_cfg.license, model_cfg.tags
+        return self._policy.generate_model_card(cfg.dataset.repo_id, *described, cfg, dataset_meta)
 
     def batches(self, indices: Iterator[torch.Tensor]) -> Iterator[dict[str, Any]]:
         """Yields the batches of the indices that LeRobot's data loader gives, without an end."""

@@ -58,6 +58,16 @@ def test_only_episodes_without_success_have_a_failure(ladder):
     assert not (ladder["location"]["failure"] == "not found").any()
 
 
+def test_a_photo_takes_the_place_of_the_demonstration():
+    loaded = load_policy(CHECKPOINT, ["--device=cpu"])
+    rows = evaluate(loaded, EvaluationPlan(TASKS, trials=1, photo=True))
+    assert rows["right_object"].mean() >= 0.5
+    assert (rows["demonstration_task"] == -1).all()
+    assert not any(len(episodes) for episodes in rows["demonstration_episodes"])
+    with pytest.raises(ValueError, match="A photo takes the place of one demonstration"):
+        EvaluationPlan(TASKS, photo=True, without="instruction")
+
+
 def test_a_policy_that_does_not_localize_has_no_oracle():
     class Other:
         config = type("Config", (), {"type": "act"})

@@ -20,7 +20,7 @@ from lerobot_deltaco.evaluation.video import (
     record_episode,
 )
 from lerobot_deltaco.pages import look as look_module
-from lerobot_deltaco.pages.arguments import LookArguments
+from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions
 from lerobot_deltaco.pages.html import EpisodeView, render
 from lerobot_deltaco.pages.look import look
 from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_localization, encode_video
@@ -127,6 +127,19 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     for what, number in zip(("pick", "place"), right.sum(dim=0).tolist(), strict=True):
         assert f"Episodes with the right {what} location: <b>{number} of 3</b>" in text
         assert f"Episodes with the right {what} location: {number} of 3\n" in report
+
+
+def test_a_point_takes_the_place_of_demonstrations(tmp_path):
+    write_robot_dataset(tmp_path / "data", [4, 4])
+    arguments = [str(save_tiny_policy(tmp_path / "policy")), str(tmp_path / "data"), 2, tmp_path / "out"]
+    look(LookArguments(*arguments, policy=PromptOptions(demo_point="[10, 20]")))
+    assert (tmp_path / "out/index.html").read_text().count("where a point shows the object") == 2
+    with pytest.raises(ValueError, match="picture, which has 48 x 48 px"):
+        look(LookArguments(*arguments, policy=PromptOptions(demo_point="[480, 20]")))
+    with pytest.raises(ValueError, match=r"a list of numbers, such as \[320,240\]. Got '4 5'"):
+        PromptOptions(demo_point="4 5")
+    with pytest.raises(ValueError, match="need the episodes of a --dataset"):
+        LookArguments("policy", policy=PromptOptions(demo_photo="cup.png"))
 
 
 def test_an_episode_is_marked_as_right_wrong_or_unknown():

@@ -14,7 +14,8 @@ from gym_deltaco.env import PickPlaceEnv
 from gym_deltaco.layout import Layout, PlacedContainer
 from gym_deltaco.sim.workspace import CONTAINER_FLOOR, Quadrant
 from gym_deltaco.tasks import OBJECTS, TASKS, get_task
-from lerobot_deltaco.evaluation.video import Recording, image_locations
+from lerobot_deltaco.evaluation.photos import image_locations
+from lerobot_deltaco.evaluation.video import Recording
 from lerobot_deltaco.pages.player import BOTH, DEMONSTRATION, INSTRUCTION, Choice, Player
 from lerobot_deltaco.pages.verdict import describe_outcome, describe_words, judge
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace

@@ -87,7 +87,11 @@ def robot_data(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("policy_type", "task"),
-    [("deltaco", ["--task=drop it"]), ("deltaco_match", ["--task=in words", "--policy.demo_episode=0"])],
+    [
+        ("deltaco", ["--task=drop it"]),
+        ("deltaco_match", ["--task=in words", "--policy.demo_episode=0"]),
+        ("deltaco_match", ["--task=in words", "--policy.demo_point=[8, 14]"]),
+    ],
 )
 def test_rollouts_move_a_robot_by_the_demonstration_of_a_new_task(
     robot_data, tmp_path, monkeypatch, policy_type, task

@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 # Choice of `chunk_size`: its duration and the least duration of the episodes, in s, and its maximum.
 _CHUNK_SECONDS, _MIN_CHUNKED_SECONDS, _MAX_CHUNK = 2 / 3, 2.5, 50
 # Options that name files and datasets of the training machine, whose contents are in the checkpoint.
-SOURCES = ("paraphrases", "demo_repo_id", "demo_root")
+SOURCES = ("paraphrases", "demo_repo_id", "demo_root", "demo_point", "demo_photo")
 
 
 @dataclass
@@ -51,7 +51,7 @@ class TaskConditionedConfig(PreTrainedConfig):
         num_mixture_components: Number of Gaussians of the action's distribution. One averages two actions
             that are equally good; of several, the policy cycles through the likely ones.
         gripper: Gripper's dimension of the action: an index, "auto" (of those whose name contains "gripper",
-            the one that moves most) or "none".
+            the one that moves most; for `deltaco_match` made without a dataset, the last) or "none".
         gripper_closed: Whether low or high values of the gripper's dimension mean closed.
         demo_camera: Name of the camera of demonstrations, such as "observation.images.front". By default, the
             first.
@@ -303,7 +303,8 @@ class TaskConditionedConfig(PreTrainedConfig):
     def _save_pretrained(self, save_directory: Path) -> None:
         saved = copy.copy(self)
         for name in SOURCES:
-            setattr(saved, name, None)
+            if hasattr(saved, name):
+                setattr(saved, name, None)
         PreTrainedConfig._save_pretrained(saved, save_directory)
 
     def get_optimizer_preset(self) -> AdamWConfig:

@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -22,6 +23,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_deltaco.data.demonstrations import Demonstration, DemonstrationBank
+from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.data.reading import compare_robots, open_dataset
 from lerobot_deltaco.data.training_data import DatasetEpisodes, Episodes, TrainingData
 from lerobot_deltaco.errors import UserError
@@ -46,7 +48,7 @@ logger = logging.getLogger(__name__)
 # Normalized actions are in -1..1; a policy may overshoot, but not by that much.
 _ABSURD_ACTION = 100.0
 
-DemonstrationsOfTasks = Sequence[Sequence[Demonstration]]
+DemonstrationsOfTasks = Sequence[Sequence[Demonstration | ObjectPrompt]]
 
 
 class TrainingDivergedError(UserError, FloatingPointError):
@@ -75,6 +77,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     policy_network: PolicyNetwork
     config_class: ClassVar[type] = TaskConditionedConfig
     name = "task_conditioned"
+    takes_prompts: ClassVar[bool] = False  # in place of demonstrations
 
     def __init__(
         self,
@@ -123,10 +126,16 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         Args:
             instructions: Instruction of each sample; an empty string leaves it out.
             demonstrations: One or more demonstrations of each sample's task; an empty list leaves them out.
+                For `deltaco_match`, one `ObjectPrompt` may take their place.
 
         Raises:
-            ValueError: They differ in number.
+            ValueError: They differ in number, or the policy takes no prompts.
         """
+        if not self.takes_prompts and any(isinstance(each, ObjectPrompt) for each in chain(*demonstrations)):
+            raise UserError(
+                f"A policy of the type {self.name!r} needs demonstrations: a point, box or photo is for "
+                "deltaco_match."
+            )
         if len(instructions) != len(demonstrations):
             raise UserError(
                 f"There must be as many lists of demonstrations as instructions. Got {len(demonstrations)} "
@@ -168,6 +177,11 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         if self._begins_episode(batch) or self._actions.need_chunks:
             self._actions.refill(self.predict_action_chunk(batch))
         return self._actions.pop()
+
+    def drop_queued_actions(self) -> None:
+        """Drops the rest of the running chunks. LeRobot calls this when the task changes."""
+        self._actions.clear()
+        self._ensemble = None
 
     @property
     def pick_confidence(self) -> Tensor | None:

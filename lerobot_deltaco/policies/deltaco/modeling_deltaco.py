@@ -242,7 +242,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
     def _embed_demonstrations(self, demonstrations: DemonstrationsOfTasks, device: torch.device) -> Tensor:
         """Returns embeddings of the first demonstration of each sample, (batch, embedding)."""
         assert self.demo_encoder is not None
-        present = [own[0] for own in demonstrations if own]
+        present = [each for own in demonstrations for each in own[:1] if isinstance(each, Demonstration)]
         embeddings = torch.zeros(len(demonstrations), self.config.demo_dim, device=device)
         if not present:
             return embeddings

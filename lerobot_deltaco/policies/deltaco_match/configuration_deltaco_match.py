@@ -24,13 +24,18 @@ class DeltacoMatchConfig(TaskConditionedConfig):
 
     Args:
         acting: How the policy acts. "replay": the demonstration's trajectory is replayed, moved to where the
-            policy picks and places; without a trajectory, the policy network acts. "network": it always does.
-            Training is the same: a checkpoint acts either way. With None, training chooses "replay" for up to
-            200 episodes.
+            policy picks and places; without a demonstrated one, that of the training episode whose grasp and
+            release were nearest. "network": the policy network acts. Training is the same: a checkpoint acts
+            either way. With None, training chooses "replay" for up to 200 episodes.
         crop_size: Side of the square around an object that is compared, in the middle of the first camera's
             image and as a fraction of its side. Used only where objects do not stand out from other scenes,
             such as after a camera was moved during recording; otherwise, the size of objects is measured.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation.
+        demo_point: Point [x, y] or box [left, top, right, bottom] on the object to pick, px, in place of a
+            demonstration: in the first image of the episode by the camera of demonstrations, or in
+            `demo_photo`. The instruction says where to put the object.
+        demo_photo: Image file that shows the object, in place of a demonstration. With a box in `demo_point`,
+            by any camera; with a point, by the camera of demonstrations; without, the object fills it.
         grasp_height_bias: Height offset that is added to the estimate when the policy acts, in standard
             deviations over the training episodes; larger is farther along the approach. On a robot, a gripper
             that goes too far presses into the table. The benchmark's recipes choose 0.5, for flat objects.
@@ -52,6 +57,8 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     acting: str | None = None
     crop_size: float = 0.17
     n_demonstrations: int = 1
+    demo_point: list[float] | None = None
+    demo_photo: str | None = None
     num_mixture_components: int = 5
     grasp_height_bias: float = 0.0
     location_noise: float = 0.04
@@ -124,6 +131,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         Raises:
             ValueError: There is no camera, no state, or no gripper.
         """
+        if self.gripper == "auto" and self.action_feature is not None:
+            # Made without a dataset, which names dimensions.
+            self.gripper = str(self.action_feature.shape[0] - 1)
         super().validate_features()
         if self.gripper_index is None or not self.state_dim:
             raise UserError(

@@ -32,10 +32,11 @@ from lerobot.processor import NormalizerProcessorStep, TransitionKey, create_tra
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_deltaco.data.demonstrations import RobotData
+from lerobot_deltaco.data.demonstrations import Demonstration, RobotData
 from lerobot_deltaco.data.grasps import warn_of_missing
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
 from lerobot_deltaco.data.gripper_states import find_gripper_states
+from lerobot_deltaco.data.object_prompts import ObjectPrompt, read_prompt
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
 from lerobot_deltaco.errors import UserError
@@ -57,6 +58,7 @@ from lerobot_deltaco.policies.deltaco_match.place import (
     PlaceNetwork,
     peak_locations,
 )
+from lerobot_deltaco.policies.deltaco_match.prompts import choose_prompted, describe_prompts, prompts_of
 from lerobot_deltaco.policies.deltaco_match.words import (
     INSTRUCTION_DIM,
     InstructionEncoder,
@@ -141,6 +143,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     config_class = DeltacoMatchConfig
     name = "deltaco_match"
+    takes_prompts = True
 
     def __init__(
         self,
@@ -179,6 +182,15 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self.training_locations: TrainingLocations | None = None
         self._held_out: dict[int, TrainingLocations] = {}
         self._given_states: Tensor | None = None  # by `set_pick_and_place`
+        self._prompt = self._read_prompt()
+
+    def _read_prompt(self) -> ObjectPrompt | None:
+        """Returns the object that the options show in place of a demonstration."""
+        config = self.config
+        if config.demo_point is None and config.demo_photo is None:
+            return None
+        _, height, width = config.image_features[config.cameras[0]].shape
+        return read_prompt(config.demo_point, config.demo_photo, (width, height))
 
     # Training
 
@@ -306,7 +318,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """Returns the actions of a chunk, (batch, steps, action). See `select_action`."""
         if self._begins_episode(batch):
             instructions, demonstrations = self._tasks_of(batch)
-            if demonstrations is None:
+            if demonstrations is None and self._prompt is not None:
+                demonstrations = [[self._prompt]] * len(instructions)
+            elif demonstrations is None:
                 demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
             localization = self.localize(batch, instructions, demonstrations)
             if (states := self._given_states) is not None:
@@ -373,8 +387,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         Args:
             batch: As in `select_action`, at the start of the episodes.
             instructions: Instruction of each sample; an empty string leaves it out.
-            demonstrations: Demonstrations of each sample, the same number for each; an empty list leaves them
-                out.
+            demonstrations: Demonstrations of each sample, the same number for each, or one `ObjectPrompt`; an
+                empty list leaves them out.
 
         Raises:
             ValueError: Neither is given, or samples have different numbers of demonstrations.
@@ -383,9 +397,12 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
         self.matching.camera_motion(batch[camera][0])  # warns
         by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
-        given = self._batch_demonstrations(demonstrations, scenes.device)
+        prompts = prompts_of(instructions, demonstrations)
+        given = None if prompts else self._batch_demonstrations(demonstrations, scenes.device)
         attention = last = descriptors = heights = None
-        if given is None:
+        if prompts:
+            descriptors = describe_prompts(self.matching, prompts, scenes, batch[camera])
+        elif given is None:
             if not bool(by_instruction.all()):
                 raise UserError("Neither a demonstration nor an instruction is given. Pass one of them.")
         else:
@@ -402,6 +419,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             heights = self.state_regressor.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
             attention, last = attentions[::n_each], ends[::n_each, 1]
         candidates = self.matching.find(scenes, batch[camera], instructions, descriptors, heights)
+        if prompts:
+            candidates = choose_prompted(candidates, prompts, self.matching.grasp_radius)
         proposal, confidence, height = candidates.best
         pick = self.matching.grasps(batch[camera], proposal)
         place_maps = self._place_maps(
@@ -454,7 +473,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         (n_each,) = counts
         if not n_each:
             return None
-        flat = list(chain.from_iterable(demonstrations))
+        flat = [each for given in demonstrations for each in given if isinstance(each, Demonstration)]
         unknown = torch.full((self.config.state_dim,), torch.nan)
         parts = (
             torch.stack([shown.frames[[0, -1]] for shown in flat]).to(device).float() / 255,
@@ -490,10 +509,24 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """
         command = self.config.gripper_command
         assert command is not None
-        read = [self.replay.trajectory(shown[0] if shown else None, command) for shown in demonstrations]
+        first = [given[0] if given else None for given in demonstrations]
+        read = [self.replay.trajectory(shown, command) for shown in first]
         reasons = {each for each in read if isinstance(each, str)}
-        if reasons:
-            logger.warning("The policy network acts, since no demonstration can be replayed: %s.", *reasons)
+        if reasons and self.replay.n_trajectories:
+            logger.info("The nearest training episode is replayed: %s.", "; ".join(sorted(reasons)))
+            at = self.state_regressor.to_image(self.replay.stored_grasp_states).clamp(
+                -1, 1
+            )  # (trajectories, 2, 2)
+            nearest = torch.cdist(localization.locations.flatten(1), at.flatten(1)).argmin(dim=1).tolist()
+            read = [
+                self.replay.stored_trajectory(row, command) if isinstance(each, str) else each
+                for each, row in zip(read, nearest, strict=True)
+            ]
+        elif reasons:
+            logger.warning(
+                "The policy network acts, since no demonstration can be replayed: %s.",
+                "; ".join(sorted(reasons)),
+            )
         replayed = torch.tensor([isinstance(each, Trajectory) for each in read], device=self.step.device)
         trajectories = [each for each in read if isinstance(each, Trajectory)]
         if not trajectories:
@@ -590,6 +623,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             is_arm,
             self.config.gripper_index,
         )
+        if self.config.acting == "replay":
+            command = self.config.gripper_command
+            assert command is not None
+            spans = [slice(first, last + 1) for first, last in robot.spans]
+            replay.store([(robot.states[span], robot.actions[span]) for span in spans], command)
 
     def fit_matching(self) -> None:
         """Fits feature matching to the first images of the training episodes, in minutes.

@@ -13,7 +13,7 @@ Nothing here looks at images.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.data.grasps import Grasp, find_grasps
 from lerobot_deltaco.data.gripper import Gripper
+from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.errors import UserError
 
 # Frames after which the effect of an action is looked for: at most so many, and this part of an episode.
@@ -36,6 +37,8 @@ _LEAST_APPROACH = 0.1  # of the tolerance, in a frame that comes closer
 _MAX_WAIT = 2  # frames that a state is waited for without coming closer
 _LEAST_EXPLAINED = 0.1  # of the variance of an action, by the dimension of the state that it moves
 _VELOCITY = 0.8  # coefficient of determination above which a dimension is a velocity
+_MAX_STORED = 48  # trajectories of training episodes
+_STORED = ("stored_states", "stored_actions", "stored_lengths", "stored_grasp_states")
 
 
 class Trajectory(NamedTuple):
@@ -91,6 +94,8 @@ class TrajectoryReplay(nn.Module):
         lag: Frames after which the effect of an action is looked for, () int64.
         is_arm: 1 for the dimensions of the state that are followed, else 0, (state,).
         usual_step: Distance that is usual between successive states, as the size of an action, ().
+        stored_grasp_states: States at the grasps and releases of stored trajectories, as in the dataset,
+            (trajectories, 2, state).
     """
 
     displacement_gain: Tensor
@@ -102,6 +107,10 @@ class TrajectoryReplay(nn.Module):
     action_shift: Tensor
     state_scale: Tensor
     state_shift: Tensor
+    stored_states: Tensor
+    stored_actions: Tensor
+    stored_lengths: Tensor
+    stored_grasp_states: Tensor
 
     def __init__(self, state_dim: int, action_dim: int) -> None:
         super().__init__()
@@ -115,6 +124,19 @@ class TrajectoryReplay(nn.Module):
         self.register_buffer("action_shift", torch.zeros(action_dim))
         self.register_buffer("state_scale", torch.ones(state_dim))
         self.register_buffer("state_shift", torch.zeros(state_dim))
+        # States and actions of training episodes, one after the other, as in the dataset.
+        self.register_buffer("stored_states", torch.zeros(0, state_dim))
+        self.register_buffer("stored_actions", torch.zeros(0, action_dim))
+        self.register_buffer("stored_lengths", torch.zeros(0, dtype=torch.int64))
+        self.register_buffer("stored_grasp_states", torch.zeros(0, 2, state_dim))
+        self.register_load_state_dict_pre_hook(self._add_state)
+
+    @staticmethod
+    def _add_state(module: TrajectoryReplay, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
+        """Makes room for stored trajectories."""
+        for name in _STORED:
+            state_dict.setdefault(prefix + name, getattr(module, name))
+            setattr(module, name, getattr(module, name).new_empty(state_dict[prefix + name].shape))
 
     def fit(self, trajectories: Sequence[tuple[Tensor, Tensor]], is_arm: Tensor, gripper_index: int) -> None:
         """Fits the inverse dynamics.
@@ -153,11 +175,41 @@ class TrajectoryReplay(nn.Module):
         steps = torch.cat([self._distance(s[1:] - s[:-1]) for s, _ in trajectories])
         self.usual_step.copy_(steps.quantile(0.9))
 
+    def store(self, episodes: Sequence[tuple[Tensor, Tensor]], command: Gripper) -> None:
+        """Stores trajectories of some training episodes, for tasks without a demonstrated one.
+
+        Args:
+            episodes: States (frames, state) and actions (frames, action) of each, as in the dataset.
+            command: How the gripper is read from an action.
+        """
+        read = [(each, self._trajectory(*each, command)) for each in episodes]
+        usable = [(each, found) for each, found in read if isinstance(found, Trajectory)]
+        usable = usable[:: -(-len(usable) // _MAX_STORED) or 1]
+        states, actions = zip(*(each for each, _ in usable), strict=True)
+        self.stored_states, self.stored_actions = torch.cat(states).float(), torch.cat(actions).float()
+        self.stored_lengths = torch.tensor([len(each) for each in states], device=self.is_arm.device)
+        self.stored_grasp_states = torch.stack([found.grasp_states for _, found in usable])
+
+    @property
+    def n_trajectories(self) -> int:
+        """Number of stored trajectories."""
+        return len(self.stored_grasp_states)
+
+    def stored_trajectory(self, number: int, command: Gripper) -> Trajectory:
+        """Returns a stored trajectory. See `store`."""
+        lengths = self.stored_lengths.tolist()
+        states, actions = (each.split(lengths)[number] for each in (self.stored_states, self.stored_actions))
+        found = self._trajectory(states, actions, command)
+        assert isinstance(found, Trajectory)
+        return found
+
     def _distance(self, displacements: Tensor) -> Tensor:
         """Returns the size of the actions that make displacements of states, (...)."""
         return (displacements @ self.displacement_gain).norm(dim=-1)
 
-    def trajectory(self, demonstration: Demonstration | None, command: Gripper) -> Trajectory | str:
+    def trajectory(
+        self, demonstration: Demonstration | ObjectPrompt | None, command: Gripper
+    ) -> Trajectory | str:
         """Returns the trajectory of a demonstration, or the reason why it cannot be replayed.
 
         Args:
@@ -172,13 +224,15 @@ class TrajectoryReplay(nn.Module):
                 "The checkpoint was trained by a version that could not replay demonstrations. Train it "
                 "again, or act with --policy.acting=network."
             )
-        if demonstration is None:
-            return "none was given"
+        if not isinstance(demonstration, Demonstration):
+            return "no demonstration is given"
         if demonstration.states is None or demonstration.actions is None:
             return "the demonstration has no states and actions of the robot"
-        states, actions = (
-            each.to(self.is_arm.device).float() for each in (demonstration.states, demonstration.actions)
-        )
+        return self._trajectory(demonstration.states, demonstration.actions, command)
+
+    def _trajectory(self, states: Tensor, actions: Tensor, command: Gripper) -> Trajectory | str:
+        """Returns the trajectory of an episode, or the reason why it has no grasp."""
+        states, actions = (each.to(self.is_arm.device).float() for each in (states, actions))
         span = (0, len(states) - 1)
         (grasp,) = find_grasps(command.opening(actions), [span], command.usual_range, states)
         if isinstance(grasp, str):
