@@ -33,8 +33,7 @@ def main(suite: str = "libero_object", task_id: int = 0, image_size: int = 256, 
     start = time.perf_counter()
     env.reset(seed=0)
     results["first reset, which makes the scene, s"] = time.perf_counter() - start
-    scene, cameras = env._scene, env._cameras
-    assert scene is not None
+    scene, cameras = env.scene, env._cameras
     assert cameras is not None
     results["reset, s"] = seconds_of(lambda: env.reset(seed=1))
     results["action, ms"] = 1e3 * seconds_of(lambda: scene.step(NO_ACTION))

@@ -75,6 +75,20 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
         yield _action(scene, np.array([0, 0, 0.08]), grasp.axis, -1)
 
 
+def grasp_and_release(scene: Scene, target: str, place: str) -> np.ndarray:
+    """Returns the robot's states, (2, 8) float32, in which the hand would grasp and release an object.
+
+    Arguments are those of `pick_and_place`. The fingers are as they are now.
+    """
+    grasp = find_grasp(scene, target, _hand_axis(scene))
+    origin = scene.position(target)
+    bottom = scene.vertices(target)[:, 2].min() - origin[2]
+    released = np.array([*scene.position(place)[:2], _rim(scene, place) + RELEASE - bottom])
+    angle = turn(grasp.axis, _hand_axis(scene))
+    hands = (grasp.point, grasp.point + released - origin)
+    return np.stack([scene.robot_state_at(hand, angle) for hand in hands])
+
+
 def _hand_axis(scene: Scene) -> np.ndarray:
     """Returns the horizontal direction in which the fingers close, (2,)."""
     return scene.hand_rotation()[:2, 0]
