@@ -21,6 +21,11 @@ TRIED_WITH = ("0.6.1", "0.6.2")
 PREDICTION: str | None = getattr(constants, "PREDICTION", None)
 
 
+def action_of(output: Any) -> Any:
+    """Returns the action in what a policy's `select_action` gives."""
+    return output[constants.ACTION] if isinstance(output, dict) else output
+
+
 @contextmanager
 def replaced(make_card: Callable[..., Any], **replacements: Callable[..., Any]) -> Iterator[None]:
     """Replaces functions by their names in LeRobot's training script, in a context.

@@ -40,6 +40,7 @@ from lerobot_deltaco.evaluation.oracle import (
 )
 from lerobot_deltaco.evaluation.photos import take_photo
 from lerobot_deltaco.evaluation.records import EvaluationPlan, Oracle
+from lerobot_deltaco.lerobot_versions import action_of
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
 from lerobot_deltaco.processes import disable_malloc_trim, end_with_parent
 
@@ -230,7 +231,8 @@ def run_episodes(
                 offsets = np.stack([rng.normal(0, np.radians(joint_noise), N_JOINTS) for rng in generators])
                 stacked["agent_pos"][:, :N_JOINTS] += offsets.astype(np.float32)
             batch = {**preprocess_observation(stacked), "task": instructions}
-            actions = loaded.postprocessor(policy.select_action(loaded.preprocessor(batch))).cpu().numpy()
+            output = policy.select_action(loaded.preprocessor(batch))
+            actions = loaded.postprocessor(action_of(output)).cpu().numpy()
             if oracle == "controller":  # The policy's first action has localized.
                 controllers = make_controllers(policy, envs)
         if controllers:

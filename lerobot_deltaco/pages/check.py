@@ -37,10 +37,10 @@ from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, re
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments, episode_numbers
 from lerobot_deltaco.pages.html import picture_uri, write_page
-from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
 from lerobot_deltaco.policies.deltaco_match.proposals import N_OBJECTS
 from lerobot_deltaco.training.train import image_size_in_memory
 

@@ -23,11 +23,12 @@ from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions, episode_numbers, point_numbers
 from lerobot_deltaco.pages.html import EpisodeView, picture_uri, write_page
-from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
 from lerobot_deltaco.pages.player import Player
-from lerobot_deltaco.pages.verdict import TOLERANCE, describe_words
+from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
+from lerobot_deltaco.policies.deltaco_match.findings import describe_words
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset

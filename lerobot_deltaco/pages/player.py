@@ -18,8 +18,10 @@ from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.records import EvaluationPlan
 from lerobot_deltaco.evaluation.video import benchmark_env, find_demonstration, record_episode
 from lerobot_deltaco.pages.html import EpisodeView, picture_uri
-from lerobot_deltaco.pages.pictures import demonstration_ends, draw_localization, video_uri
-from lerobot_deltaco.pages.verdict import describe_words, judge, object_name
+from lerobot_deltaco.pages.verdict import judge, object_name
+from lerobot_deltaco.pages.videos import video_uri
+from lerobot_deltaco.policies.deltaco_match.findings import describe_words
+from lerobot_deltaco.policies.deltaco_match.pictures import demonstration_ends, draw_localization
 
 BOTH, DEMONSTRATION, INSTRUCTION = "Both", "Demonstration only", "Instruction only"
 MAX_SEED = 9999

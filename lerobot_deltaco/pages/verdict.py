@@ -7,7 +7,6 @@ only; for others, the verdict compares what happened with what the policy unders
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import cache
 from typing import NamedTuple
 
@@ -21,8 +20,7 @@ from gym_deltaco.sim.workspace import CONTAINER_FLOOR, TABLE_TOP, TRAY_CENTER, T
 from gym_deltaco.tasks import TASKS, Task
 from lerobot_deltaco.evaluation.photos import image_locations
 from lerobot_deltaco.evaluation.video import Recording
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
-from lerobot_deltaco.policies.deltaco_match.words import understand, words_of
+from lerobot_deltaco.policies.deltaco_match.words import words_of
 
 # A location belongs to what is within this distance of it: a tenth of the image's side. In the benchmark, the
 # centers of objects are at least 0.26 apart, and the shipped policy's place locations are within 0.13 of the
@@ -66,7 +64,7 @@ def judge(recording: Recording, sentence: str, demonstrated: Task | None, words:
         recording: The episode.
         sentence: Instruction that the policy received; empty for none.
         demonstrated: Task whose demonstration the policy received; None for none.
-        words: How the policy read the sentence, as of `describe_words`.
+        words: How the policy read the sentence, as of `findings.describe_words`.
     """
     understanding, placements = understand_locations(recording), recording.placements
     lines = [describe_outcome(recording)]
@@ -147,23 +145,6 @@ def understand_locations(recording: Recording) -> Understanding | None:
 def _nearest(location: NDArray[np.float64], others: NDArray[np.float64]) -> int:
     distances = np.linalg.norm(others - location, axis=1)
     return int(distances.argmin()) if distances.min() < TOLERANCE else -1
-
-
-def describe_words(policy: DeltacoMatchPolicy, sentence: str) -> str:
-    """Returns which words of an instruction a policy reads as the object's, misreads and does not know."""
-    if not sentence:
-        return ""
-    about = _quoted(dict(policy.matching.understood(sentence)))
-    read = dict(zip(words_of(sentence), understand(sentence, policy.config.known_words), strict=True))
-    unknown = _quoted(word for word, meaning in read.items() if meaning is None)
-    others = [f"“{word}” as “{meaning}”" for word, meaning in read.items() if meaning not in (None, word)]
-    text = f"Words for the object: {about}." if about else "No word for the object."
-    text += f" Read {', '.join(others)}." if others else ""
-    return text + (f" Unknown words: {unknown}." if unknown else "")
-
-
-def _quoted(words: Iterable[str]) -> str:
-    return ", ".join(f"“{word}”" for word in words)
 
 
 # In words

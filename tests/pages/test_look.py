@@ -23,9 +23,10 @@ from lerobot_deltaco.pages import look as look_module
 from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions
 from lerobot_deltaco.pages.html import EpisodeView, render
 from lerobot_deltaco.pages.look import look
-from lerobot_deltaco.pages.pictures import PICK_COLOR, PLACE_COLOR, draw_localization, encode_video
 from lerobot_deltaco.pages.verdict import TOLERANCE
+from lerobot_deltaco.pages.videos import encode_video
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
+from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
 
 
 def found_at(pick, place, by_demonstration=(True, True), size=24):

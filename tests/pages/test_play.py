@@ -17,7 +17,8 @@ from gym_deltaco.tasks import OBJECTS, TASKS, get_task
 from lerobot_deltaco.evaluation.photos import image_locations
 from lerobot_deltaco.evaluation.video import Recording
 from lerobot_deltaco.pages.player import BOTH, DEMONSTRATION, INSTRUCTION, Choice, Player
-from lerobot_deltaco.pages.verdict import describe_outcome, describe_words, judge
+from lerobot_deltaco.pages.verdict import describe_outcome, judge
+from lerobot_deltaco.policies.deltaco_match.findings import describe_words
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
 
 # The verdict

@@ -20,9 +20,10 @@ from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import Deltac
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "pick_place"
 
-pytestmark = pytest.mark.usefixtures("fake_language", "short_fit")
+small = pytest.mark.usefixtures("fake_language", "short_fit")  # not for the shipped checkpoint
 
 
+@small
 def test_features_of_the_dataset_become_inputs_and_outputs(make, dataset):
     config = make()[0].config
     assert {name: feature.shape for name, feature in config.image_features.items()} == {
@@ -38,6 +39,7 @@ def test_features_of_the_dataset_become_inputs_and_outputs(make, dataset):
     assert torch.isfinite(policy(before(batch_of(dataset, [0, 7])))[0])
 
 
+@small
 def test_processors_normalize_and_revert_it(make, dataset):
     _, before, after = make()
     raw = batch_of(dataset, list(range(len(dataset))))
@@ -85,6 +87,7 @@ def robot_data(tmp_path_factory):
     return [write_robot_dataset(folder / name, own) for name, own in tasks.items()]
 
 
+@small
 @pytest.mark.parametrize(
     ("policy_type", "task"),
     [

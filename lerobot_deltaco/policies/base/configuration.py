@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 # Choice of `chunk_size`: its duration and the least duration of the episodes, in s, and its maximum.
 _CHUNK_SECONDS, _MIN_CHUNKED_SECONDS, _MAX_CHUNK = 2 / 3, 2.5, 50
 # Options that name files and datasets of the training machine, whose contents are in the checkpoint.
-SOURCES = ("paraphrases", "demo_repo_id", "demo_root", "demo_point", "demo_photo")
+SOURCES = ("paraphrases", "demo_repo_id", "demo_root", "demo_point", "demo_photo", "picture_folder")
 
 
 @dataclass

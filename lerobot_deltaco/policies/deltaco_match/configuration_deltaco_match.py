@@ -36,6 +36,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             `demo_photo`. The instruction says where to put the object.
         demo_photo: Image file that shows the object, in place of a demonstration. With a box in `demo_point`,
             by any camera; with a point, by the camera of demonstrations; without, the object fills it.
+        picture_folder: Folder in which a picture of what was found is written at the start of each episode.
         grasp_height_bias: Height offset that is added to the estimate when the policy acts, in standard
             deviations over the training episodes; larger is farther along the approach. On a robot, a gripper
             that goes too far presses into the table. The benchmark's recipes choose 0.5, for flat objects.
@@ -59,6 +60,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     n_demonstrations: int = 1
     demo_point: list[float] | None = None
     demo_photo: str | None = None
+    picture_folder: str | None = None
     num_mixture_components: int = 5
     grasp_height_bias: float = 0.0
     location_noise: float = 0.04

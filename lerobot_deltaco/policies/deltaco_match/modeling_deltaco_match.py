@@ -40,6 +40,7 @@ from lerobot_deltaco.data.object_prompts import ObjectPrompt, read_prompt
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
 from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.lerobot_versions import PREDICTION
 from lerobot_deltaco.policies.base.augmentation import (
     change_colors,
     random_color_changes,
@@ -50,6 +51,7 @@ from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.policies.deltaco_match.findings import predicted_boxes, report_findings
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
 from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.place import (
@@ -66,6 +68,7 @@ from lerobot_deltaco.policies.deltaco_match.words import (
     vocabulary_of,
 )
 from lerobot_deltaco.policies.geometry.calibration import MIN_EPISODES
+from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
 from lerobot_deltaco.policies.geometry.replay import Reference, Trajectory, TrajectoryReplay
 from lerobot_deltaco.policies.geometry.states import N_LOCATIONS, StateRegressor, TrainingLocations
 
@@ -93,6 +96,8 @@ class PickPlace(NamedTuple):
         by_demonstration: Whether the demonstration decided on the pick and on the place location. Otherwise,
             the attention is meaningless.
         confidence: Probability of the pick location among the proposals, (batch,).
+        camera_motion: How far the camera has moved since the training, by the first scene; None if it is not
+            known.
     """
 
     locations: Tensor
@@ -101,6 +106,7 @@ class PickPlace(NamedTuple):
     attention: Tensor | None
     by_demonstration: tuple[bool, bool]
     confidence: Tensor
+    camera_motion: CameraMotion | None = None
 
 
 class RunningEpisode(NamedTuple):
@@ -313,6 +319,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
 
     # Acting
 
+    def select_action(self, batch: dict[str, Any], **options: Any) -> Any:
+        """Returns the next action; where LeRobot draws predictions (`PREDICTION`), a dict with boxes."""
+        action = super().select_action(batch, **options)
+        if PREDICTION is None or self.localization is None:
+            return action
+        return {ACTION: action, PREDICTION: predicted_boxes(self, self.localization)}
+
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
         """Returns the actions of a chunk, (batch, steps, action). See `select_action`."""
@@ -332,6 +345,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 reference, replayed = self._move_demonstrations(demonstrations, localization, batch)
             network = self._inference_network()
             self._start(RunningEpisode(instructions, localization, network, reference, replayed))
+            if len(instructions) == 1:
+                shown = demonstrations[0][0] if demonstrations[0] else None
+                report_findings(self, batch[self.config.cameras[0]][0], instructions[0], shown)
         episode: RunningEpisode = self._episode
         replay = None
         if episode.reference is not None:
@@ -400,7 +416,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """
         camera = self.config.cameras[0]
         scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
-        self.matching.camera_motion(batch[camera][0])  # warns
+        camera_motion = self.matching.camera_motion(batch[camera][0])  # warns
         by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
         prompts = prompts_of(instructions, demonstrations)
         given = None if prompts else self._batch_demonstrations(demonstrations, scenes.device)
@@ -438,6 +454,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             attention=attention,
             by_demonstration=(given is not None, given is not None and not bool(by_instruction.all())),
             confidence=confidence,
+            camera_motion=camera_motion,
         )
 
     def _place_maps(
@@ -519,9 +536,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         reasons = {each for each in read if isinstance(each, str)}
         if reasons and self.replay.n_trajectories:
             logger.info("The nearest training episode is replayed: %s.", "; ".join(sorted(reasons)))
-            at = self.state_regressor.to_image(self.replay.stored_grasp_states).clamp(
-                -1, 1
-            )  # (trajectories, 2, 2)
+            at = self.state_regressor.to_image(self.replay.grasp_states).clamp(-1, 1)  # (trajectories, 2, 2)
             nearest = torch.cdist(localization.locations.flatten(1), at.flatten(1)).argmin(dim=1).tolist()
             read = [
                 self.replay.stored_trajectory(row, command) if isinstance(each, str) else each

@@ -63,9 +63,7 @@ def describe_prompts(
                 side = float(matching.crop_sizes(torch.zeros(2, device=image.device)))
                 size = max(_MIN_CROP, round(side * height)), max(_MIN_CROP, round(side * width))
                 crop = cut_box(image, prompt.box, size)[None]
-                features = matching.encoder(
-                    crop, crop.new_zeros(1, 1, 2), torch.ones(1, 1, device=crop.device)
-                )
+                features = matching.features(crop, crop.new_zeros(1, 1, 2), crop.new_ones(1, 1))
             described.append(matching.compare(features).descriptors[:, 0])
     return torch.cat(described)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -38,8 +39,13 @@ class ImageProjection(nn.Module):
 
     Args:
         state_dim: Size of the robot's state.
+
+    Attributes:
+        residual: Median distance of changes in the training episodes from where they are expected, as a
+            fraction of the image's side, (); negative if it is not known.
     """
 
+    residual: Tensor
     mean: Tensor
     scale: Tensor
     weights: Tensor
@@ -49,6 +55,13 @@ class ImageProjection(nn.Module):
         self.register_buffer("mean", torch.zeros(state_dim))
         self.register_buffer("scale", torch.zeros(state_dim))
         self.register_buffer("weights", torch.zeros(_quadratic(self.mean).shape[-1], 2))
+        self.register_buffer("residual", torch.tensor(-1.0))
+        self.register_load_state_dict_pre_hook(self._add_residual)
+
+    @staticmethod
+    def _add_residual(module: ImageProjection, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
+        """Lets checkpoints that do not tell the residual be loaded."""
+        state_dict.setdefault(f"{prefix}residual", module.residual)
 
     def fit(self, first: Tensor, carried: Tensor, last: Tensor, states: Tensor, scale: Tensor) -> None:
         """Learns the map from episodes; warns if it fits badly.
@@ -73,6 +86,7 @@ class ImageProjection(nn.Module):
         self.weights.copy_(weights)
         locations = _quadratic(x) @ weights
         distance = _distance(near, locations)
+        self.residual.fill_(distance)
         # As near as this, something changes in any episode.
         others = locations.roll(1, dims=0)
         chance = _distance(_peaks_near(smooth, others), others)

@@ -38,7 +38,7 @@ _MAX_WAIT = 2  # frames that a state is waited for without coming closer
 _LEAST_EXPLAINED = 0.1  # of the variance of an action, by the dimension of the state that it moves
 _VELOCITY = 0.8  # coefficient of determination above which a dimension is a velocity
 _MAX_STORED = 48  # trajectories of training episodes
-_STORED = ("stored_states", "stored_actions", "stored_lengths", "stored_grasp_states")
+_STORED = ("stored_states", "stored_actions", "stored_lengths", "grasp_states")
 
 
 class Trajectory(NamedTuple):
@@ -94,7 +94,7 @@ class TrajectoryReplay(nn.Module):
         lag: Frames after which the effect of an action is looked for, () int64.
         is_arm: 1 for the dimensions of the state that are followed, else 0, (state,).
         usual_step: Distance that is usual between successive states, as the size of an action, ().
-        stored_grasp_states: States at the grasps and releases of stored trajectories, as in the dataset,
+        grasp_states: States at the grasps and releases of stored trajectories, as in the dataset,
             (trajectories, 2, state).
     """
 
@@ -110,7 +110,7 @@ class TrajectoryReplay(nn.Module):
     stored_states: Tensor
     stored_actions: Tensor
     stored_lengths: Tensor
-    stored_grasp_states: Tensor
+    grasp_states: Tensor
 
     def __init__(self, state_dim: int, action_dim: int) -> None:
         super().__init__()
@@ -128,15 +128,15 @@ class TrajectoryReplay(nn.Module):
         self.register_buffer("stored_states", torch.zeros(0, state_dim))
         self.register_buffer("stored_actions", torch.zeros(0, action_dim))
         self.register_buffer("stored_lengths", torch.zeros(0, dtype=torch.int64))
-        self.register_buffer("stored_grasp_states", torch.zeros(0, 2, state_dim))
-        self.register_load_state_dict_pre_hook(self._add_state)
+        self.register_buffer("grasp_states", torch.zeros(0, 2, state_dim))
+        self.register_load_state_dict_pre_hook(self._make_room)
 
     @staticmethod
-    def _add_state(module: TrajectoryReplay, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
-        """Makes room for stored trajectories."""
+    def _make_room(module: TrajectoryReplay, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
+        """Makes the buffers of stored trajectories as large as those that are loaded."""
         for name in _STORED:
-            state_dict.setdefault(prefix + name, getattr(module, name))
-            setattr(module, name, getattr(module, name).new_empty(state_dict[prefix + name].shape))
+            loaded = state_dict.setdefault(prefix + name, getattr(module, name))
+            setattr(module, name, getattr(module, name).new_empty(loaded.shape))
 
     def fit(self, trajectories: Sequence[tuple[Tensor, Tensor]], is_arm: Tensor, gripper_index: int) -> None:
         """Fits the inverse dynamics.
@@ -188,12 +188,12 @@ class TrajectoryReplay(nn.Module):
         states, actions = zip(*(each for each, _ in usable), strict=True)
         self.stored_states, self.stored_actions = torch.cat(states).float(), torch.cat(actions).float()
         self.stored_lengths = torch.tensor([len(each) for each in states], device=self.is_arm.device)
-        self.stored_grasp_states = torch.stack([found.grasp_states for _, found in usable])
+        self.grasp_states = torch.stack([found.grasp_states for _, found in usable])
 
     @property
     def n_trajectories(self) -> int:
         """Number of stored trajectories."""
-        return len(self.stored_grasp_states)
+        return len(self.grasp_states)
 
     def stored_trajectory(self, number: int, command: Gripper) -> Trajectory:
         """Returns a stored trajectory. See `store`."""

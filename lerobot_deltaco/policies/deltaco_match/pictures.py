@@ -1,27 +1,25 @@
-"""Pictures of where a policy looked, and videos of episodes."""
+"""Pictures of where the policy looked."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import av
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lerobot_deltaco.data.demonstrations import Demonstration
-from lerobot_deltaco.pages.html import data_uri
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
+
+if TYPE_CHECKING:
+    from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
 
 # No object and no container of the benchmark has these colors. They differ in lightness, so that they can be
 # told apart without color vision.
 PICK_COLOR, PLACE_COLOR = (225, 0, 170), (90, 240, 255)
-VIDEO_FPS = 8  # a third of the nominal frame rate, which is too fast to watch
 MIN_SIDE = 320  # px, below which a scene is enlarged
 _OPACITY = 0.65  # of a map at its maximum
-_HELD_SECONDS = 1.0  # for which the last frame of a video stays
 
 Color = tuple[int, int, int]
 
@@ -113,30 +111,3 @@ def _draw_cross(picture: Image.Image, location: Sequence[float]) -> None:
 def demonstration_ends(demonstration: Demonstration) -> NDArray[np.uint8]:
     """Returns the first and the last image of a demonstration, (2, H, W, 3)."""
     return demonstration.frames[[0, -1]].permute(0, 2, 3, 1).cpu().numpy()
-
-
-def video_uri(frames: Sequence[NDArray[np.uint8]]) -> str:
-    """Returns a video of images (H, W, 3) as a data URI."""
-    return data_uri("video/mp4", encode_video(frames))
-
-
-def encode_video(frames: Sequence[NDArray[np.uint8]], fps: int = VIDEO_FPS) -> bytes:
-    """Encodes an H.264 video in MP4, which browsers play. The last frame stays for a second.
-
-    Args:
-        frames: Images, (H, W, 3); an odd row or column is cut off.
-        fps: Frames per second.
-
-    Returns:
-        The content of the file.
-    """
-    content = io.BytesIO()
-    height, width = (side // 2 * 2 for side in frames[0].shape[:2])
-    with av.open(content, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=fps, options={"crf": "20"})
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for image in (*frames, *[frames[-1]] * round(_HELD_SECONDS * fps)):
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return content.getvalue()
