@@ -251,6 +251,9 @@ class LoadedPolicy(NamedTuple):
         if demo_root is not None:
             options += ["--demo_repo_id=local/demonstrations", f"--demo_root={demo_root}"]
         config = PreTrainedConfig.from_pretrained(folder, cli_overrides=options)
+        if getattr(config, "pretrained_backbone_weights", None) is not None:
+            # The checkpoint's weights replace them, so they need not be downloaded.
+            config.pretrained_backbone_weights = None
         policy = get_policy_class(config.type).from_pretrained(folder, config=config)
         policy.to(config.device).eval()
         device_step = {"device_processor": {"device": str(config.device)}}
