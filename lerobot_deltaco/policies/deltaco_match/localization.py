@@ -171,9 +171,9 @@ class FeatureMatching(nn.Module):
                 demonstrated = torch.full_like(scores[:, 0], torch.nan)
             heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
             log_p = (self.sharpness * scores).masked_fill(~crops.exists, -torch.inf).log_softmax(dim=1)
-            if bool(self.error_rate > 0):
-                log_p = torch.lerp(log_p.exp(), uniform(crops.exists), self.error_rate).log()
-            return Candidates(locations.nan_to_num(), log_p, heights, self.settings.map_std)
+            # The object may be none of these, however few they are.
+            p = torch.lerp(log_p.exp(), crops.exists / crops.exists.shape[1], self.error_rate)
+            return Candidates(locations.nan_to_num(), p.log(), heights, self.settings.map_std)
 
     def scores(self, crops: Crops, words: Tensor, described: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scores the crops of proposals by demonstrations and words.
