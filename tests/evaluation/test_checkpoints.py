@@ -172,12 +172,14 @@ def test_weights_that_are_not_finite_are_neither_loaded_nor_saved(checkpoint, ma
         checkpoint / "model.safetensors",
         lambda tensors, _: tensors["policy_network.raw_log_std"].fill_(torch.nan),
     )
-    with pytest.raises(ValueError, match="is damaged: the weight model.raw_log_std has numbers that are not"):
+    with pytest.raises(ValueError, match="is damaged: the weight policy_network.raw_log_std has numbers"):
         DeltacoPolicy.from_pretrained(checkpoint)
     policy, _, _ = make()
     with torch.no_grad():
         policy.policy_network.raw_log_std.fill_(torch.inf)
-    with pytest.raises(TrainingDivergedError, match="weight model.raw_log_std is not finite, and no chec"):
+    with pytest.raises(
+        TrainingDivergedError, match="weight policy_network.raw_log_std is not finite, and no"
+    ):
         policy.save_pretrained(tmp_path / "new")
     assert not (tmp_path / "new" / "model.safetensors").exists()
 
