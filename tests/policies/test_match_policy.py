@@ -384,7 +384,7 @@ def test_the_network_acts_where_a_demonstration_cannot_be_replayed(make, table, 
     # Each sample of a batch on its own
     both = act([by_camera], [shown])
     torch.testing.assert_close(both[1:], replayed)
-    torch.testing.assert_close(both[:1], act([by_camera]))
+    torch.testing.assert_close(both[:1], act([by_camera]), atol=1e-3, rtol=0)
     policy.replay.action_scale.zero_()
     policy.set_tasks([RED], [[shown]])
     with pytest.raises(ValueError, match="could not replay demonstrations. Train it again"):

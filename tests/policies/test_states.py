@@ -176,7 +176,7 @@ def errors_at_the_pick(regressor, scale, shift, recording, joints=False):
         (False, 60, 3, 4, 10),
         (False, 120, 6, 4, 10),
         (True, 60, 0, 4, 20),
-        (True, 120, 6, 4, 15),
+        (True, 120, 6, 5, 15),
     ],
 )
 def test_location_and_height_give_the_state_at_the_pick(joints, n_episodes, accidents, median, p90):

@@ -47,13 +47,14 @@ class CropEncoder:
 
         Args:
             images: Images (batch, 3, H, W), uint8 or in 0..1, at their own resolution.
-            locations: Centers of the crops, (batch, n, 2) in -1..1.
+            locations: Centers of the crops, (batch, n, 2) in -1..1; NaN for none, whose features are NaN.
             sizes: Sides of the crops as fractions of the image's, (batch, n).
 
         Raises:
             PretrainedWeightsError: The network's weights are missing.
         """
-        crops = cut_crops(images, locations, sizes, _RESOLUTION).flatten(0, 1)
+        is_crop = ~locations.isnan().any(dim=2)
+        crops = cut_crops(images, locations.nan_to_num(), sizes.nan_to_num(nan=1.0), _RESOLUTION)[is_crop]
         mean, std = (
             torch.tensor(values, device=crops.device)[:, None, None]
             for values in (IMAGENET_MEAN, IMAGENET_STD)
@@ -65,7 +66,10 @@ class CropEncoder:
             last.mean(dim=(2, 3)),
             F.adaptive_avg_pool2d(crops, _COLOR_CELLS).flatten(1),
         ]
-        return torch.cat([part.float() for part in parts], dim=1).unflatten(0, locations.shape[:2])
+        features = torch.cat([part.float() for part in parts], dim=1)
+        every = features.new_full((*is_crop.shape, self.feature_dim), torch.nan)
+        every[is_crop] = features
+        return every
 
 
 @cache

@@ -387,7 +387,8 @@ def _word_losses(
     """
     settings, weights = matching.settings, matching.word_weights(words)
     named = crops.words[torch.arange(len(target)), target]  # (batch, vocabulary)
-    loss = F.cross_entropy(word_scores(crops.words, words, weights) + crops.objectness, target)
+    logits = word_scores(crops.words, words, weights) + crops.objectness
+    loss = F.cross_entropy(logits.masked_fill(~crops.exists, -torch.inf), target)
     known_weights = weights.detach() * (words > UNKNOWN_WORD)
     of_words = named.gather(1, (words - UNKNOWN_WORD - 1).clamp_min(0))
     naming = -(known_weights * of_words).sum(dim=1) / known_weights.sum(dim=1).clamp_min(1e-6)

@@ -32,7 +32,13 @@ from torch import Tensor, nn
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder
-from lerobot_deltaco.policies.deltaco_match.matching import HIDDEN_DIM, Crops, MatchingHead, word_scores
+from lerobot_deltaco.policies.deltaco_match.matching import (
+    HIDDEN_DIM,
+    Crops,
+    MatchingHead,
+    uniform,
+    word_scores,
+)
 from lerobot_deltaco.policies.deltaco_match.proposals import Background, ProposalNetwork, nearest_proposals
 from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner
 from lerobot_deltaco.policies.deltaco_match.words import (
@@ -46,6 +52,7 @@ from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
 
 logger = logging.getLogger(__name__)
 
+_MIN_PROBABILITY = 1e-9
 _MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
 # Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
 _APPEARANCE_STD = 0.7
@@ -55,7 +62,7 @@ class Candidates(NamedTuple):
     """What could be picked.
 
     Attributes:
-        locations: The proposals, (batch, n, 2) in -1..1.
+        locations: The proposals, (batch, n, 2) in -1..1; anywhere where there is none.
         log_probabilities: How likely each is what the task asks for, (batch, n).
         heights: Height offset of a grasp of each, (batch, n).
         map_std: Standard deviation of a candidate in a map, in cells.
@@ -163,11 +170,10 @@ class FeatureMatching(nn.Module):
             if demonstrated is None:
                 demonstrated = torch.full_like(scores[:, 0], torch.nan)
             heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
-            log_p = (self.sharpness * scores).log_softmax(dim=1)
-            if bool(self.error_rate > 0):
-                uniform = torch.full_like(log_p, 1 / log_p.shape[1])
-                log_p = torch.lerp(log_p.exp(), uniform, self.error_rate).log()
-            return Candidates(locations, log_p, heights, self.settings.map_std)
+            log_p = (self.sharpness * scores).masked_fill(~crops.exists, -torch.inf).log_softmax(dim=1)
+            # The object may be none of these, however few they are.
+            p = torch.lerp(log_p.exp(), crops.exists / crops.exists.shape[1], self.error_rate)
+            return Candidates(locations.nan_to_num(), p.log(), heights, self.settings.map_std)
 
     def scores(self, crops: Crops, words: Tensor, described: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scores the crops of proposals by demonstrations and words.
@@ -192,10 +198,9 @@ class FeatureMatching(nn.Module):
                 crops, described, settings.sharpness, settings.p_other_object * p_described
             )
             scores = (1 - p_unknown)[:, None] * scores
-        by_words = (scores + crops.objectness).softmax(dim=1)
-        p_misdescribed = settings.p_misdescribed
-        by_words = (1 - p_misdescribed) * by_words + p_misdescribed / scores.shape[1]
-        return matches + by_words.log(), similarity
+        by_words = (scores + crops.objectness).masked_fill(~crops.exists, -torch.inf).softmax(dim=1)
+        by_words = torch.lerp(by_words, uniform(crops.exists), settings.p_misdescribed)
+        return matches + by_words.clamp_min(_MIN_PROBABILITY).log(), similarity
 
     def camera_motion(self, scene: Tensor) -> CameraMotion | None:
         """Returns how far the camera has moved since the training, and warns if it has.

@@ -28,12 +28,14 @@ class Crops(NamedTuple):
         words: Log probabilities of the words of the vocabulary, (batch, n, words).
         objectness: Log odds that a crop shows something to grasp, up to a constant, (batch, n).
         hidden: Features of a crop's appearance, (batch, n, hidden).
+        exists: Whether there is a crop; no other is chosen, (batch, n) bool.
     """
 
     descriptors: Tensor
     words: Tensor
     objectness: Tensor
     hidden: Tensor
+    exists: Tensor
 
     def among(self, chosen: slice) -> Crops:
         """Returns some of the crops of each sample."""
@@ -73,8 +75,9 @@ class MatchingHead(nn.Module):
         self.gate = nn.Parameter(torch.tensor(_INITIAL_GATE))
 
     def set_statistics(self, features: Tensor) -> None:
-        """Sets the mean and the standard deviation of features (scenes, n, feature_dim)."""
+        """Sets the mean and the standard deviation of features (scenes, n, feature_dim); NaN for no crop."""
         some = features[:: max(1, len(features) // 1000)].flatten(0, 1).float()
+        some = some[~some[:, 0].isnan()]
         self.mean.copy_(some.mean(dim=0))
         self.std.copy_(some.std(dim=0).clamp_min(_MIN_STD))
 
@@ -83,8 +86,8 @@ class MatchingHead(nn.Module):
         return self.describe(self.inputs(features))
 
     def inputs(self, features: Tensor) -> Tensor:
-        """Normalizes features, (batch, n, feature_dim)."""
-        inputs = ((features.float() - self.mean) / self.std).clamp(-_MAX_FEATURE, _MAX_FEATURE)
+        """Normalizes features, (batch, n, feature_dim): NaN, for no crop, becomes 0."""
+        inputs = ((features.float() - self.mean) / self.std).clamp(-_MAX_FEATURE, _MAX_FEATURE).nan_to_num()
         others, colors = inputs.tensor_split((inputs.shape[-1] - self.color_dim,), dim=-1)
         return torch.cat([others, _COLOR_WEIGHT * colors], dim=-1)
 
@@ -92,7 +95,7 @@ class MatchingHead(nn.Module):
         """Describes crops.
 
         Args:
-            inputs: Normalized features, (batch, n, feature_dim).
+            inputs: Normalized features, (batch, n, feature_dim); 0 for no crop.
             generator: Source of dropout's draws, on the CPU; None for no dropout.
         """
         features, inputs = inputs, _dropout(inputs, generator)
@@ -102,7 +105,8 @@ class MatchingHead(nn.Module):
             descriptors = torch.cat([descriptors.float(), features.float()], dim=-1)
         words = self.words(hidden).float().log_softmax(dim=-1)
         objectness = self.objectness(hidden)[..., 0].float()
-        return Crops(_unit(descriptors.float()), words, objectness, hidden.float())
+        exists = (features != 0).any(dim=-1)
+        return Crops(_unit(descriptors.float()), words, objectness, hidden.float(), exists)
 
     def match(
         self,
@@ -131,14 +135,23 @@ class MatchingHead(nn.Module):
             )
             cosines = torch.lerp(cosines, of_features.expand_as(cosines), self.feature_weight)
         is_instance, is_category = (
-            (sharpness * self.log_scale.exp()[:, None, None] * cosines).softmax(dim=2).unbind()
+            (sharpness * self.log_scale.exp()[:, None, None] * cosines)
+            .masked_fill(~crops.exists, -torch.inf)
+            .softmax(dim=2)
+            .unbind()
         )
+        cosines = cosines.masked_fill(~crops.exists, -1.0)
         if p_other is not None:
-            is_category = (1 - p_other)[:, None] * is_category + p_other[:, None] / is_category.shape[1]
+            is_category = (1 - p_other)[:, None] * is_category + p_other[:, None] * uniform(crops.exists)
         # Whether any crop shows the demonstrated object.
         p_instance = torch.sigmoid(self.gate[0] * cosines[0].amax(dim=1, keepdim=True) + self.gate[1])
         probabilities = p_instance * is_instance + (1 - p_instance) * is_category
         return probabilities.clamp_min(_MIN_PROBABILITY).log(), cosines[0]
+
+
+def uniform(exists: Tensor) -> Tensor:
+    """Returns the uniform distribution over the crops that exist, (batch, n)."""
+    return exists / exists.sum(dim=1, keepdim=True)
 
 
 def _unit(descriptors: Tensor) -> Tensor:

@@ -390,6 +390,11 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         return None if self._episode is None else self._episode.localization
 
     @property
+    def needs_images(self) -> bool:
+        """Whether the running episode needs further images: not while demonstrations are replayed."""
+        return self._episode is None or not bool(self._episode.replayed.all())
+
+    @property
     def pick_confidence(self) -> Tensor | None:
         """Probability of the pick location among the proposals, (batch,); None before the first action."""
         return None if self._episode is None else self._episode.localization.confidence

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -13,6 +13,7 @@ from lerobot_deltaco.policies.base.image_coordinates import cell_centers, grid_o
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.segmentation import Regions, segment
 from lerobot_deltaco.policies.geometry.camera_motion import (
     CameraMotion,
     estimate_motion,
@@ -20,7 +21,7 @@ from lerobot_deltaco.policies.geometry.camera_motion import (
 )
 from lerobot_deltaco.policies.geometry.regression import robust_regression
 
-N_OBJECTS = 6  # proposed in a scene by `Background`
+N_OBJECTS = 10  # proposed in a scene by `Background`, at most
 _SIDE = 128  # px, of the images as they are compared
 MAX_REMEMBERED = 48  # images
 _MIN_IMAGES = 8
@@ -29,8 +30,6 @@ _MIN_IMAGES = 8
 _COMMON = 0.17
 _MIN_CONTRAST = 0.02  # of colors in 0..1
 _NOISE_FACTOR = 4.0  # by which a contrast exceeds the median of a scene
-_BLUR = 0.6  # standard deviation of the smoothing, in diameters of an object divided by two
-_NEIGHBOR = 1.6  # least distance between two proposals, in the same unit
 _SEED_RADIUS, _GROWING_STEPS = 0.12, 40  # around a grasp, in -1..1; px by which an object's region grows
 _EDGE = 1.0  # px, by which images blur an object
 _SIZE_LIMITS = (0.02, 0.4)  # of an object's diameter, as a fraction of the image's side
@@ -84,7 +83,7 @@ class Background(nn.Module):
         module._bounds = module._static = None
 
     def forward(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
-        """Proposes objects, those that stand out most first.
+        """Proposes objects, the most prominent first.
 
         Args:
             scenes: First images, (batch, 3, H, W), uint8 or in 0..1, at full resolution.
@@ -92,13 +91,32 @@ class Background(nn.Module):
                 scene that is not among them.
 
         Returns:
-            Locations in -1..1, (batch, N_OBJECTS, 2).
+            Locations in -1..1, (batch, N_OBJECTS, 2); NaN behind the last object.
         """
-        found = [
-            self._peaks(self.mask(some, None if remembered is None else remembered[n : n + _AT_A_TIME]))
-            for n, some in zip(range(0, len(scenes), _AT_A_TIME), scenes.split(_AT_A_TIME), strict=True)
-        ]
-        return torch.cat(found)
+        masks = torch.cat(
+            [
+                self.mask(some, None if remembered is None else remembered[n : n + _AT_A_TIME])
+                for n, some in zip(range(0, len(scenes), _AT_A_TIME), scenes.split(_AT_A_TIME), strict=True)
+            ]
+        )
+        return self._padded([regions.locations for regions in self._segment(masks)], masks)
+
+    def _segment(self, masks: Tensor) -> list[Regions]:
+        """Returns the regions of masks (batch, 128, 128)."""
+        perspective = self.perspective.cpu()
+        return [segment(mask, float(self.object_size), perspective) for mask in masks.cpu()]
+
+    @staticmethod
+    def _padded(locations: Sequence[Tensor], masks: Tensor) -> Tensor:
+        """Stacks locations (objects, 2) as (batch, N_OBJECTS, 2); without any, with the clearest pixel."""
+        centers = grid_of_centers(_SIDE, _SIDE, masks.device)
+        padded = masks.new_full((len(masks), N_OBJECTS, 2), torch.nan)
+        for row, mask, found in zip(padded, masks, locations, strict=True):
+            n_found = min(len(found), N_OBJECTS)
+            row[:n_found] = found[:N_OBJECTS].to(row)
+            if not n_found:
+                row[0] = centers[mask.argmax()]
+        return padded
 
     def mask(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
         """Returns how clearly each pixel stands out, (batch, 128, 128) in 0..1. See `forward`."""
@@ -172,20 +190,6 @@ class Background(nn.Module):
             results.append(_kth_smallest(away, n_common))
         return torch.stack(results).clamp_min(0)
 
-    def _peaks(self, masks: Tensor) -> Tensor:
-        """Returns the middles of the regions of objects' size that stand out most, (batch, N_OBJECTS, 2)."""
-        size = self.object_size
-        centers = grid_of_centers(_SIDE, _SIDE, masks.device)
-        smooth = _blurred(masks, float(_BLUR * size * _SIDE / 2)).flatten(1)
-        weights, found = masks.flatten(1), []
-        for _ in range(N_OBJECTS):
-            peak = centers[smooth.argmax(dim=1)]  # (batch, 2)
-            away = (centers - peak[:, None]).norm(dim=2)  # (batch, cells)
-            inside = weights * (away < size) + 1e-6 * (away < size / 4)
-            found.append((inside[..., None] * centers).sum(dim=1) / inside.sum(dim=1, keepdim=True))
-            smooth = smooth.masked_fill(away < _NEIGHBOR * size, -1.0)
-        return torch.stack(found, dim=1)
-
 
 def _over_neighbors(images: Tensor, extreme: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """Returns the extreme value of 3 x 3 pixels of images (..., h, w)."""
@@ -217,16 +221,6 @@ def _scaled(images: Tensor) -> Tensor:
     if min(images.shape[-2:]) >= _SIDE:
         return F.interpolate(images, (_SIDE, _SIDE), mode="area")
     return F.interpolate(images, (_SIDE, _SIDE), mode="bilinear", align_corners=False)
-
-
-def _blurred(maps: Tensor, std: float) -> Tensor:
-    """Smooths maps (batch, h, w) by a Gaussian of a standard deviation in px."""
-    half = max(1, round(3 * std))
-    offsets = torch.arange(-half, half + 1, device=maps.device)
-    weights = torch.exp(-0.5 * (offsets / std) ** 2)
-    weights = weights / weights.sum()
-    across = F.conv2d(maps[:, None], weights[None, None, None], padding=(0, half))
-    return F.conv2d(across, weights[None, None, :, None], padding=(half, 0))[:, 0]
 
 
 class ProposalNetwork(nn.Module):
@@ -346,5 +340,5 @@ def peaks(maps: Tensor, n_peaks: int) -> Tensor:
 
 def nearest_proposals(proposed: Tensor, locations: Tensor, radius: float) -> tuple[Tensor, Tensor]:
     """Returns the nearest proposal to locations (batch, 2), and whether it is near, (batch,) each."""
-    distance, nearest = (proposed - locations[:, None]).norm(dim=2).min(dim=1)
+    distance, nearest = (proposed - locations[:, None]).norm(dim=2).nan_to_num(nan=torch.inf).min(dim=1)
     return nearest, distance < radius

@@ -1,0 +1,71 @@
+"""Tests of splitting what stands out into objects."""
+
+import pytest
+import torch
+
+from lerobot_deltaco.policies.deltaco_match.segmentation import segment
+
+SIDE = 128
+FLAT = torch.zeros(2)
+
+
+def disks(*circles):
+    """Returns a mask of disks, each given as x, y in -1..1 and a diameter as a fraction of the side."""
+    centers = (torch.arange(SIDE) + 0.5) * 2 / SIDE - 1
+    y, x = torch.meshgrid(centers, centers, indexing="ij")
+    return sum(torch.hypot(x - cx, y - cy) < d for cx, cy, d in circles).clamp(max=1).float()
+
+
+def assert_found(regions, *circles):
+    """Asserts that each disk is among the regions, with its center and its diameter."""
+    for x, y, diameter in circles:
+        distances = (regions.locations - torch.tensor([x, y])).norm(dim=1)
+        nearest = int(distances.argmin())
+        assert distances[nearest] < 0.3 * diameter
+        assert float(regions.diameters[nearest]) == pytest.approx(diameter, rel=0.25)
+
+
+@pytest.mark.parametrize("diameter", [0.04, 0.1, 0.3])
+def test_separate_objects_are_found_once_each(diameter):
+    circles = [(-0.6, -0.55, diameter), (0.5, -0.2, 0.8 * diameter), (-0.1, 0.6, diameter)]
+    regions = segment(disks(*circles), diameter, FLAT)
+    assert len(regions.locations) == 3
+    assert_found(regions, *circles)
+
+
+def test_objects_that_touch_are_proposed_one_by_one_and_together():
+    circles = [(-0.1, 0.0, 0.1), (0.1, 0.05, 0.1)]
+    regions = segment(disks(*circles), 0.1, FLAT)
+    assert len(regions.locations) == 3
+    assert_found(regions, *circles)
+    assert float((regions.locations[0] - torch.tensor([0.0, 0.025])).norm()) < 0.03  # the most prominent
+
+
+def test_one_long_object_is_not_split():
+    mask = torch.zeros(SIDE, SIDE)
+    mask[20:80, 50:64] = 1
+    regions = segment(mask, 0.12, FLAT)
+    assert len(regions.locations) == 1
+
+
+def test_specks_are_no_objects_and_gaps_do_not_split_one():
+    mask = disks((0.2, 0.2, 0.15))
+    mask[77, :] = 0  # a line through the object
+    mask[5, 5] = mask[100, 20] = 1
+    regions = segment(mask, 0.15, FLAT)
+    assert len(regions.locations) == 1
+    assert_found(regions, (0.2, 0.2, 0.15))
+
+
+def test_sizes_follow_the_perspective():
+    speck, object_ = (0.0, 0.8, 0.03), (0.0, -0.8, 0.03)
+    perspective = torch.tensor([0.0, 1.5])  # lower in the image, objects are larger
+    regions = segment(disks(speck, object_), 0.06, perspective)
+    assert len(regions.locations) == 1
+    assert_found(regions, object_)
+
+
+def test_an_empty_mask_has_no_regions():
+    regions = segment(torch.zeros(SIDE, SIDE), 0.1, FLAT)
+    assert regions.locations.shape == (0, 2)
+    assert regions.diameters.shape == (0,)
