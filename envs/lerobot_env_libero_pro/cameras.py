@@ -1,4 +1,4 @@
-"""The pictures, drawn without robosuite: the same, but for edges, in a fraction of the time."""
+"""The pictures, drawn without robosuite: without shadows and reflections, in a fraction of the time."""
 
 from __future__ import annotations
 

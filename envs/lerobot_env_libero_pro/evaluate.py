@@ -64,7 +64,8 @@ def main(
         layouts: `standard`: the initial states. `permuted`: the same objects at random places.
         to_the_end: Whether episodes go on after a success until the horizon, to tell success at the end.
         image_size: Width and height of the images, pixels; by default, that of the training.
-        demo_root: Folder of a dataset of demonstrations, in place of the checkpoint's own.
+        demo_root: Folder of a dataset of demonstrations, in place of the checkpoint's own. Needed where it
+            has none, as after a training without `demo_repo_id`.
         device: Device of the policy, such as cpu.
 
     Raises:
@@ -282,6 +283,12 @@ class PolicyActor:
                 f"{condition!r} is for policies with a method `{needed}`, such as deltaco_match. Evaluate "
                 f"{loaded.identity['type']} with `--conditions full`."
             )
+        takes = needed != "reset" or getattr(loaded.policy.config, "uses_demonstrations", False)
+        if takes and condition != "no_demonstration" and loaded.policy.demonstrations is None:
+            raise ValueError(
+                f"{condition!r} needs demonstrations, and the checkpoint has none. Name a dataset of them "
+                "with --demo-root, or use `--conditions no_demonstration`."
+            )
         self._loaded, self._condition = loaded, condition
         self._sentence, self._env = "", None
 
@@ -304,7 +311,7 @@ class PolicyActor:
         if not hasattr(policy, "set_tasks"):
             return self._notes
         demonstrations = []
-        if condition != "no_demonstration" and policy.demonstrations is not None:
+        if condition != "no_demonstration" and getattr(policy.config, "uses_demonstrations", True):
             sentences = demonstrating_sentences(
                 task, list(policy.demonstrations.rows), condition == "wrong_demonstration", state
             )

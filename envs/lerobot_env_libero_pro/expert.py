@@ -14,7 +14,7 @@ APPROACH = 0.08  # m above the grasp, at least, where the hand has turned before
 PASSING = 0.05  # m above all objects on the way there
 CROSSING = 0.06  # m between the object's lowest point and the highest one where it goes, on the way
 RELEASE = 0.01  # m between them when the gripper opens
-# In a hollow place, tall objects go below the rim, so that they do not stay hanging on a finger. The fingertips
+# In a hollow place, tall objects go below the rim, so that they do not stay hanging on a finger. Fingertips
 # stop above it: below, they would rake the place.
 HOLLOW = "contain_region"
 FINGERTIP = 0.012  # m below the point between the fingertips

@@ -92,7 +92,7 @@ class FakeEnv:
 class FakePolicy:
     """A policy that closes the gripper, and notes what it is given."""
 
-    config = SimpleNamespace(device="cpu")
+    config = SimpleNamespace(device="cpu", uses_demonstrations=True)
 
     def __init__(self, sentences=(MILK.sentence, BUTTER.sentence)):
         self.demonstrations = SimpleNamespace(
@@ -162,10 +162,22 @@ def test_what_a_policy_localized_is_recorded(monkeypatch):
 
 
 def test_a_policy_that_takes_only_a_sentence_has_only_the_full_condition():
-    policy = SimpleNamespace(reset=lambda: None, select_action=FakePolicy().select_action)
+    policy = SimpleNamespace(
+        config=SimpleNamespace(device="cpu"), reset=lambda: None, select_action=FakePolicy().select_action
+    )
     assert run_episode(FakeEnv(), PolicyActor(loaded(policy), "full"), state=0)["success"]
     with pytest.raises(ValueError, match="'no_sentence' is for policies with a method `set_tasks`"):
         PolicyActor(loaded(policy), "no_sentence")
+
+
+@pytest.mark.parametrize("condition", ["full", "no_sentence", "wrong_demonstration", "oracle"])
+def test_an_empty_bank_is_an_error_and_not_another_condition(condition):
+    policy = FakePolicy()
+    policy.demonstrations = None
+    with pytest.raises(ValueError, match=f"'{condition}' needs demonstrations.*--demo-root"):
+        PolicyActor(loaded(policy), condition)
+    run_episode(FakeEnv(), PolicyActor(loaded(policy), "no_demonstration"), state=0)
+    assert policy.given == [(MILK.sentence,)]
 
 
 def test_a_policy_that_no_longer_looks_gets_no_new_pictures():
