@@ -25,6 +25,18 @@ logger = logging.getLogger(__name__)
 
 _GRIPPER_WORDS = ("gripper", "finger", "jaw")
 _AXES = {"x", "y", "z", "rx", "ry", "rz", "qx", "qy", "qz", "qw", "roll", "pitch", "yaw"}
+_NOT_POSITIONS = {
+    "rot",
+    "rotation",
+    "axis",
+    "angle",
+    "euler",
+    "quat",
+    "quaternion",
+    "vel",
+    "velocity",
+    "force",
+}
 _ARM_WORDS = (
     "joint",
     "shoulder",
@@ -98,6 +110,22 @@ def find_gripper_states(
     if not chosen.any():
         reason = "since none is named like the gripper or changes only with its command"
     return GripperStates(torch.from_numpy(chosen).to(states.device), reason, tuple(doubts))
+
+
+def find_positions(names: Sequence[str]) -> Tensor | None:
+    """Returns which dimensions are the position of the hand, by names such as `x` and `ee.x`, (state,) bool.
+
+    None if no three dimensions, or more than these, are named so.
+
+    Args:
+        names: Name of each dimension of the state; empty if the dataset has none.
+    """
+    axes = [
+        "" if _NOT_POSITIONS & (own := _tokens(name)) else "".join(own & {"x", "y", "z"}) for name in names
+    ]
+    if sorted(filter(None, axes)) != ["x", "y", "z"]:
+        return None
+    return torch.tensor([bool(axis) for axis in axes])
 
 
 def _names_gripper(name: str) -> bool:

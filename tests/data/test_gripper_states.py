@@ -1,9 +1,10 @@
 """Which dimensions of the state are the gripper's, on recordings like those of common robots."""
 
 import numpy as np
+import pytest
 import torch
 
-from lerobot_deltaco.data.gripper_states import find_gripper_states
+from lerobot_deltaco.data.gripper_states import find_gripper_states, find_positions
 
 LIBERO = ["x", "y", "z", "rx", "ry", "rz", "finger_1", "finger_2"]
 SO101 = [
@@ -136,3 +137,19 @@ def test_a_state_may_follow_with_either_sign_and_any_scale():
     states = torch.stack([arm, opening, torch.full((60,), 7.0), -opening, late], dim=1)
     found = find_gripper_states(states, gripper, [(0, 29), (30, 59)])
     assert found.is_gripper.tolist() == [False, True, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["x", "y", "z", "rx", "ry", "rz", "finger_1", "finger_2"], [0, 1, 2]),
+        (["ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz", "ee.gripper_pos"], [0, 1, 2]),
+        (["joint.1", "eef.pos.x", "eef.pos.y", "eef.pos.z", "eef.quat.x", "eef.quat.y"], [1, 2, 3]),
+        (["left.x", "left.y", "left.z", "right.x", "right.y", "right.z"], None),
+        (["shoulder_pan.pos", "elbow_flex.pos", "gripper.pos"], None),
+        ([], None),
+    ],
+)
+def test_positions_are_found_by_name(names, expected):
+    found = find_positions(names)
+    assert (None if found is None else found.nonzero().flatten().tolist()) == expected

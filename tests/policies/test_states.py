@@ -186,6 +186,21 @@ def test_location_and_height_give_the_state_at_the_pick(joints, n_episodes, acci
     assert (np.quantile(errors, 0.9, axis=0) < p90).all()
 
 
+def test_a_novel_rotation_of_the_hand_moves_no_location_where_positions_are_known():
+    recording = record(60, 0)
+    states = recording.grasps.states
+    scale = 1 / states.flatten(0, 1).std(dim=0)
+    shift = -states.flatten(0, 1).mean(dim=0) * scale
+    dims = torch.arange(states.shape[2])
+    regressor = StateRegressor(states.shape[2])
+    regressor.fit(recording.grasps, *recording.images, scale, shift, dims < 6, is_position=dims < 3)
+    turned = states[:, 0] + torch.where((dims >= 3) & (dims < 6), 2.0, 0.0)
+    torch.testing.assert_close(regressor.pick_locations(turned), regressor.pick_locations(states[:, 0]))
+    torch.testing.assert_close(regressor.heights(turned), regressor.heights(states[:, 0]))
+    errors = errors_at_the_pick(regressor, scale, shift, record(100, 1))
+    assert (np.median(errors, axis=0) < 4).all()
+
+
 def test_heights_are_larger_along_the_approach():
     recording = record(60, 0)
     regressor, scale, shift = fit_to(recording)

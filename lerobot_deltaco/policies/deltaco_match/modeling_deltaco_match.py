@@ -35,7 +35,7 @@ from torch import Tensor
 from lerobot_deltaco.data.demonstrations import Demonstration, RobotData
 from lerobot_deltaco.data.grasps import warn_of_missing
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
-from lerobot_deltaco.data.gripper_states import find_gripper_states
+from lerobot_deltaco.data.gripper_states import find_gripper_states, find_positions
 from lerobot_deltaco.data.object_prompts import ObjectPrompt, read_prompt
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
@@ -351,7 +351,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         episode: RunningEpisode = self._episode
         replay = None
         if episode.reference is not None:
-            reference, replay = self.replay.follow(episode.reference, self.state_limits(batch[OBS_STATE]))
+            reference, replay = self.replay.follow(episode.reference, self._unlimited_state(batch))
             self._episode = episode._replace(reference=reference)
             if bool(episode.replayed.all()):
                 return self._checked_action(batch, replay[:, None])
@@ -518,6 +518,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         offsets = self.state_regressor(locations, heights) - state.float()[:, None]
         return torch.cat([state, offsets.flatten(1)], dim=-1)
 
+    def _unlimited_state(self, batch: dict[str, Any]) -> Tensor:
+        """Returns the robot's state as demonstrated states are scaled, (batch, state).
+
+        A novel task may lead beyond the states of training, such as to another rotation of the hand.
+        """
+        return batch[OBS_STATE].float() * self.state_limits.scale
+
     def _move_demonstrations(
         self, demonstrations: DemonstrationsOfTasks, localization: PickPlace, batch: dict[str, Any]
     ) -> tuple[Reference | None, Tensor]:
@@ -561,7 +568,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         places = self.state_regressor.to_image(states).clamp(-1, 1)
         expected = self.state_regressor(places, self.state_regressor.heights(states[:, 0]))
         displacements = moved - torch.stack([expected[:, 0], demonstrated[:, 1]], dim=1)
-        return self.replay.start(trajectories, self.state_limits(batch[OBS_STATE]), displacements), replayed
+        return self.replay.start(trajectories, self._unlimited_state(batch), displacements), replayed
 
     # Before the first step
 
@@ -623,6 +630,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             shift,
             ~gripper_states.is_gripper,
             bank.tasks,
+            find_positions(robot.state_names),
         )
         self._fit_replay(robot, ~gripper_states.is_gripper)
 

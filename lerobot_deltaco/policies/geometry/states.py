@@ -23,6 +23,7 @@ from lerobot_deltaco.policies.geometry.calibration import ImageProjection
 from lerobot_deltaco.policies.geometry.regression import robust_regression
 
 N_LOCATIONS = 2  # pick and place
+_MAX_BY_POSITION = 600  # episodes, below which locations depend on the hand's position alone
 _N_LOCATION_FEATURES = 10
 _N_HEIGHT_FEATURES = 3  # of the first of those: 1, x, y
 _N_LEVEL_FEATURES = 6  # up to the squares
@@ -87,6 +88,7 @@ class StateRegressor(nn.Module):
         shift: Tensor,
         is_arm: Tensor,
         tasks: Sequence[str] | None = None,
+        is_position: Tensor | None = None,
     ) -> TrainingLocations:
         """Calibrates the camera and learns which state the robot has at a location.
 
@@ -100,13 +102,19 @@ class StateRegressor(nn.Module):
             is_arm: Dimensions of the state other than the gripper's opening, (state,) bool. At a grasp, the
                 opening depends on the object's width, and says nothing about where the object is.
             tasks: Task of each episode; the object of a task is as high wherever it stands. None if unknown.
+            is_position: Dimensions that are the hand's position, (state,) bool; None if they are not known.
+                With few episodes, locations and heights depend on these alone: rotations that hardly vary
+                would only add noise, and a novel one much of it.
 
         Returns:
             The locations and heights of the episodes.
         """
         has_grasp = grasps.has_grasp
+        is_related = is_arm
+        if is_position is not None and int(has_grasp.sum()) < _MAX_BY_POSITION:
+            is_related = is_position.to(is_arm.device) & is_arm
         first, carried, last = (images[has_grasp] for images in (first, carried, last))
-        self.to_image.fit(first, carried, last, grasps.states[has_grasp, 0], scale * is_arm)
+        self.to_image.fit(first, carried, last, grasps.states[has_grasp, 0], scale * is_related)
         locations = self.to_image(grasps.states).clamp(-1, 1)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
@@ -118,7 +126,7 @@ class StateRegressor(nn.Module):
             self.location_to_state[n].copy_(
                 robust_regression(features[:, n], states[:, n], degrees, _LEAST_ERROR, is_arm.float())
             )
-        self._fit_heights(features[:, 0], states[:, 0], last_moves, is_arm)
+        self._fit_heights(features[:, 0], states[:, 0], last_moves, is_related)
         if tasks is not None:
             self._level(
                 features[:, 0], states[:, 0], [t for t, has in zip(tasks, has_grasp, strict=True) if has]
