@@ -32,6 +32,8 @@ _NOT_RECORDED = (
     "output_features",
     "one_hot_tasks",
     "known_words",
+    "held_out_episodes",
+    "n_dataset_frames",
     "gripper_range",
     "paraphrases",
     "demo_repo_id",

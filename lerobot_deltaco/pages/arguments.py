@@ -122,7 +122,8 @@ class LookArguments:
             test tasks are run.
         episodes: Number of episodes, evenly spread.
         out: Folder for the page.
-        dataset_episodes: Episodes to choose from, as for `deltaco train`, such as [0,1,2]; None for all.
+        dataset_episodes: Episodes to choose from, as for `deltaco train`, such as [0,1,2]. By default, those
+            that were held out of the fit, if it is the training dataset, or else all.
         policy: What shows the object in place of other episodes.
     """
 

@@ -26,6 +26,7 @@ from lerobot_deltaco.pages.html import EpisodeView, picture_uri, write_page
 from lerobot_deltaco.pages.player import Player
 from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.policies.deltaco_match.findings import describe_words
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
@@ -49,6 +50,7 @@ def look(arguments: LookArguments) -> str:
         ValueError: The policy finds no locations, or does not fit the dataset.
     """
     checkpoint, dataset = arguments.checkpoint, arguments.dataset
+    held_out: list[int] = []
     loaded = load_conditioned(checkpoint)
     if not isinstance(loaded.policy, DeltacoMatchPolicy):
         raise UserError(
@@ -62,7 +64,9 @@ def look(arguments: LookArguments) -> str:
         names = [f"Episodes with the right {what} location" for what in ("pick", "place")]
         chosen = episode_numbers(arguments.dataset_episodes)
         prompt = _prompt(arguments.policy, loaded.policy.config)
-        episodes = _dataset_episodes(loaded, open_folder_or_hub(dataset, chosen), arguments.episodes, prompt)
+        opened = open_folder_or_hub(dataset, chosen)
+        held_out = [] if chosen else _held_out_episodes(loaded.policy.config, opened)
+        episodes = _dataset_episodes(loaded, opened, arguments.episodes, prompt, held_out)
     judged = list(tqdm(episodes, desc="Looking", unit="episode", total=arguments.episodes))
     known = np.array([rights for _, rights in judged if rights])
     rates = [(name, int(known[:, n].sum()), len(known)) for n, name in enumerate(names) if len(known)]
@@ -79,7 +83,11 @@ def look(arguments: LookArguments) -> str:
     )
     lines = [f"{name}: {n_right} of {n}" for name, n_right, n in rates]
     if dataset is not None:
-        lines.append("These say little if the policy was trained on the episodes.")
+        lines.append(
+            "These episodes were held out of the fit of what to pick; where to place was trained on them."
+            if held_out
+            else "These say little if the policy was trained on the episodes."
+        )
         lines.append(f"Its fit: {loaded.policy.matching.report}.")
     return "\n".join([*lines, f"See {page}."])
 
@@ -101,9 +109,21 @@ def _prompt(options: PromptOptions, config: TaskConditionedConfig) -> ObjectProm
 
 
 def _dataset_episodes(
-    loaded: LoadedPolicy, dataset: LeRobotDataset, n_episodes: int, prompt: ObjectPrompt | None
+    loaded: LoadedPolicy,
+    dataset: LeRobotDataset,
+    n_episodes: int,
+    prompt: ObjectPrompt | None,
+    held_out: Sequence[int],
 ) -> Iterator[Judged]:
-    """Localizes in the first images of episodes, by other episodes as demonstrations or by a prompt."""
+    """Localizes in the first images of episodes, by other episodes as demonstrations or by a prompt.
+
+    Args:
+        loaded: The policy.
+        dataset: The dataset.
+        n_episodes: Number of episodes.
+        prompt: What shows the object in place of other episodes.
+        held_out: Episodes to choose from; empty for all.
+    """
     policy, config = loaded.policy, loaded.policy.config
     camera = config.cameras[0]
     _check_features(config, dataset)
@@ -114,7 +134,8 @@ def _dataset_episodes(
     assert form.gripper is not None
     opening = form.gripper.opening(data.actions)
     grasps = find_grasp_states(data.states, opening, data.spans, form.gripper.usual_range)
-    numbers = _spread(len(tasks), n_episodes)
+    candidates = [n for n, index in enumerate(indices) if not held_out or index in held_out]
+    numbers = [candidates[n] for n in _spread(len(candidates), n_episodes)]
     partners = {episode: _partner(tasks, episode) for episode in numbers}
     bank = None
     if config.uses_demonstrations and prompt is None:
@@ -158,6 +179,12 @@ def _dataset_episodes(
         )
         is_right = all(rights) if rights else None
         yield EpisodeView(task, "", [], is_right, headline, [f"{where}.", sure], picture, None), rights
+
+
+def _held_out_episodes(config: DeltacoMatchConfig, dataset: LeRobotDataset) -> list[int]:
+    """Returns the episodes that were held out of the fit, if the policy was trained on this dataset."""
+    is_training_dataset = config.n_dataset_frames == dataset.meta.total_frames
+    return config.held_out_episodes if is_training_dataset else []
 
 
 def _image(dataset: LeRobotDataset, row: int, camera: str) -> NDArray[np.uint8]:

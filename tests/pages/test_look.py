@@ -1,6 +1,7 @@
 """Pictures, videos and the page of `deltaco look`."""
 
 import io
+import json
 import re
 
 import av
@@ -128,6 +129,23 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     for what, number in zip(("pick", "place"), right.sum(dim=0).tolist(), strict=True):
         assert f"Episodes with the right {what} location: <b>{number} of 3</b>" in text
         assert f"Episodes with the right {what} location: {number} of 3\n" in report
+
+
+@pytest.mark.parametrize(("n_frames", "shown"), [(0, "0 2"), (None, "1"), (1, "0 1 2")])
+def test_episodes_of_the_training_dataset_are_those_that_were_held_out(tmp_path, n_frames, shown):
+    """`n_frames`: what the policy's dataset has more than this one; None for a choice by the user."""
+    write_robot_dataset(tmp_path / "data", [4, 4, 9])
+    folder = save_tiny_policy(tmp_path / "policy")
+    total = json.loads((tmp_path / "data/meta/info.json").read_text())["total_frames"]
+    config = json.loads((folder / "config.json").read_text())
+    config |= {"held_out_episodes": [0, 2], "n_dataset_frames": total + (n_frames or 0)}
+    (folder / "config.json").write_text(json.dumps(config))
+    chosen = "[1]" if n_frames is None else None
+    report = look(LookArguments(str(folder), str(tmp_path / "data"), 3, tmp_path / "out", chosen))
+    text = (tmp_path / "out/index.html").read_text()
+    found = re.findall(r"Episode (\d+),", text)
+    assert found == shown.split()
+    assert ("held out of the fit of what to pick" in report) == (n_frames == 0)
 
 
 def test_a_point_takes_the_place_of_demonstrations(tmp_path):

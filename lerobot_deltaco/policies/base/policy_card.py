@@ -36,6 +36,8 @@ _HIDDEN = {
     "output_features",
     "normalization_mapping",
     "known_words",
+    "held_out_episodes",
+    "n_dataset_frames",
     "gripper_range",
     "one_hot_tasks",
     "type",

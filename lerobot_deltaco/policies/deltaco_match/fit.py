@@ -44,7 +44,7 @@ def fit_feature_matching(
     seed: int,
     *,
     in_bfloat16: bool = False,
-) -> None:
+) -> Tensor:
     """Fits the proposals, and then the matching head.
 
     The head learns to tell the object grasped in one episode of a task from the other proposals in the scene
@@ -62,6 +62,9 @@ def fit_feature_matching(
         seed: Seed of the initial weights and of the draws.
         in_bfloat16: Whether convolutions and linear layers compute in bfloat16, which takes half the time on
             a CPU that has it.
+
+    Returns:
+        Rows of the episodes that were held out, (held-out,).
 
     Raises:
         ValueError: No task has two episodes with a grasp, or no proposal is near a grasp.
@@ -128,6 +131,7 @@ def fit_feature_matching(
     matching.fitted.fill_(True)
     if int(matching.held_out[1]):
         logger.info("Feature matching: %s.", matching.report)
+    return drawn[held_out]
 
 
 def _fit_proposals(

@@ -667,7 +667,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert self.training_data is not None
         assert self.training_locations is not None
         bank, located = self.training_data.demonstrations, self.training_locations
-        fit_feature_matching(
+        held_out = fit_feature_matching(
             self.matching,
             bank.frames[:, 0],
             bank.frames[:, -1],
@@ -679,6 +679,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             self.config.seed,
             in_bfloat16=self.config.precision == "bfloat16",
         )
+        self.config.held_out_episodes = bank.episodes[held_out].tolist()
+        self.config.n_dataset_frames = None if self._meta is None else self._meta.total_frames
 
     def _recorded_locations(self, episodes: Sequence[int], rows: Sequence[int]) -> TrainingLocations:
         """Returns the locations of episodes, (batch, ...); reads those that are held out."""
