@@ -63,7 +63,8 @@ class Candidates(NamedTuple):
 
     Attributes:
         locations: The proposals, (batch, n, 2) in -1..1; anywhere where there is none.
-        log_probabilities: How likely each is what the task asks for, (batch, n).
+        log_probabilities: How likely each is what the task asks for, (batch, n). What they lack to 1 is the
+            probability that it is none of them.
         heights: Height offset of a grasp of each, (batch, n).
         map_std: Standard deviation of a candidate in a map, in cells.
     """
