@@ -112,14 +112,15 @@ def test_a_demonstration_is_repeated_exactly_where_nothing_has_moved(fitted):
     reference = replay.start([shown], torch.from_numpy(robot.state).float()[None], torch.zeros(1, 2, 10))
     for state, action in zip(shown.states[1:], shown.actions[1:], strict=True):
         reference, replayed = replay.follow(reference, state[None])
-        torch.testing.assert_close(replayed[0].clamp(-1, 1), action.clamp(-1, 1), atol=0.02, rtol=0)
+        # Also where the demonstration goes farther than the training did.
+        torch.testing.assert_close(replayed[0], action, atol=0.02, rtol=0)
 
 
-def test_an_action_stays_within_those_of_the_training(fitted):
+def test_an_action_stays_within_those_of_the_training_and_of_the_demonstration(fitted):
     _, moves, (shown, *_), replay = fitted
     far = torch.zeros(1, 2, 10)
     far[..., 6:9] = 5
     reference = replay.start([shown], shown.states[:1], far)
     for _ in range(60):
         reference, action = replay.follow(reference, shown.states[:1])
-        assert (action.abs() <= 1).all()
+        assert (action.abs() <= shown.actions.abs().amax().clamp_min(1)).all()

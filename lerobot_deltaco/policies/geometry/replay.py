@@ -315,11 +315,10 @@ class TrajectoryReplay(nn.Module):
         target = reference.states[rows, (frame + lag).clamp(max=last)]
         additional = target - state - reference.steps[rows, frame]
         aside = state - reference.recorded[rows, frame]
-        action = (
-            reference.actions[rows, frame] + additional @ self.displacement_gain + aside @ self.state_gain
-        )
-        # No action is farther out than those of the training episodes.
-        action = action.clamp(-1, 1)
+        recorded = reference.actions[rows, frame]
+        action = recorded + additional @ self.displacement_gain + aside @ self.state_gain
+        # No action is farther out than those of the training episodes and of the demonstration itself.
+        action = action.clamp(recorded.clamp(max=-1), recorded.clamp(min=1))
         return reference._replace(frame=frame, waited=waited, distance=distance), action
 
 
