@@ -2,16 +2,16 @@
 
     python examples/deltaco_match_in_one_file.py
 
-The scripted expert collects 290 episodes of 29 tasks. The policy learns from them, and then acts in
-novel tasks: scenario A's, with other objects, colors and shapes.
+The scripted expert collects 290 episodes of 29 tasks. The policy learns from them, and then acts in the novel
+tasks of scenario A, with other objects, colors and shapes.
 
-It succeeds in 59.8 % [50.1, 68.8] of 102 scenes: one of each test task of scenario A, with the seeds of the
-benchmark's protocol, one demonstration of each task, and one set of training episodes. Wherever it grasped the
-right object, it succeeded. That takes 130 s of one CPU core. On the tasks on which its constants were chosen:
+It succeeds in 59.8 % [50.1, 68.8] of 102 scenes: one of each test task, with the seeds of the benchmark's
+protocol, one demonstration of each task, and one set of training episodes. Wherever it grasps the right
+object, it succeeds. That takes 130 s of one CPU core. On the tasks that its constants were chosen on:
 59.5 % of 126 scenes, with an earlier calibration of the camera.
 
-The real policy reaches 57 % (by replay) and 64 % (by its network) from 300 episodes of 30 tasks, in other scenes
-with novel objects of 16 tasks (docs/results.md, "How many demonstrations does it need to act?").
+The real policy reaches 57 % (by replay) and 64 % (by its network) from 300 episodes of 30 tasks, in scenes of
+16 other novel tasks (docs/results.md, "How many demonstrations does it need to act?").
 
 The method, from top to bottom:
 
