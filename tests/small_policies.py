@@ -93,9 +93,11 @@ def fit_once(matching, *data, **options):
         arguments.append(part.shape if isinstance(part, torch.Tensor) else part)
     key = digest.digest(), repr(arguments)
     if key not in _fits:
-        fit.fit_feature_matching(matching, *data, **options)
-        _fits[key] = {name: value.cpu().clone() for name, value in matching.state_dict().items()}
-    matching.load_state_dict(_fits[key])
+        held_out = fit.fit_feature_matching(matching, *data, **options)
+        state = {name: value.cpu().clone() for name, value in matching.state_dict().items()}
+        _fits[key] = state, held_out
+    matching.load_state_dict(_fits[key][0])
+    return _fits[key][1]
 
 
 class ColorEncoder:
@@ -104,7 +106,8 @@ class ColorEncoder:
     feature_dim, color_dim = 192, 0
 
     def __call__(self, images, locations, sizes):
-        return cut_crops(images, locations, sizes, resolution=8).flatten(2)
+        crops = cut_crops(images, locations.nan_to_num(), sizes.nan_to_num(nan=1.0), resolution=8)
+        return torch.where(locations.isnan().any(dim=2, keepdim=True), torch.nan, crops.flatten(2))
 
 
 def use_short_fit(monkeypatch, steps=2, **settings):
