@@ -13,7 +13,7 @@ from lerobot_deltaco.policies.base.image_coordinates import cell_centers, grid_o
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
-from lerobot_deltaco.policies.deltaco_match.segmentation import Regions, segment
+from lerobot_deltaco.policies.deltaco_match.segmentation import segment
 from lerobot_deltaco.policies.geometry.camera_motion import (
     CameraMotion,
     estimate_motion,
@@ -99,10 +99,10 @@ class Background(nn.Module):
                 for n, some in zip(range(0, len(scenes), _AT_A_TIME), scenes.split(_AT_A_TIME), strict=True)
             ]
         )
-        return self._padded([regions.locations for regions in self._segment(masks)], masks)
+        return self._padded(self._segment(masks), masks)
 
-    def _segment(self, masks: Tensor) -> list[Regions]:
-        """Returns the regions of masks (batch, 128, 128)."""
+    def _segment(self, masks: Tensor) -> list[Tensor]:
+        """Returns the centers of the regions of masks (batch, 128, 128), (regions, 2) each."""
         perspective = self.perspective.cpu()
         return [segment(mask, float(self.object_size), perspective) for mask in masks.cpu()]
 

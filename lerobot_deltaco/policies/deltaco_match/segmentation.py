@@ -6,8 +6,6 @@ split there. A single object may have a neck, too, such as a goblet; so the whol
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -25,25 +23,16 @@ _MAX_PARTS = 6
 _SAMPLES_PER_PIXEL = 2  # along a line between two parts' middles
 
 
-class Regions(NamedTuple):
-    """Regions of a mask, the most prominent first.
-
-    Attributes:
-        locations: Centers of mass, (regions, 2) in -1..1.
-        diameters: Diameters of disks with the same variance, as fractions of the mask's side, (regions,).
-    """
-
-    locations: Tensor
-    diameters: Tensor
-
-
-def segment(mask: Tensor, diameter: float, perspective: Tensor) -> Regions:
+def segment(mask: Tensor, diameter: float, perspective: Tensor) -> Tensor:
     """Finds objects in a mask.
 
     Args:
         mask: How clearly each pixel stands out, (side, side) in 0..1, on the CPU.
         diameter: That of a typical object in the middle of the image, as a fraction of its side.
         perspective: How its log changes along x and y, (2,).
+
+    Returns:
+        Centers of mass of the regions, the most prominent first, (regions, 2) in -1..1.
     """
     weights, side = mask.numpy(), len(mask)
     stands_out = weights > _THRESHOLD
@@ -51,7 +40,7 @@ def segment(mask: Tensor, diameter: float, perspective: Tensor) -> Regions:
         _CLOSING:-_CLOSING, _CLOSING:-_CLOSING
     ]
     labels, _ = ndimage.label(ndimage.binary_fill_holes(stands_out), structure=np.ones((3, 3)))
-    found: list[tuple[float, float, float, float]] = []
+    found: list[tuple[float, float, float]] = []
     for label, (rows, columns) in enumerate(ndimage.find_objects(labels), start=1):
         region = labels[rows, columns] == label
         y, x = np.nonzero(region)
@@ -68,11 +57,9 @@ def segment(mask: Tensor, diameter: float, perspective: Tensor) -> Regions:
         for part in candidates:
             px, py = x[part] + columns.start, y[part] + rows.start
             center = ((np.array([px.mean(), py.mean()]) + 0.5) * 2 / side - 1).tolist()
-            extent = 4 * np.sqrt((px.var() + py.var()) / 2) / side
-            found.append((float(weights[py, px].sum()), *center, float(extent)))
+            found.append((float(weights[py, px].sum()), *center))
     found.sort(reverse=True)
-    regions = torch.tensor(found, dtype=torch.float32).view(-1, 4)
-    return Regions(regions[:, 1:3], regions[:, 3])
+    return torch.tensor(found, dtype=torch.float32).view(-1, 3)[:, 1:]
 
 
 def _split(region: NDArray[np.bool_], typical: float) -> NDArray[np.int64]:
