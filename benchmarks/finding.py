@@ -296,7 +296,7 @@ def measure(matching: Any, pairs: Sequence[tuple[StillEpisode, StillEpisode]]) -
     generator = torch.Generator().manual_seed(0)
     picks = torch.stack([demonstration.locations[0] for _, demonstration in pairs])
     picks = picks + LOCATION_NOISE * torch.randn(picks.shape, generator=generator)
-    described = matching.describe(small(shown).float() / 255, shown.float() / 255, picks, picks)
+    described = matching.describe(small(shown).float() / 255, shown.float() / 255, picks, picks).descriptors
     rng = np.random.default_rng(0)
     texts = [str(rng.choice(scene.sentences)) for scene, _ in pairs]
     nothing = [""] * len(pairs)

@@ -112,8 +112,8 @@ def find_gripper_states(
     return GripperStates(torch.from_numpy(chosen).to(states.device), reason, tuple(doubts))
 
 
-def find_positions(names: Sequence[str]) -> Tensor | None:
-    """Returns which dimensions are the position of the hand, by names such as `x` and `ee.x`, (state,) bool.
+def find_positions(names: Sequence[str]) -> list[int] | None:
+    """Returns which dimensions are the hand's position along x, y and z, by names such as `x` and `ee.x`.
 
     None if no three dimensions, or more than these, are named so.
 
@@ -125,7 +125,7 @@ def find_positions(names: Sequence[str]) -> Tensor | None:
     ]
     if sorted(filter(None, axes)) != ["x", "y", "z"]:
         return None
-    return torch.tensor([bool(axis) for axis in axes])
+    return [axes.index(axis) for axis in "xyz"]
 
 
 def _names_gripper(name: str) -> bool:

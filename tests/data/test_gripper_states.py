@@ -151,5 +151,4 @@ def test_a_state_may_follow_with_either_sign_and_any_scale():
     ],
 )
 def test_positions_are_found_by_name(names, expected):
-    found = find_positions(names)
-    assert (None if found is None else found.nonzero().flatten().tolist()) == expected
+    assert find_positions(names) == expected

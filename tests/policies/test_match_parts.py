@@ -178,7 +178,7 @@ def fraction_found(matching, shapes, by_demonstration=False, words=lambda task: 
     if by_demonstration:
         attended = locations[shown]
         grasps = attended if grasp is None else torch.full_like(attended, grasp)
-        described = matching.describe(scenes[shown], scenes[shown], grasps, attended)
+        described = matching.describe(scenes[shown], scenes[shown], grasps, attended).descriptors
         demonstrated = torch.zeros(12)
     candidates = matching.find(scenes, scenes, [*map(words, tasks)], described, demonstrated)
     assert candidates.locations.shape == (12, N_OBJECTS, 2)
@@ -362,10 +362,10 @@ def test_crops_show_what_the_policys_small_images_do_not(matching):
     torch.testing.assert_close(*small)
     at = torch.zeros(1, 2)
     plain, striped, blurred = (
-        matching.describe(small[0], images, at, at) for images in (plain, striped, small[1])
+        matching.describe(small[0], images, at, at).descriptors for images in (plain, striped, small[1])
     )
     similar, different = ((plain * other).sum() / plain.square().sum() for other in (blurred, striped))
-    assert different < 0.8 < similar
+    assert different < 0.75 < similar
 
 
 def test_the_perspective_is_that_of_what_disappears():

@@ -5,7 +5,7 @@ import contextlib
 import pytest
 import torch
 
-from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner
+from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner, correlations, cut_templates
 
 SIZE, RADIUS = 96, 7
 N_EPISODES = 36
@@ -64,3 +64,39 @@ def test_without_held_out_episodes_it_is_not_used(refined):
     nothing = torch.zeros_like(held_out)
     refiner.fit(images, grasps, middles, sizes, nothing, 1, torch.Generator(), contextlib.nullcontext())
     assert torch.equal(refiner(images, middles, sizes), middles)
+
+
+def test_a_demonstration_shows_where_another_kind_of_object_is_grasped(refined):
+    refiner, (_, _, _, sizes, _) = refined
+    # In training, disks are grasped at their left edge; this bar, at its upper end.
+    generator = torch.Generator().manual_seed(1)
+    tops = 20 + 50 * torch.rand(8, 2, generator=generator).round(decimals=1)
+    y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    away = (x - tops[:, :1, None]).abs() < 3, (y - tops[:, 1:, None] - 5).abs() < 8
+    color = torch.tensor([200, 60, 30])[:, None, None]
+    images = torch.where((away[0] & away[1])[:, None], color, 120).to(torch.uint8)
+    grasps = 2 * tops / SIZE - 1
+    middles = 2 * (tops + torch.tensor([0, 5])) / SIZE - 1
+    sizes = sizes[:8]
+    templates = cut_templates(images[:1], grasps[:1], sizes[:1]).expand(8, -1, -1, -1)[:, None]
+    found = refiner(images, middles, sizes, templates)
+    errors = (found - grasps).norm(dim=1) * SIZE / 2  # px
+    assert errors.max() < 1.5
+    # A demonstration whose grasp is not known changes nothing.
+    unknown = cut_templates(images[:1], grasps[:1] * torch.nan, sizes[:1])
+    assert unknown.isnan().all()
+    both = torch.cat([templates, unknown.expand(8, -1, -1, -1)[:, None]], dim=1)
+    torch.testing.assert_close(refiner(images, middles, sizes, both), found)
+
+
+def test_a_template_correlates_fully_with_itself_and_with_nothing_on_an_empty_table():
+    generator = torch.Generator().manual_seed(2)
+    images = disks(torch.tensor([[40.3, 50.8]]), generator)
+    at, sizes = 2 * torch.tensor([[42.0, 49.0]]) / SIZE - 1, torch.tensor([2 * RADIUS / SIZE])
+    templates = cut_templates(images, at, sizes)[:, None]
+    found = correlations(images, at, sizes, templates, 0.5)
+    middle = found.shape[1] // 2
+    assert float(found.max()) == pytest.approx(1, abs=0.01)
+    assert int(found.argmax()) == middle * found.shape[2] + middle
+    empty = correlations(images, torch.tensor([[-0.7, -0.7]]), sizes, templates, 0.1)
+    assert empty.abs().max() < 0.1

@@ -193,12 +193,37 @@ def test_a_novel_rotation_of_the_hand_moves_no_location_where_positions_are_know
     shift = -states.flatten(0, 1).mean(dim=0) * scale
     dims = torch.arange(states.shape[2])
     regressor = StateRegressor(states.shape[2])
-    regressor.fit(recording.grasps, *recording.images, scale, shift, dims < 6, is_position=dims < 3)
+    regressor.fit(recording.grasps, *recording.images, scale, shift, dims < 6, position_dims=[0, 1, 2])
     turned = states[:, 0] + torch.where((dims >= 3) & (dims < 6), 2.0, 0.0)
     torch.testing.assert_close(regressor.pick_locations(turned), regressor.pick_locations(states[:, 0]))
     torch.testing.assert_close(regressor.heights(turned), regressor.heights(states[:, 0]))
     errors = errors_at_the_pick(regressor, scale, shift, record(100, 1))
     assert (np.median(errors, axis=0) < 4).all()
+
+
+def test_a_release_keeps_the_height_and_the_rotation_that_were_demonstrated():
+    recording = record(60, 0)
+    states = recording.grasps.states
+    scale = 1 / states.flatten(0, 1).std(dim=0)
+    shift = -states.flatten(0, 1).mean(dim=0) * scale
+    dims = torch.arange(states.shape[2])
+    regressor = StateRegressor(states.shape[2])
+    located = regressor.fit(
+        recording.grasps, *recording.images, scale, shift, dims < 6, position_dims=[0, 1, 2]
+    )
+    # Turned by 2, and released 5 cm higher, as something tall
+    shown = states[:1] + torch.where((dims >= 3) & (dims < 6), 2.0, 0.0)
+    shown[:, 1, 2] += 0.05
+    moved = regressor.displacements(shown.expand(9, -1, -1), located.locations[1:10], located.heights[1:10])
+    release = shown[:, 1] + moved[:, 1] / scale
+    wanted = torch.where(dims < 2, states[1:10, 1], shown[:, 1])
+    assert ((release - wanted)[:, :2].abs() < 0.03).all()
+    assert ((release - wanted)[:, 2].abs() < 0.01).all()
+    torch.testing.assert_close(release[:, 3:6], wanted[:, 3:6])
+    # Without names, whatever a place does not tell is kept.
+    regressor.fit(recording.grasps, *recording.images, scale, shift, dims < 6)
+    assert (regressor.follows_place[:2] > 0.8).all()
+    assert (regressor.follows_place[3:6] < 0.3).all()
 
 
 def test_heights_are_larger_along_the_approach():

@@ -183,6 +183,9 @@ class MatchingSettings:
             where an image's edges are at -1 and 1; 4.5 px of 48.
         grasp_error: The same where objects stand out from the background, in addition to `grasp_size`.
         grasp_size: Part of that distance that grows with the objects, in their diameters.
+        template_weight: Weight of the correlation of a proposal with the demonstrated grasp, where an unknown
+            word describes the object: the object is new, and the learned descriptors tell less of it.
+        template_reach: How far from a proposal the demonstrated grasp is looked for, in diameters.
         refinement_steps: Steps of the fit of where on an object the gripper closes.
         min_matching_steps: Smallest number of steps of the fit of the matching head.
         max_matching_steps: Largest number of steps.
@@ -224,6 +227,8 @@ class MatchingSettings:
     grasp_radius: float = 0.19
     grasp_error: float = 0.06
     grasp_size: float = 0.75
+    template_weight: float = 20.0
+    template_reach: float = 0.5
     refinement_steps: int = 300
     min_matching_steps: int = 300
     max_matching_steps: int = 1500

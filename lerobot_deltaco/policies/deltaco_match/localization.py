@@ -40,7 +40,7 @@ from lerobot_deltaco.policies.deltaco_match.matching import (
     word_scores,
 )
 from lerobot_deltaco.policies.deltaco_match.proposals import Background, ProposalNetwork, nearest_proposals
-from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner
+from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner, correlations, cut_templates
 from lerobot_deltaco.policies.deltaco_match.words import (
     UNKNOWN_WORD,
     WordWeights,
@@ -53,6 +53,7 @@ from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
 logger = logging.getLogger(__name__)
 
 _MIN_PROBABILITY = 1e-9
+_MIN_P_UNKNOWN = 0.01  # of an unknown word, below which templates are not compared
 _MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
 # Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
 _APPEARANCE_STD = 0.7
@@ -87,6 +88,18 @@ class Candidates(NamedTuple):
         std = 2 * self.map_std / torch.tensor([width, height], device=self.locations.device)
         each = gaussian_maps(self.locations, height, width, std)
         return (self.log_probabilities.exp()[..., None, None] * each).sum(dim=1).clamp_min(1e-9).log()
+
+
+class Described(NamedTuple):
+    """What demonstrations grasped.
+
+    Attributes:
+        descriptors: Descriptors of the objects, (batch, descriptor).
+        templates: Surroundings of the grasps, (batch, 3, h, w); NaN where the grasp is not known.
+    """
+
+    descriptors: Tensor
+    templates: Tensor
 
 
 class FeatureMatching(nn.Module):
@@ -151,6 +164,7 @@ class FeatureMatching(nn.Module):
         instructions: Sequence[str],
         described: Tensor | None,
         demonstrated: Tensor | None,
+        templates: Tensor | None = None,
     ) -> Candidates:
         """Finds what tasks ask for.
 
@@ -162,12 +176,17 @@ class FeatureMatching(nn.Module):
                 demonstrations.
             demonstrated: Height offsets of the demonstrated grasps, (batch,), NaN where they are not known;
                 None without demonstrations.
+            templates: Surroundings of the demonstrated grasps, (batch, demonstrations, 3, h, w). See
+                `Described`.
         """
         with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
             locations = self.proposals(scenes, full_resolution)
             crops = self.compare(self.features(full_resolution, locations))
             words = encode_words(instructions, self.vocabulary).to(scenes.device)
             scores, similarity = self.scores(crops, words, described)
+            if templates is not None and bool((self._p_unknown(words) > _MIN_P_UNKNOWN).any()):
+                alike = self._correlations(full_resolution, locations, templates)
+                scores = scores + self.settings.template_weight * self._p_unknown(words)[:, None] * alike
             if demonstrated is None:
                 demonstrated = torch.full_like(scores[:, 0], torch.nan)
             heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
@@ -193,7 +212,7 @@ class FeatureMatching(nn.Module):
         matches = similarity = torch.zeros_like(scores)
         if described is not None:
             # How well known words describe the object. A new noun leaves the demonstration in charge.
-            p_unknown = (weights * (words == UNKNOWN_WORD)).amax(dim=1)
+            p_unknown = self._p_unknown(words)
             p_described = (1 - p_unknown) * (weights * (words > UNKNOWN_WORD)).amax(dim=1)
             matches, similarity = self.compare.match(
                 crops, described, settings.sharpness, settings.p_other_object * p_described
@@ -202,6 +221,18 @@ class FeatureMatching(nn.Module):
         by_words = (scores + crops.objectness).masked_fill(~crops.exists, -torch.inf).softmax(dim=1)
         by_words = torch.lerp(by_words, uniform(crops.exists), settings.p_misdescribed)
         return matches + by_words.clamp_min(_MIN_PROBABILITY).log(), similarity
+
+    def _p_unknown(self, words: Tensor) -> Tensor:
+        """Returns how likely an unknown word describes the object, (batch,)."""
+        return (self.word_weights(words) * (words == UNKNOWN_WORD)).amax(dim=1)
+
+    def _correlations(self, full_resolution: Tensor, locations: Tensor, templates: Tensor) -> Tensor:
+        """Returns how well the surroundings of proposals agree with templates, (batch, n); 0 for none."""
+        n_each, flat = locations.shape[1], locations.nan_to_num().flatten(0, 1)
+        images, repeated = (part.repeat_interleave(n_each, 0) for part in (full_resolution, templates))
+        reach = self.settings.template_reach
+        found = correlations(images, flat, self.object_sizes(flat), repeated, reach)
+        return found.flatten(1).amax(dim=1).view(-1, n_each)
 
     def camera_motion(self, scene: Tensor) -> CameraMotion | None:
         """Returns how far the camera has moved since the training, and warns if it has.
@@ -226,14 +257,16 @@ class FeatureMatching(nn.Module):
         """Returns where something could be grasped in scenes, (batch, n, 2) in -1..1. See `find`."""
         return self.background(full_resolution) if bool(self.uses_background) else self.propose(scenes)
 
-    def grasps(self, full_resolution: Tensor, proposals: Tensor) -> Tensor:
+    def grasps(self, full_resolution: Tensor, proposals: Tensor, templates: Tensor | None = None) -> Tensor:
         """Returns where the gripper closes on proposed objects, (batch, 2) in -1..1.
 
         Args:
             full_resolution: First images of episodes, (batch, 3, H, W), uint8 or in 0..1.
             proposals: A proposal in each, (batch, 2) in -1..1.
+            templates: Surroundings of demonstrated grasps, (batch, demonstrations, 3, h, w); None without
+                demonstrations. See `Described`.
         """
-        return self.refine(full_resolution, proposals, self.object_sizes(proposals))
+        return self.refine(full_resolution, proposals, self.object_sizes(proposals), templates)
 
     @property
     def report(self) -> str:
@@ -255,8 +288,10 @@ class FeatureMatching(nn.Module):
         return self.settings.grasp_error + self.settings.grasp_size * float(self.background.object_size)
 
     @torch.no_grad()
-    def describe(self, images: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor) -> Tensor:
-        """Returns descriptors of what was grasped in demonstrations, (batch, descriptor).
+    def describe(
+        self, images: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor
+    ) -> Described:
+        """Describes what was grasped in demonstrations.
 
         An object that was pushed before it was grasped, as by an attempt that failed, is no longer where it
         was in the first image: no proposal is near the grasp. The attention then tells where it was.
@@ -275,7 +310,10 @@ class FeatureMatching(nn.Module):
             # A gripper is not always above the middle of an object, but a proposal is.
             near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
             locations = torch.where((is_near | is_attended)[:, None], near, attended)
-            return self.compare(self.features(full_resolution, locations[:, None])).descriptors[:, 0]
+            features = self.features(full_resolution, locations[:, None])
+            shown = torch.where(is_near[:, None], grasps, torch.nan)
+            templates = cut_templates(full_resolution, shown, self.object_sizes(grasps))
+            return Described(self.compare(features).descriptors[:, 0], templates)
 
     @torch.no_grad()
     def understood(self, instruction: str) -> list[tuple[str, str]]:

@@ -420,7 +420,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
         prompts = prompts_of(instructions, demonstrations)
         given = None if prompts else self._batch_demonstrations(demonstrations, scenes.device)
-        attention = last = descriptors = heights = None
+        attention = last = descriptors = heights = templates = None
         if prompts:
             descriptors = describe_prompts(self.matching, prompts, scenes, batch[camera])
         elif given is None:
@@ -435,15 +435,16 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 self.state_regressor.pick_locations(states),
                 given.first_images.flatten(0, 1),
             )
-            descriptors = self.matching.describe(ends[:, 0], first_images, picks, attended)
-            descriptors = descriptors.unflatten(0, (-1, n_each)).mean(dim=1)
+            described = self.matching.describe(ends[:, 0], first_images, picks, attended)
+            descriptors = described.descriptors.unflatten(0, (-1, n_each)).mean(dim=1)
+            templates = described.templates.unflatten(0, (-1, n_each))
             heights = self.state_regressor.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
             attention, last = attentions[::n_each], ends[::n_each, 1]
-        candidates = self.matching.find(scenes, batch[camera], instructions, descriptors, heights)
+        candidates = self.matching.find(scenes, batch[camera], instructions, descriptors, heights, templates)
         if prompts:
             candidates = choose_prompted(candidates, prompts, self.matching.grasp_radius)
         proposal, confidence, height = candidates.best
-        pick = self.matching.grasps(batch[camera], proposal)
+        pick = self.matching.grasps(batch[camera], proposal, templates)
         place_maps = self._place_maps(
             scenes, by_instruction, instructions, last, None if attention is None else attention[:, 1]
         )
@@ -561,13 +562,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         # The others get any one, and do not follow it.
         trajectories = [each if isinstance(each, Trajectory) else trajectories[0] for each in read]
         states = torch.stack([each.grasp_states for each in trajectories])  # (batch, 2, state)
-        demonstrated = states * self.state_regressor.state_scale + self.state_regressor.state_shift
-        moved = self.state_regressor(localization.locations, localization.heights)
-        # The pick is relative to what the regression makes of the demonstration, so that the way in which it
-        # grasped is kept. Where it released is chance.
-        places = self.state_regressor.to_image(states).clamp(-1, 1)
-        expected = self.state_regressor(places, self.state_regressor.heights(states[:, 0]))
-        displacements = moved - torch.stack([expected[:, 0], demonstrated[:, 1]], dim=1)
+        displacements = self.state_regressor.displacements(
+            states, localization.locations, localization.heights
+        )
         return self.replay.start(trajectories, self._unlimited_state(batch), displacements), replayed
 
     # Before the first step

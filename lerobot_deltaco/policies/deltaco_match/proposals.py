@@ -21,14 +21,14 @@ from lerobot_deltaco.policies.geometry.camera_motion import (
 )
 from lerobot_deltaco.policies.geometry.regression import robust_regression
 
-N_OBJECTS = 10  # proposed in a scene by `Background`, at most
+N_OBJECTS = 14  # proposed in a scene by `Background`, at most
 _SIDE = 128  # px, of the images as they are compared
 MAX_REMEMBERED = 48  # images
 _MIN_IMAGES = 8
 # Fraction of the images that may show a pixel's color while it still stands out. It is more than an object
 # takes, and less than a container that stands in one of four places.
 _COMMON = 0.17
-_MIN_CONTRAST = 0.02  # of colors in 0..1
+_MIN_CONTRAST = 0.03  # of colors in 0..1
 _NOISE_FACTOR = 4.0  # by which a contrast exceeds the median of a scene
 _SEED_RADIUS, _GROWING_STEPS = 0.12, 40  # around a grasp, in -1..1; px by which an object's region grows
 _EDGE = 1.0  # px, by which images blur an object
@@ -99,12 +99,12 @@ class Background(nn.Module):
                 for n, some in zip(range(0, len(scenes), _AT_A_TIME), scenes.split(_AT_A_TIME), strict=True)
             ]
         )
-        return self._padded(self._segment(masks), masks)
-
-    def _segment(self, masks: Tensor) -> list[Tensor]:
-        """Returns the centers of the regions of masks (batch, 128, 128), (regions, 2) each."""
-        perspective = self.perspective.cpu()
-        return [segment(mask, float(self.object_size), perspective) for mask in masks.cpu()]
+        diameter, perspective = float(self.object_size), self.perspective.cpu()
+        found = [
+            segment(mask, image, diameter, perspective)
+            for mask, image in zip(masks.cpu(), _scaled(scenes).cpu(), strict=True)
+        ]
+        return self._padded(found, masks)
 
     @staticmethod
     def _padded(locations: Sequence[Tensor], masks: Tensor) -> Tensor:
@@ -177,9 +177,14 @@ class Background(nn.Module):
         """Returns the difference of each pixel from the colors that are common there, (batch, 128, 128)."""
         if self._bounds is None or self._bounds[0].device != self.images.device:
             images = self.images[: int(self.n_images)]
-            # A pixel may lie between two of the image: its neighbors count.
+            # A pixel may lie between two of the image: its neighbors count, as far as they usually differ
+            # there, and not as the colors of an object do that stood there in one image.
             least, most = (_over_neighbors(images, extreme) for extreme in (torch.minimum, torch.maximum))
-            self._bounds = least.float() / 255, most.float() / 255
+            usual = (most.short() - least).median(dim=0).values  # (3, 128, 128)
+            self._bounds = (
+                torch.maximum(least.short(), images.short() - usual).float() / 255,
+                torch.minimum(most.short(), images.short() + usual).float() / 255,
+            )
         low, high = self._bounds
         n_common = min(max(2, round(_COMMON * len(low))), len(low))
         results = []

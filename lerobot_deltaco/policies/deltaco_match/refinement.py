@@ -1,13 +1,16 @@
 """A second look at what is picked: where on the object the gripper closes.
 
-A proposal is somewhere on an object. A small network sees its surroundings, enlarged from the full
-resolution, and finds the grasp in them. It learns from the training episodes, whose grasps are known, at
-centers and sizes that are off at random, so that it learns to center objects that it has never seen.
+A proposal is somewhere on an object. Two things tell where its grasp is. A small network sees its
+surroundings, enlarged from the full resolution; it learns from the training episodes, whose grasps are known,
+at centers and sizes that are off at random. And the demonstration shows what the grasp looked like: its
+surroundings there are a template, which is correlated with those of the proposal. The network is more exact
+on objects of the training, and can be wrong on others.
 """
 
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -28,6 +31,11 @@ _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
 _MAX_MOVE = 1.0  # from a proposal, in diameters
 _PEAK_RADIUS = 2.6  # of the cells around a peak whose mean is the location
 _N_LOOKS = 2
+_TEMPLATE_EXTENT, _TEMPLATE_RESOLUTION = 1.0, 24  # in diameters, and px
+_TEMPLATE_WINDOW = 0.7  # standard deviation of the weights of a template's pixels, in half extents
+_CORRELATION_WEIGHT = 40.0  # of a correlation, as a logit beside the network's
+_LEAST_LOG_PROBABILITY = -8.0  # of a cell, by the network: it may be wrong
+_MIN_VARIANCE = 1e-4  # of colors in 0..1
 
 
 class GraspRefiner(nn.Module):
@@ -57,24 +65,43 @@ class GraspRefiner(nn.Module):
         self.register_buffer("is_used", torch.zeros((), dtype=torch.bool))
         self.register_buffer("errors", torch.zeros(2))
 
-    def forward(self, images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
+    def forward(
+        self, images: Tensor, locations: Tensor, sizes: Tensor, templates: Tensor | None = None
+    ) -> Tensor:
         """Returns where the gripper closes, (batch, 2) in -1..1.
 
         Args:
             images: Images at full resolution, (batch, 3, H, W), uint8 or in 0..1.
             locations: Proposals, (batch, 2) in -1..1.
             sizes: Diameters of typical objects there, as fractions of the image's side, (batch,).
+            templates: Surroundings of demonstrated grasps, (batch, demonstrations, 3, h, w); NaN where the
+                grasp is not known. See `cut_templates`.
         """
-        if not bool(self.is_used):
+        if templates is None and not bool(self.is_used):
             return locations
-        return self._refine(images, locations, sizes)
+        return self._refine(images, locations, sizes, templates, uses_network=bool(self.is_used))
 
     @torch.no_grad()
-    def _refine(self, images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
+    def _refine(
+        self,
+        images: Tensor,
+        locations: Tensor,
+        sizes: Tensor,
+        templates: Tensor | None = None,
+        *,
+        uses_network: bool = True,
+    ) -> Tensor:
         extent, proposals = _EXTENT * sizes, locations
         for _ in range(_N_LOOKS):
-            crops = cut_crops(images, locations[:, None], extent[:, None], _RESOLUTION)[:, 0]
-            maps = self.layers(channels_last(crops))[:, 0].float()
+            maps = images.new_zeros(len(images), *[_RESOLUTION // 2] * 2, dtype=torch.float32)
+            if uses_network:
+                crops = cut_crops(images, locations[:, None], extent[:, None], _RESOLUTION)[:, 0]
+                logits = self.layers(channels_last(crops))[:, 0].float()
+                maps = logits.flatten(1).log_softmax(dim=1).view_as(logits)
+            if templates is not None:
+                found = correlations(images, locations, sizes, templates, _EXTENT / 2)
+                found = F.interpolate(found[:, None], maps.shape[1:], mode="bilinear", align_corners=True)
+                maps = maps.clamp_min(_LEAST_LOG_PROBABILITY) + _CORRELATION_WEIGHT * found[:, 0]
             best, cells = maps.flatten(1).max(dim=1)
             weights = (maps - best[:, None, None]).exp()
             locations = locations + extent[:, None] * mean_near(weights, cells, _PEAK_RADIUS)
@@ -135,3 +162,53 @@ class GraspRefiner(nn.Module):
             errors = [(each - grasps[rows]).norm(dim=1).median() for each in (proposals[rows], refined)]
             self.errors.copy_(torch.stack(errors))
             self.is_used.copy_(errors[1] < errors[0])
+
+
+def cut_templates(images: Tensor, grasps: Tensor, sizes: Tensor) -> Tensor:
+    """Cuts out the surroundings of demonstrated grasps, (batch, 3, h, w); NaN where a grasp is not known.
+
+    Args:
+        images: First images of demonstrations at full resolution, (batch, 3, H, W), uint8 or in 0..1.
+        grasps: Locations of their grasps, (batch, 2) in -1..1; NaN where they are not known.
+        sizes: Diameters of typical objects there, as fractions of the image's side, (batch,).
+    """
+    is_known = ~grasps.isnan().any(dim=1)
+    extent = torch.where(is_known, _TEMPLATE_EXTENT * sizes, 1.0)
+    crops = cut_crops(images, grasps.nan_to_num()[:, None], extent[:, None], _TEMPLATE_RESOLUTION)[:, 0]
+    return torch.where(is_known[:, None, None, None], crops, torch.nan)
+
+
+def correlations(images: Tensor, locations: Tensor, sizes: Tensor, templates: Tensor, reach: float) -> Tensor:
+    """Correlates templates with the surroundings of locations.
+
+    Args:
+        images: Images at full resolution, (batch, 3, H, W), uint8 or in 0..1.
+        locations: Locations, (batch, 2) in -1..1.
+        sizes: Diameters of typical objects there, as fractions of the image's side, (batch,).
+        templates: Templates, (batch, demonstrations, 3, h, w); those that are NaN do not count.
+        reach: How far from a location templates are laid, to each side, in diameters.
+
+    Returns:
+        Mean correlation coefficients of colors, (batch, n, n) in -1..1; 0 without a template.
+    """
+    n_pixels = templates.shape[-1]
+    side = 2 * round(n_pixels * (0.5 + reach / _TEMPLATE_EXTENT))
+    extent = side / n_pixels * _TEMPLATE_EXTENT * sizes
+    crops = cut_crops(images, locations[:, None], extent[:, None], side)[:, 0]  # (batch, 3, side, side)
+    offsets = torch.linspace(-1, 1, n_pixels, device=images.device) / _TEMPLATE_WINDOW
+    window = torch.exp(-(offsets[:, None].square() + offsets.square()) / 2)
+    window = window / window.sum()
+    usable = ~templates.isnan().flatten(2).any(dim=2)  # (batch, demonstrations)
+    templates = templates.nan_to_num()
+    centered = templates - (window * templates).sum(dim=(3, 4), keepdim=True)
+    variance = (window * centered.square()).sum(dim=(2, 3, 4))
+    # Each sample has templates of its own.
+    covariances = F.conv2d(
+        crops.flatten(0, 1)[None], (window * centered).flatten(0, 1), groups=len(crops)
+    ).unflatten(1, usable.shape)[0]  # (batch, demonstrations, n, n)
+    sums = F.conv2d(torch.cat([crops, crops.square()]).flatten(0, 1)[:, None], window[None, None])[:, 0]
+    means, squares = sums.unflatten(0, (2, -1, 3)).unbind()
+    variances = (squares - means.square()).sum(dim=1).clamp_min(_MIN_VARIANCE)  # (batch, n, n)
+    found = covariances / (variances[:, None] * variance.clamp_min(_MIN_VARIANCE)[..., None, None]).sqrt()
+    weights = usable / usable.sum(dim=1, keepdim=True).clamp_min(1)
+    return (weights[..., None, None] * found).sum(dim=1)

@@ -60,6 +60,8 @@ class StateRegressor(nn.Module):
 
     Attributes:
         to_image: Projects states to locations in the image.
+        follows_place: How far each dimension of the state at a release follows from the location, 0..1,
+            (state,). The rest, such as how the hand is turned, is the demonstration's.
     """
 
     location_to_state: Tensor
@@ -67,6 +69,7 @@ class StateRegressor(nn.Module):
     state_scale: Tensor
     state_shift: Tensor
     rest_scale: Tensor
+    follows_place: Tensor
 
     def __init__(self, state_dim: int) -> None:
         super().__init__()
@@ -77,6 +80,7 @@ class StateRegressor(nn.Module):
         self.register_buffer("state_scale", torch.ones(state_dim))
         self.register_buffer("state_shift", torch.zeros(state_dim))
         self.register_buffer("rest_scale", torch.zeros(state_dim))
+        self.register_buffer("follows_place", torch.ones(state_dim))
 
     def fit(
         self,
@@ -88,7 +92,7 @@ class StateRegressor(nn.Module):
         shift: Tensor,
         is_arm: Tensor,
         tasks: Sequence[str] | None = None,
-        is_position: Tensor | None = None,
+        position_dims: Sequence[int] | None = None,
     ) -> TrainingLocations:
         """Calibrates the camera and learns which state the robot has at a location.
 
@@ -102,17 +106,18 @@ class StateRegressor(nn.Module):
             is_arm: Dimensions of the state other than the gripper's opening, (state,) bool. At a grasp, the
                 opening depends on the object's width, and says nothing about where the object is.
             tasks: Task of each episode; the object of a task is as high wherever it stands. None if unknown.
-            is_position: Dimensions that are the hand's position, (state,) bool; None if they are not known.
-                With few episodes, locations and heights depend on these alone: rotations that hardly vary
-                would only add noise, and a novel one much of it.
+            position_dims: Dimensions that are the hand's position along x, y and z, of which z is up; None
+                if they are not known. With few episodes, locations and heights depend on these alone:
+                rotations that hardly vary would only add noise, and a novel one much of it.
 
         Returns:
             The locations and heights of the episodes.
         """
         has_grasp = grasps.has_grasp
         is_related = is_arm
-        if is_position is not None and int(has_grasp.sum()) < _MAX_BY_POSITION:
-            is_related = is_position.to(is_arm.device) & is_arm
+        if position_dims is not None and int(has_grasp.sum()) < _MAX_BY_POSITION:
+            is_related = torch.zeros_like(is_arm)
+            is_related[list(position_dims)] = True
         first, carried, last = (images[has_grasp] for images in (first, carried, last))
         self.to_image.fit(first, carried, last, grasps.states[has_grasp, 0], scale * is_related)
         locations = self.to_image(grasps.states).clamp(-1, 1)
@@ -126,6 +131,7 @@ class StateRegressor(nn.Module):
             self.location_to_state[n].copy_(
                 robust_regression(features[:, n], states[:, n], degrees, _LEAST_ERROR, is_arm.float())
             )
+        self._fit_follows_place(features[:, 1], states[:, 1], position_dims)
         self._fit_heights(features[:, 0], states[:, 0], last_moves, is_related)
         if tasks is not None:
             self._level(
@@ -143,6 +149,29 @@ class StateRegressor(nn.Module):
             torch.where(has_grasp, heights, 0.0),
             has_grasp,
         )
+
+    def _fit_follows_place(
+        self, features: Tensor, states: Tensor, position_dims: Sequence[int] | None
+    ) -> None:
+        """Learns which dimensions of the state at a release follow from the place.
+
+        Args:
+            features: Features of the locations of releases, (episodes, features).
+            states: States there, normalized, (episodes, state).
+            position_dims: See `fit`. With it, x and y follow from the place, and z as far as they tell it: a
+                tall object is released higher.
+        """
+        if position_dims is None:
+            predicted = features @ self.location_to_state[1]
+            self.follows_place.copy_(_explained(states, predicted))
+            return
+        *across, up = position_dims
+        self.follows_place.zero_()
+        self.follows_place[across] = 1
+        linear = torch.cat([torch.ones_like(states[:, :1]), states[:, across]], dim=1)
+        degrees = torch.tensor([0, 1, 1], device=states.device)
+        weights = robust_regression(linear, states[:, [up]], degrees, _LEAST_ERROR)
+        self.follows_place[up] = _explained(states[:, [up]], linear @ weights)[0]
 
     def _fit_heights(self, features: Tensor, states: Tensor, last_moves: Tensor, is_arm: Tensor) -> None:
         """Learns how an unknown height moves the state at a grasp, and what a location predicts without it.
@@ -229,6 +258,26 @@ class StateRegressor(nn.Module):
         ratio = ratio / torch.where(is_open, ratio, 1.0).min()
         self.rest_scale.copy_(torch.where(is_open, 1 / (spread * ratio), 0.0))
 
+    def displacements(self, demonstrated: Tensor, locations: Tensor, heights: Tensor) -> Tensor:
+        """Returns how far the states at a demonstrated grasp and release are from those at other locations.
+
+        Args:
+            demonstrated: The robot's states at the grasp and at the release, as in the dataset,
+                (batch, 2, state).
+            locations: Where to pick and place instead, (batch, 2, 2) in -1..1.
+            heights: Height offset of each grasp, (batch,).
+
+        Returns:
+            As the policy gets states, (batch, 2, state).
+        """
+        moved = self(locations, heights)
+        # Relative to what is expected of such a demonstration: how it grasped is kept, beside the middle or
+        # with the hand turned. Where it released is chance.
+        at = self.to_image(demonstrated).clamp(-1, 1)
+        pick = moved[:, 0] - self(at, self.heights(demonstrated[:, 0]))[:, 0]
+        release = demonstrated[:, 1] * self.state_scale + self.state_shift
+        return torch.stack([pick, self.follows_place * (moved[:, 1] - release)], dim=1)
+
     def heights(self, pick_states: Tensor) -> Tensor:
         """Returns the height offsets of grasps, (grasps,); NaN for a grasp that is not known.
 
@@ -264,6 +313,12 @@ class StateRegressor(nn.Module):
         states = torch.einsum("bgf,gfs->bgs", features, self.location_to_state)
         further = (features[:, 0, :_N_HEIGHT_FEATURES] * heights[:, None]) @ self.height_to_state
         return torch.cat([states[:, :1] + further[:, None], states[:, 1:]], dim=1)
+
+
+def _explained(values: Tensor, predicted: Tensor) -> Tensor:
+    """Returns the fraction of the variance of values (n, dims) that is predicted, (dims,) in 0..1."""
+    left = (values - predicted).square().mean(dim=0)
+    return (1 - left / values.var(dim=0, correction=0).clamp_min(1e-12)).clamp_min(0)
 
 
 def _spread(values: Tensor) -> Tensor:
