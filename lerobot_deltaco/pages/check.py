@@ -35,7 +35,7 @@ from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import dimension_names, episode_spans, open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
 from lerobot_deltaco.errors import UserError
-from lerobot_deltaco.pages.arguments import CheckArguments, episode_numbers
+from lerobot_deltaco.pages.arguments import CheckArguments, list_of_numbers
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
 from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
@@ -124,7 +124,7 @@ def check(arguments: CheckArguments) -> str:
     Raises:
         ValueError: Training would refuse the dataset; the message has the reason, and the report.
     """
-    opened = open_folder_or_hub(arguments.dataset, episode_numbers(arguments.dataset_episodes))
+    opened = open_folder_or_hub(arguments.dataset, list_of_numbers(arguments.dataset_episodes))
     config = DeltacoMatchConfig(**asdict(arguments.policy))
     start = TrainingStart(opened, config)
     tasks = DatasetEpisodes(opened).episode_tasks()

@@ -21,7 +21,7 @@ from lerobot_deltaco.data.training_data import DatasetEpisodes, read_demonstrati
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import load_conditioned
-from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions, episode_numbers, point_numbers
+from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions, list_of_numbers
 from lerobot_deltaco.pages.html import EpisodeView, picture_uri, write_page
 from lerobot_deltaco.pages.player import Player
 from lerobot_deltaco.pages.verdict import TOLERANCE
@@ -62,7 +62,7 @@ def look(arguments: LookArguments) -> str:
         episodes = _benchmark_episodes(loaded, arguments.episodes)
     else:
         names = [f"Episodes with the right {what} location" for what in ("pick", "place")]
-        chosen = episode_numbers(arguments.dataset_episodes)
+        chosen = list_of_numbers(arguments.dataset_episodes)
         prompt = _prompt(arguments.policy, loaded.policy.config)
         opened = open_folder_or_hub(dataset, chosen)
         held_out = [] if chosen else _held_out_episodes(loaded.policy.config, opened)
@@ -105,7 +105,7 @@ def _prompt(options: PromptOptions, config: TaskConditionedConfig) -> ObjectProm
     if options == PromptOptions():
         return None
     _, height, width = config.image_features[config.cameras[0]].shape
-    return read_prompt(point_numbers(options.demo_point), options.demo_photo, (width, height))
+    return read_prompt(list_of_numbers(options.demo_point), options.demo_photo, (width, height))
 
 
 def _dataset_episodes(

@@ -104,7 +104,7 @@ def test_an_undecodable_image_is_named_and_the_episode_can_be_left_out(table, tm
         )
     )
     assert "in 47 of 47 episodes" in report
-    with pytest.raises(ValueError, match="--dataset.episodes must be a list of numbers"):
+    with pytest.raises(ValueError, match=r"lists of whole numbers, such as \[10,20\]. Got '3 4'"):
         CheckArguments(str(root), dataset_episodes="3 4")
 
 

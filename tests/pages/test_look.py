@@ -155,7 +155,7 @@ def test_a_point_takes_the_place_of_demonstrations(tmp_path):
     assert (tmp_path / "out/index.html").read_text().count("where a point shows the object") == 2
     with pytest.raises(ValueError, match="picture, which has 48 x 48 px"):
         look(LookArguments(*arguments, policy=PromptOptions(demo_point="[480, 20]")))
-    with pytest.raises(ValueError, match=r"a list of numbers, such as \[320,240\]. Got '4 5'"):
+    with pytest.raises(ValueError, match=r"lists of whole numbers, such as \[10,20\]. Got '4 5'"):
         PromptOptions(demo_point="4 5")
     with pytest.raises(ValueError, match="need the episodes of a --dataset"):
         LookArguments("policy", policy=PromptOptions(demo_photo="cup.png"))
