@@ -27,7 +27,7 @@ from lerobot_deltaco.pages.player import Player
 from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.findings import describe_words
+from lerobot_deltaco.policies.deltaco_match.findings import compared_crops, describe_words
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
 
@@ -178,7 +178,12 @@ def _dataset_episodes(
             f"{100 * localization.confidence.item():.0f} % sure of the object. {describe_words(policy, task)}"
         )
         is_right = all(rights) if rights else None
-        yield EpisodeView(task, "", [], is_right, headline, [f"{where}.", sure], picture, None), rights
+        crops = [
+            picture_uri(crop)
+            for crop in compared_crops(policy, observation[camera].to(config.device), *given)
+        ]
+        lines = [f"{where}.", sure]
+        yield EpisodeView(task, "", [], is_right, headline, lines, picture, None, crops), rights
 
 
 def _held_out_episodes(config: DeltacoMatchConfig, dataset: LeRobotDataset) -> list[int]:

@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers
-from lerobot_deltaco.policies.deltaco_match.pictures import demonstration_ends, draw_localization
+from lerobot_deltaco.policies.deltaco_match.pictures import demonstration_ends, draw_crop, draw_localization
+from lerobot_deltaco.policies.deltaco_match.place import peak_locations
+from lerobot_deltaco.policies.deltaco_match.prompts import prompted_crop
 from lerobot_deltaco.policies.deltaco_match.words import understand, words_of
 
 if TYPE_CHECKING:
@@ -124,6 +127,56 @@ def predicted_boxes(policy: DeltacoMatchPolicy, localization: PickPlace) -> dict
         for probabilities, own in zip(sure, boxes, strict=True)
     ]
     return {"boxes": {policy.config.cameras[0]: detections}}
+
+
+@torch.no_grad()
+def compared_crops(
+    policy: DeltacoMatchPolicy, image: Tensor, shown: Demonstration | ObjectPrompt | None = None
+) -> list[Image.Image]:
+    """Returns the crops that were compared in a policy's running episode, as pictures.
+
+    The first is of the demonstration or photo, if there is one; the last is of what was chosen in the scene.
+    See `report_findings` for the arguments.
+    """
+    matching, localization = policy.matching, policy.localization
+    assert localization is not None
+    camera, scene = policy.config.cameras[0], image[None]
+    small = policy._camera_image({camera: scene}, camera)
+    crops = []
+    if isinstance(shown, ObjectPrompt):
+        crops.append(draw_crop(*prompted_crop(matching, shown, image, small.shape[-2:])))
+        if shown.image is None:  # which shows what is chosen
+            return crops
+    elif shown is not None:
+        assert localization.attention is not None
+        attended = peak_locations(localization.attention[:1].log())[:, 0]
+        crops.append(demonstrated_crop(policy, shown, attended))
+    proposals = matching.proposals(small, scene)[0]
+    proposals = proposals[~proposals.isnan().any(dim=1)]
+    grasps = matching.grasps(scene.expand(len(proposals), -1, -1, -1), proposals)
+    chosen = (grasps - localization.locations[:, 0]).norm(dim=1).argmin()
+    location = proposals[chosen].view(1, 1, 2)
+    return [*crops, draw_crop(scene, location, matching.crop_sizes(location))]
+
+
+@torch.no_grad()
+def demonstrated_crop(
+    policy: DeltacoMatchPolicy, shown: Demonstration, attended: Tensor | None = None
+) -> Image.Image:
+    """Returns the crop of what a demonstration grasped, as a picture.
+
+    Args:
+        policy: A policy whose feature matching is fitted.
+        shown: The demonstration.
+        attended: Location of what moved, by the attention, (1, 2) in -1..1; None for that of the grasp.
+    """
+    given = policy._batch_demonstrations([[shown]], policy.step.device)
+    assert given is not None
+    small, full_resolution = given.ends[0, :, 0], given.first_images[0]
+    grasps = policy.state_regressor.pick_locations(given.pick_states[0])
+    attended = grasps if attended is None else attended
+    location = policy.matching.demonstrated(small, full_resolution, grasps, attended)[:, None]
+    return draw_crop(full_resolution, location, policy.matching.crop_sizes(location))
 
 
 def _draw(

@@ -268,14 +268,20 @@ class FeatureMatching(nn.Module):
             attended: Locations of what moved, by the attention, (batch, 2) in -1..1.
         """
         with torch.autocast(images.device.type, enabled=False):
-            proposed, radius = self.proposals(images, full_resolution), self.grasp_radius
-            by_grasp, is_near = nearest_proposals(proposed, grasps, radius)
-            by_attention, is_attended = nearest_proposals(proposed, attended, radius)
-            nearest = torch.where(is_near, by_grasp, by_attention)
-            # A gripper is not always above the middle of an object, but a proposal is.
-            near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
-            locations = torch.where((is_near | is_attended)[:, None], near, attended)
+            locations = self.demonstrated(images, full_resolution, grasps, attended)
             return self.compare(self.features(full_resolution, locations[:, None])).descriptors[:, 0]
+
+    def demonstrated(
+        self, images: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor
+    ) -> Tensor:
+        """Returns the centers of what was grasped in demonstrations, (batch, 2) in -1..1. See `describe`."""
+        proposed, radius = self.proposals(images, full_resolution), self.grasp_radius
+        by_grasp, is_near = nearest_proposals(proposed, grasps, radius)
+        by_attention, is_attended = nearest_proposals(proposed, attended, radius)
+        nearest = torch.where(is_near, by_grasp, by_attention)
+        # A gripper is not always above the middle of an object, but a proposal is.
+        near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
+        return torch.where((is_near | is_attended)[:, None], near, attended)
 
     @torch.no_grad()
     def understood(self, instruction: str) -> list[tuple[str, str]]:
