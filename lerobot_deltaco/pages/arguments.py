@@ -9,24 +9,26 @@ from typing import Annotated
 
 import tyro
 
+from lerobot_deltaco.errors import UserError
+
 # Under the name that errors advise, as in `deltaco train`
 DatasetEpisodesOption = Annotated[str | None, tyro.conf.arg(name="dataset.episodes")]
 
 
-def episode_numbers(option: str | None) -> list[int] | None:
-    """Returns the episodes that an option names; None for all.
+def list_of_numbers(text: str | None) -> list[int] | None:
+    """Returns the episodes or the coordinates that an option lists, such as "[10,20]"; None for none.
 
     Raises:
-        ValueError: It is not a list of numbers.
+        UserError: It is not a list of whole numbers.
     """
-    if option is None:
+    if text is None:
         return None
     try:
-        numbers = json.loads(option)
+        numbers = json.loads(text)
     except ValueError:
         numbers = None
     if not isinstance(numbers, list) or not all(type(number) is int for number in numbers):
-        raise ValueError(f"--dataset.episodes must be a list of numbers, such as [0,1,2]. Got {option!r}.")
+        raise UserError(f"Episodes and points are lists of whole numbers, such as [10,20]. Got {text!r}.")
     return numbers
 
 
@@ -74,24 +76,7 @@ class CheckArguments:
     dataset_episodes: DatasetEpisodesOption = None
 
     def __post_init__(self) -> None:
-        episode_numbers(self.dataset_episodes)
-
-
-def point_numbers(option: str | None) -> list[float] | None:
-    """Returns the point or box that an option names; None for none.
-
-    Raises:
-        ValueError: It is not a list of numbers.
-    """
-    if option is None:
-        return None
-    try:
-        numbers = json.loads(option)
-    except ValueError:
-        numbers = None
-    if not isinstance(numbers, list) or not all(type(number) in (int, float) for number in numbers):
-        raise ValueError(f"--policy.demo_point must be a list of numbers, such as [320,240]. Got {option!r}.")
-    return numbers
+        list_of_numbers(self.dataset_episodes)
 
 
 @dataclass(frozen=True)
@@ -108,7 +93,7 @@ class PromptOptions:
     demo_photo: Path | None = None
 
     def __post_init__(self) -> None:
-        point_numbers(self.demo_point)
+        list_of_numbers(self.demo_point)
 
 
 @dataclass(frozen=True)
@@ -135,7 +120,7 @@ class LookArguments:
     policy: PromptOptions = PromptOptions()
 
     def __post_init__(self) -> None:
-        episode_numbers(self.dataset_episodes)
+        list_of_numbers(self.dataset_episodes)
         if self.dataset is None and self.policy != PromptOptions():
             raise ValueError("--policy.demo_point and --policy.demo_photo need the episodes of a --dataset.")
 

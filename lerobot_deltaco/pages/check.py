@@ -35,9 +35,10 @@ from lerobot_deltaco.data.pauses import paused_frames
 from lerobot_deltaco.data.reading import dimension_names, episode_spans, open_folder_or_hub
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
 from lerobot_deltaco.errors import UserError
-from lerobot_deltaco.pages.arguments import CheckArguments, episode_numbers
+from lerobot_deltaco.pages.arguments import CheckArguments, list_of_numbers
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
+from lerobot_deltaco.policies.deltaco_match.findings import demonstrated_crop
 from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
@@ -114,6 +115,11 @@ class TrainingStart:
         known = None if self.policy is None else self.policy.training_locations
         return None if known is None else known.locations.cpu()
 
+    @property
+    def has_crops(self) -> bool:
+        """Whether it is known how large the objects' crops are."""
+        return self.policy is not None and bool(self.policy.matching.fitted)
+
 
 def check(arguments: CheckArguments) -> str:
     """Shows what a policy would take from a dataset, on one self-contained page.
@@ -124,7 +130,7 @@ def check(arguments: CheckArguments) -> str:
     Raises:
         ValueError: Training would refuse the dataset; the message has the reason, and the report.
     """
-    opened = open_folder_or_hub(arguments.dataset, episode_numbers(arguments.dataset_episodes))
+    opened = open_folder_or_hub(arguments.dataset, list_of_numbers(arguments.dataset_episodes))
     config = DeltacoMatchConfig(**asdict(arguments.policy))
     start = TrainingStart(opened, config)
     tasks = DatasetEpisodes(opened).episode_tasks()
@@ -150,6 +156,7 @@ def check(arguments: CheckArguments) -> str:
         views=views,
         n_episodes=len(tasks),
         has_locations=start.locations is not None,
+        has_crops=start.has_crops,
     )
     lines = [
         *(f"{name + ':':15} {text}" for name, text in facts),
@@ -213,6 +220,11 @@ def _read_episodes(
         images = [] if demo_camera is None else list(images_of.get(demo_camera, ()))
         located = start.locations if isinstance(grasp, Grasp) else None
         marks = [] if located is None else list(zip(located[episode], (PICK_COLOR, PLACE_COLOR), strict=True))
+        pictures = _strip(images, marks)
+        if marks and start.has_crops:
+            assert start.policy is not None
+            assert start.bank is not None
+            pictures.append(picture_uri(demonstrated_crop(start.policy, start.bank[episode])))
         text = f"{(last - first + 1) / meta.fps:.1f} s"
         if is_left_out[episode]:
             text += f", left out: {grasp}"
@@ -229,7 +241,7 @@ def _read_episodes(
                 "number": number,
                 "task": tasks[episode],
                 "text": text,
-                "pictures": _strip(images, marks),
+                "pictures": pictures,
                 "polyline": polyline,
                 "lines": lines,
             }

@@ -30,6 +30,7 @@ class EpisodeView(NamedTuple):
         lines: What happened, and what the policy understood, as sentences.
         picture: Where the policy looked, as a data URI; None for policies that find no locations.
         video: The episode, as a data URI; None if it was not run.
+        crops: What the policy compared, as data URIs: the demonstrated object, and what it chose.
     """
 
     instruction: str
@@ -40,6 +41,7 @@ class EpisodeView(NamedTuple):
     lines: Sequence[str]
     picture: str | None
     video: str | None
+    crops: Sequence[str] = ()
 
 
 def write_page(out: Path, template: str, **values: Any) -> Path:

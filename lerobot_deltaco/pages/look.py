@@ -21,13 +21,13 @@ from lerobot_deltaco.data.training_data import DatasetEpisodes, read_demonstrati
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import load_conditioned
-from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions, episode_numbers, point_numbers
+from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions, list_of_numbers
 from lerobot_deltaco.pages.html import EpisodeView, picture_uri, write_page
 from lerobot_deltaco.pages.player import Player
 from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.findings import describe_words
+from lerobot_deltaco.policies.deltaco_match.findings import compared_crops, describe_words
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
 
@@ -62,7 +62,7 @@ def look(arguments: LookArguments) -> str:
         episodes = _benchmark_episodes(loaded, arguments.episodes)
     else:
         names = [f"Episodes with the right {what} location" for what in ("pick", "place")]
-        chosen = episode_numbers(arguments.dataset_episodes)
+        chosen = list_of_numbers(arguments.dataset_episodes)
         prompt = _prompt(arguments.policy, loaded.policy.config)
         opened = open_folder_or_hub(dataset, chosen)
         held_out = [] if chosen else _held_out_episodes(loaded.policy.config, opened)
@@ -105,7 +105,7 @@ def _prompt(options: PromptOptions, config: TaskConditionedConfig) -> ObjectProm
     if options == PromptOptions():
         return None
     _, height, width = config.image_features[config.cameras[0]].shape
-    return read_prompt(point_numbers(options.demo_point), options.demo_photo, (width, height))
+    return read_prompt(list_of_numbers(options.demo_point), options.demo_photo, (width, height))
 
 
 def _dataset_episodes(
@@ -178,7 +178,12 @@ def _dataset_episodes(
             f"{100 * localization.confidence.item():.0f} % sure of the object. {describe_words(policy, task)}"
         )
         is_right = all(rights) if rights else None
-        yield EpisodeView(task, "", [], is_right, headline, [f"{where}.", sure], picture, None), rights
+        crops = [
+            picture_uri(crop)
+            for crop in compared_crops(policy, observation[camera].to(config.device), *given)
+        ]
+        lines = [f"{where}.", sure]
+        yield EpisodeView(task, "", [], is_right, headline, lines, picture, None, crops), rights
 
 
 def _held_out_episodes(config: DeltacoMatchConfig, dataset: LeRobotDataset) -> list[int]:

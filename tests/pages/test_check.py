@@ -1,5 +1,7 @@
 """`deltaco check`: its report agrees with the training."""
 
+import base64
+import io
 import re
 import shutil
 import sys
@@ -9,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
+from PIL import Image
 from small_policies import (
     COLORS,
     EPISODES,
@@ -52,8 +55,15 @@ def test_a_good_dataset_is_reported_as_it_is_trained_on(table, tmp_path, short_f
     )
     # The training's own warning, of a joint that never moves.
     assert report.count("warning:") == report.count("of the robot's state hardly move") == 1
-    assert page.count("data:image/jpeg;base64") == 4 * 48
+    pictures = [
+        Image.open(io.BytesIO(base64.b64decode(content)))
+        for content in re.findall('data:image/jpeg;base64,([^"]*)', page)
+    ]
+    assert len(pictures) == 5 * 48
     assert "would refuse" not in page
+    # The crop, the last one of each episode, has the task's object in its middle.
+    middle = [picture.getpixel((picture.width // 2, picture.height // 2)) for picture in pictures[4::5]]
+    assert all((red > blue) == (n % 2 == 0) for n, (red, _, blue) in enumerate(middle))
 
 
 def test_the_direction_of_the_gripper_is_the_one_given(table, tmp_path):
@@ -104,7 +114,7 @@ def test_an_undecodable_image_is_named_and_the_episode_can_be_left_out(table, tm
         )
     )
     assert "in 47 of 47 episodes" in report
-    with pytest.raises(ValueError, match="--dataset.episodes must be a list of numbers"):
+    with pytest.raises(ValueError, match=r"lists of whole numbers, such as \[10,20\]. Got '3 4'"):
         CheckArguments(str(root), dataset_episodes="3 4")
 
 

@@ -26,8 +26,14 @@ from lerobot_deltaco.pages.html import EpisodeView, render
 from lerobot_deltaco.pages.look import look
 from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.pages.videos import encode_video
+from lerobot_deltaco.policies.deltaco_match import findings
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
-from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
+from lerobot_deltaco.policies.deltaco_match.pictures import (
+    PICK_COLOR,
+    PLACE_COLOR,
+    draw_crop,
+    draw_localization,
+)
 
 
 def found_at(pick, place, by_demonstration=(True, True), size=24):
@@ -37,7 +43,9 @@ def found_at(pick, place, by_demonstration=(True, True), size=24):
         maps[0, n, row, column] = 20
     locations = (torch.tensor([[pick, place]]) + 0.5) / size * 2 - 1
     attention = maps.flatten(2).softmax(2).view_as(maps)
-    return PickPlace(locations, torch.zeros(1), maps, attention, by_demonstration, torch.ones(1))
+    return PickPlace(
+        locations, torch.zeros(1), maps, attention, by_demonstration, torch.ones(1), locations[:, 0]
+    )
 
 
 def test_maps_are_drawn_at_the_scenes_own_resolution():
@@ -120,7 +128,7 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     report = look(LookArguments(str(folder), str(tmp_path / "data"), 3, tmp_path / "out"))
     text = (tmp_path / "out/index.html").read_text()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["index.html"]
-    assert text.count("data:image/jpeg;base64") == 3
+    assert text.count("data:image/jpeg;base64") == 3 * 3
     # The first two demonstrate each other, the third itself; the scenes have the dataset's own size.
     assert [text.count(f"by {who}") for who in ("episode 1", "episode 0", "itself")] == [1, 1, 1]
     assert [args[0].shape for args in drawn] == [(96, 96, 3)] * 3
@@ -129,6 +137,27 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
     for what, number in zip(("pick", "place"), right.sum(dim=0).tolist(), strict=True):
         assert f"Episodes with the right {what} location: <b>{number} of 3</b>" in text
         assert f"Episodes with the right {what} location: {number} of 3\n" in report
+
+
+def test_the_crops_on_the_page_are_those_that_were_compared(tmp_path, monkeypatch):
+    write_robot_dataset(tmp_path / "data", [4, 4])
+    loaded = load_tiny_policy(tmp_path)
+    matching = loaded.policy.matching
+    compared, chosen, drawn = [], [], []
+    encoder, find = matching.encoder, matching.find
+    # The gripper does not close at a crop's center.
+    monkeypatch.setattr(matching, "grasps", lambda _, proposals, *__: -proposals)
+    monkeypatch.setattr(look_module, "load_conditioned", lambda _: loaded)
+    monkeypatch.setattr(matching, "encoder", lambda *crops: compared.append(crops) or encoder(*crops))
+    monkeypatch.setattr(matching, "find", lambda *args: chosen.append(find(*args)) or chosen[-1])
+    monkeypatch.setattr(findings, "draw_crop", lambda *crop: drawn.append(crop) or draw_crop(*crop))
+    look(LookArguments("policy", str(tmp_path / "data"), 2, tmp_path / "out"))
+    assert len(compared) == len(drawn) == 2 * len(chosen) == 4
+    for shown, own in zip(compared[::2], drawn[::2], strict=True):
+        assert all(map(torch.equal, shown, own))
+    for (image, locations, sizes), candidates, own in zip(compared[1::2], chosen, drawn[1::2], strict=True):
+        best = candidates.log_probabilities[0].argmax()
+        assert all(map(torch.equal, (image, locations[:, best, None], sizes[:, best, None]), own))
 
 
 @pytest.mark.parametrize(("n_frames", "shown"), [(0, "0 2"), (None, "1"), (1, "0 1 2")])
@@ -152,10 +181,12 @@ def test_a_point_takes_the_place_of_demonstrations(tmp_path):
     write_robot_dataset(tmp_path / "data", [4, 4])
     arguments = [str(save_tiny_policy(tmp_path / "policy")), str(tmp_path / "data"), 2, tmp_path / "out"]
     look(LookArguments(*arguments, policy=PromptOptions(demo_point="[10, 20]")))
-    assert (tmp_path / "out/index.html").read_text().count("where a point shows the object") == 2
+    text = (tmp_path / "out/index.html").read_text()
+    assert text.count("where a point shows the object") == 2
+    assert text.count("data:image/jpeg;base64") == 2 * 2  # nothing is compared
     with pytest.raises(ValueError, match="picture, which has 48 x 48 px"):
         look(LookArguments(*arguments, policy=PromptOptions(demo_point="[480, 20]")))
-    with pytest.raises(ValueError, match=r"a list of numbers, such as \[320,240\]. Got '4 5'"):
+    with pytest.raises(ValueError, match=r"lists of whole numbers, such as \[10,20\]. Got '4 5'"):
         PromptOptions(demo_point="4 5")
     with pytest.raises(ValueError, match="need the episodes of a --dataset"):
         LookArguments("policy", policy=PromptOptions(demo_photo="cup.png"))

@@ -44,7 +44,13 @@ def recording(name, bin_, pick=None, place="green", end=POSITIONS):
         points = np.array([POSITIONS[NAMES.index(pick)], centers[BINS.index(place)]])
         locations = torch.tensor(image_locations(points))[None] + 0.05
         localization = PickPlace(
-            locations, torch.zeros(1), torch.zeros(1, 2, 4, 4), None, (False, False), torch.ones(1)
+            locations,
+            torch.zeros(1),
+            torch.zeros(1, 2, 4, 4),
+            None,
+            (False, False),
+            torch.ones(1),
+            locations[:, 0],
         )
     return Recording([], localization, layout(), np.array([POSITIONS, end]), placements, number)
 

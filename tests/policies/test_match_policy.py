@@ -402,7 +402,13 @@ def test_replay_repeats_the_demonstration_in_its_own_scene(table):
     policy.eval()
     located = policy.training_locations
     policy.localize = lambda *_: PickPlace(
-        located.locations[:1], located.heights[:1], None, None, (True, False), torch.ones(1)
+        located.locations[:1],
+        located.heights[:1],
+        None,
+        None,
+        (True, False),
+        torch.ones(1),
+        located.locations[:1, 0],
     )
     policy.set_tasks([RED], [[policy.training_data.demonstrations[0]]])
     steps = range(1, TABLE_LENGTH)

@@ -20,7 +20,7 @@ from lerobot_deltaco.policies.base.image_encoder import (
     EfficientNetLite0,
 )
 
-_RESOLUTION = 128  # px, of crops as the network sees them
+CROP_RESOLUTION = 128  # px, of crops as the network sees them
 # Maps that describe a crop: at stride 16, as 4 x 4 cells, and at stride 32, as their mean.
 _FINE_CHANNELS, _FINE_CELLS, _COARSE_CHANNELS = 112, 4, 320
 _COLOR_CELLS = 8  # of a row and of a column, whose mean colors are features
@@ -54,7 +54,7 @@ class CropEncoder:
             PretrainedWeightsError: The network's weights are missing.
         """
         is_crop = ~locations.isnan().any(dim=2)
-        crops = cut_crops(images, locations.nan_to_num(), sizes.nan_to_num(nan=1.0), _RESOLUTION)[is_crop]
+        crops = cut_crops(images, locations.nan_to_num(), sizes.nan_to_num(nan=1.0), CROP_RESOLUTION)[is_crop]
         mean, std = (
             torch.tensor(values, device=crops.device)[:, None, None]
             for values in (IMAGENET_MEAN, IMAGENET_STD)

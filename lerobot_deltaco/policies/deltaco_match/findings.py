@@ -10,15 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers
-from lerobot_deltaco.policies.deltaco_match.pictures import demonstration_ends, draw_localization
+from lerobot_deltaco.policies.deltaco_match.pictures import demonstration_ends, draw_crop, draw_localization
+from lerobot_deltaco.policies.deltaco_match.prompts import prompted_crop
 from lerobot_deltaco.policies.deltaco_match.words import understand, words_of
 
 if TYPE_CHECKING:
+    from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
     from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, PickPlace
 
 logger = logging.getLogger(__name__)
@@ -124,6 +127,53 @@ def predicted_boxes(policy: DeltacoMatchPolicy, localization: PickPlace) -> dict
         for probabilities, own in zip(sure, boxes, strict=True)
     ]
     return {"boxes": {policy.config.cameras[0]: detections}}
+
+
+@torch.no_grad()
+def compared_crops(
+    policy: DeltacoMatchPolicy, image: Tensor, shown: Demonstration | ObjectPrompt | None = None
+) -> list[Image.Image]:
+    """Returns the crops that were compared in a policy's running episode, as pictures.
+
+    The first is of the demonstration or photo, if there is one; the last is of what was chosen in the scene.
+    See `report_findings` for the arguments.
+    """
+    matching, localization = policy.matching, policy.localization
+    assert localization is not None
+    camera, scene = policy.config.cameras[0], image[None]
+    crops = []
+    if isinstance(shown, ObjectPrompt):
+        small = policy._camera_image({camera: scene}, camera)
+        crops.append(draw_crop(*prompted_crop(matching, shown, image, small.shape[-2:])))
+        if shown.image is None:  # which shows what is chosen
+            return crops
+    elif shown is not None:
+        assert localization.demonstrated is not None
+        first = shown.frames[0] if shown.first_image is None else shown.first_image
+        crops.append(_crop(matching, first[None], localization.demonstrated[:1]))
+    return [*crops, _crop(matching, scene, localization.proposal[:1])]
+
+
+@torch.no_grad()
+def demonstrated_crop(policy: DeltacoMatchPolicy, shown: Demonstration) -> Image.Image:
+    """Returns the crop of what a demonstration grasped, as a picture.
+
+    Args:
+        policy: A policy whose feature matching is fitted.
+        shown: The demonstration.
+    """
+    given = policy._batch_demonstrations([[shown]], policy.step.device)
+    assert given is not None
+    small, full_resolution = given.ends[0, :, 0], given.first_images[0]
+    grasps = policy.state_regressor.pick_locations(given.pick_states[0])
+    center, _ = policy.matching.demonstrated(small, full_resolution, grasps, grasps)
+    return _crop(policy.matching, full_resolution, center)
+
+
+def _crop(matching: FeatureMatching, image: Tensor, center: Tensor) -> Image.Image:
+    """Draws the crop of an image (1, 3, H, W) at a center (1, 2) in -1..1."""
+    location = center[:, None]
+    return draw_crop(image, location, matching.crop_sizes(location))
 
 
 def _draw(

@@ -94,10 +94,12 @@ class Described(NamedTuple):
     """What demonstrations grasped.
 
     Attributes:
+        centers: Centers of the objects, (batch, 2) in -1..1.
         descriptors: Descriptors of the objects, (batch, descriptor).
         templates: Surroundings of the grasps, (batch, 3, h, w); NaN where the grasp is not known.
     """
 
+    centers: Tensor
     descriptors: Tensor
     templates: Tensor
 
@@ -303,17 +305,27 @@ class FeatureMatching(nn.Module):
             attended: Locations of what moved, by the attention, (batch, 2) in -1..1.
         """
         with torch.autocast(images.device.type, enabled=False):
-            proposed, radius = self.proposals(images, full_resolution), self.grasp_radius
-            by_grasp, is_near = nearest_proposals(proposed, grasps, radius)
-            by_attention, is_attended = nearest_proposals(proposed, attended, radius)
-            nearest = torch.where(is_near, by_grasp, by_attention)
-            # A gripper is not always above the middle of an object, but a proposal is.
-            near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
-            locations = torch.where((is_near | is_attended)[:, None], near, attended)
-            features = self.features(full_resolution, locations[:, None])
+            centers, is_near = self.demonstrated(images, full_resolution, grasps, attended)
+            features = self.features(full_resolution, centers[:, None])
             shown = torch.where(is_near[:, None], grasps, torch.nan)
             templates = cut_templates(full_resolution, shown, self.object_sizes(grasps))
-            return Described(self.compare(features).descriptors[:, 0], templates)
+            return Described(centers, self.compare(features).descriptors[:, 0], templates)
+
+    def demonstrated(
+        self, images: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Finds what was grasped in demonstrations. See `describe` for the arguments.
+
+        Returns:
+            The centers of the objects, (batch, 2) in -1..1, and whether the grasp was there, (batch,) bool.
+        """
+        proposed, radius = self.proposals(images, full_resolution), self.grasp_radius
+        by_grasp, is_near = nearest_proposals(proposed, grasps, radius)
+        by_attention, is_attended = nearest_proposals(proposed, attended, radius)
+        nearest = torch.where(is_near, by_grasp, by_attention)
+        # A gripper is not always above the middle of an object, but a proposal is.
+        near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
+        return torch.where((is_near | is_attended)[:, None], near, attended), is_near
 
     @torch.no_grad()
     def understood(self, instruction: str) -> list[tuple[str, str]]:

@@ -96,6 +96,9 @@ class PickPlace(NamedTuple):
         by_demonstration: Whether the demonstration decided on the pick and on the place location. Otherwise,
             the attention is meaningless.
         confidence: Probability of the pick location among the proposals, (batch,).
+        proposal: The proposal that was chosen, (batch, 2) in -1..1.
+        demonstrated: Center of what the (first) demonstration grasped, in its first image, (batch, 2); None
+            without demonstrations.
         camera_motion: How far the camera has moved since the training, by the first scene; None if it is not
             known.
     """
@@ -106,6 +109,8 @@ class PickPlace(NamedTuple):
     attention: Tensor | None
     by_demonstration: tuple[bool, bool]
     confidence: Tensor
+    proposal: Tensor
+    demonstrated: Tensor | None = None
     camera_motion: CameraMotion | None = None
 
 
@@ -420,7 +425,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
         prompts = prompts_of(instructions, demonstrations)
         given = None if prompts else self._batch_demonstrations(demonstrations, scenes.device)
-        attention = last = descriptors = heights = templates = None
+        attention = last = centers = descriptors = heights = templates = None
         if prompts:
             descriptors = describe_prompts(self.matching, prompts, scenes, batch[camera])
         elif given is None:
@@ -438,6 +443,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             described = self.matching.describe(ends[:, 0], first_images, picks, attended)
             descriptors = described.descriptors.unflatten(0, (-1, n_each)).mean(dim=1)
             templates = described.templates.unflatten(0, (-1, n_each))
+            centers = described.centers[::n_each]
             heights = self.state_regressor.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
             attention, last = attentions[::n_each], ends[::n_each, 1]
         candidates = self.matching.find(scenes, batch[camera], instructions, descriptors, heights, templates)
@@ -455,6 +461,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             attention=attention,
             by_demonstration=(given is not None, given is not None and not bool(by_instruction.all())),
             confidence=confidence,
+            proposal=proposal,
+            demonstrated=centers,
             camera_motion=camera_motion,
         )
 

@@ -11,6 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lerobot_deltaco.data.demonstrations import Demonstration
+from lerobot_deltaco.data.images import as_uint8
+from lerobot_deltaco.policies.deltaco_match.crop_encoder import CROP_RESOLUTION, cut_crops
 
 if TYPE_CHECKING:
     from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
@@ -69,6 +71,20 @@ def draw_localization(
             panel = _overlay(panel, localization.attention[0, n : n + 1].float().cpu(), (color,))
         image.paste(panel, (0, n * (height + gap)))
     return image
+
+
+def draw_crop(image: Tensor, location: Tensor, size: Tensor) -> Image.Image:
+    """Draws a crop as a policy compares it, but in the proportions of the image.
+
+    Args:
+        image: (1, 3, H, W), uint8 or in 0..1.
+        location: Center of the crop, (1, 1, 2) in -1..1.
+        size: Its side as a fraction of the image's, (1, 1).
+    """
+    crop = cut_crops(image, location, size, CROP_RESOLUTION)[0, 0]
+    width = round(CROP_RESOLUTION * image.shape[-1] / image.shape[-2])
+    picture = Image.fromarray(as_uint8(crop).permute(1, 2, 0).cpu().numpy())
+    return picture.resize((width, CROP_RESOLUTION), Image.Resampling.BICUBIC)
 
 
 def _overlay(picture: Image.Image, maps: Tensor, colors: tuple[Color, ...]) -> Image.Image:

@@ -50,34 +50,40 @@ def describe_prompts(
         scenes: First images of the episodes, (batch, 3, H, W) in 0..1, as small as the policy's.
         full_resolution: The same at full resolution, (batch, 3, H', W').
     """
-    described = []
     with torch.autocast(scenes.device.type, enabled=False):
-        for n, prompt in enumerate(prompts):
-            image = full_resolution[n]
-            if prompt.image is not None:
-                image = prompt.image.to(image.device).float() / 255
-            if prompt.image is None or prompt.is_point:
-                features = _features_at(matching, prompt, image, scenes.shape[-2:])
-            else:
-                height, width = full_resolution.shape[-2:]
-                side = float(matching.crop_sizes(torch.zeros(2, device=image.device)))
-                size = max(_MIN_CROP, round(side * height)), max(_MIN_CROP, round(side * width))
-                crop = cut_box(image, prompt.box, size)[None]
-                features = matching.features(crop, crop.new_zeros(1, 1, 2), crop.new_ones(1, 1))
-            described.append(matching.compare(features).descriptors[:, 0])
-    return torch.cat(described)
+        crops = [
+            prompted_crop(matching, prompt, scene, scenes.shape[-2:])
+            for prompt, scene in zip(prompts, full_resolution, strict=True)
+        ]
+        return torch.cat([matching.compare(matching.features(*crop)).descriptors[:, 0] for crop in crops])
 
 
-def _features_at(
-    matching: FeatureMatching, prompt: ObjectPrompt, image: Tensor, size: Sequence[int]
-) -> Tensor:
-    """Returns features (1, 1, features) of the proposal at a point; of the point itself if there is none."""
+def prompted_crop(
+    matching: FeatureMatching, prompt: ObjectPrompt, scene: Tensor, size: Sequence[int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns an image (1, 3, H, W), and the center (1, 1, 2) and the side (1, 1) of a prompt's crop of it.
+
+    That is around the proposal at a point, or the point itself if there is none.
+
+    Args:
+        matching: Feature matching, fitted.
+        prompt: The prompt.
+        scene: First image of the episode, (3, H', W') in 0..1, at full resolution.
+        size: Height and width of scenes as small as the policy's.
+    """
+    image = scene if prompt.image is None else prompt.image.to(scene.device).float() / 255
+    if prompt.image is not None and not prompt.is_point:
+        height, width = scene.shape[-2:]
+        side = float(matching.crop_sizes(torch.zeros(2, device=image.device)))
+        extent = max(_MIN_CROP, round(side * height)), max(_MIN_CROP, round(side * width))
+        crop = cut_box(image, prompt.box, extent)[None]
+        return crop, crop.new_zeros(1, 1, 2), crop.new_ones(1, 1)
     point = image.new_tensor([prompt.location])  # (1, 2)
     small = F.interpolate(image[None], tuple(size), mode="bilinear", antialias=True)
     proposed = matching.proposals(small, image[None])
     nearest, is_near = nearest_proposals(proposed, point, matching.grasp_radius)
-    location = torch.where(is_near[:, None], proposed[0, nearest], point)
-    return matching.features(image[None], location[:, None])
+    location = torch.where(is_near[:, None], proposed[0, nearest], point)[:, None]
+    return image[None], location, matching.crop_sizes(location)
 
 
 def cut_box(image: Tensor, box: Sequence[float], size: tuple[int, int]) -> Tensor:
