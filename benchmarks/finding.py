@@ -293,21 +293,24 @@ def measure(matching: Any, pairs: Sequence[tuple[StillEpisode, StillEpisode]]) -
     """
     scenes = torch.stack([scene.first for scene, _ in pairs])
     shown = torch.stack([demonstration.first for _, demonstration in pairs])
+    last = torch.stack([demonstration.last for _, demonstration in pairs])
     generator = torch.Generator().manual_seed(0)
     picks = torch.stack([demonstration.locations[0] for _, demonstration in pairs])
     picks = picks + LOCATION_NOISE * torch.randn(picks.shape, generator=generator)
-    described = matching.describe(small(shown).float() / 255, shown.float() / 255, picks, picks).descriptors
+    ends = torch.stack([small(each).float() / 255 for each in (shown, last)], dim=1)
+    described = matching.describe(ends, shown.float() / 255, picks, picks)
+    templates = described.templates[:, None]
     rng = np.random.default_rng(0)
     texts = [str(rng.choice(scene.sentences)) for scene, _ in pairs]
     nothing = [""] * len(pairs)
     heights = torch.full((len(pairs),), torch.nan)
     result: dict[str, float] = {}
     for name, words, by in (
-        ("demo", nothing, described),
-        ("words", texts, None),
-        ("both", texts, described),
+        ("demo", nothing, (described.descriptors, heights, templates)),
+        ("words", texts, (None, None, None)),
+        ("both", texts, (described.descriptors, heights, templates)),
     ):
-        candidates = matching.find(small(scenes).float() / 255, scenes.float() / 255, words, by, heights)
+        candidates = matching.find(small(scenes).float() / 255, scenes.float() / 255, words, *by)
         location, p, _ = candidates.best
         right, near = [], []
         for n, (scene, _) in enumerate(pairs):

@@ -395,12 +395,12 @@ def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[
         optimizer.zero_grad()
     per_step = (time.perf_counter() - began) / _TIMED_STEPS
     # Crops of all proposals are encoded, which is most of the fit.
-    images = bank.frames[:_DESCRIBED_EPISODES, 0]
-    full_resolution = images if bank.first_images is None else bank.first_images[:_DESCRIBED_EPISODES]
-    middle = torch.zeros(len(images), 2, device=images.device)
+    ends = bank.frames[:_DESCRIBED_EPISODES, [0, -1]]
+    full_resolution = ends[:, 0] if bank.first_images is None else bank.first_images[:_DESCRIBED_EPISODES]
+    middle = torch.zeros(len(ends), 2, device=ends.device)
     began = time.perf_counter()
-    policy.matching.describe(images.float() / 255, full_resolution, middle, middle)
-    per_crop = (time.perf_counter() - began) / len(images)
+    policy.matching.describe(ends.float() / 255, full_resolution, middle, middle)
+    per_crop = (time.perf_counter() - began) / len(ends)
     fit = min(len(bank), policy.matching.settings.max_episodes) * N_OBJECTS * per_crop
     total = start.reading + fit + steps * per_step
     memory = start.bytes + psutil.Process().memory_info().rss

@@ -166,6 +166,11 @@ def encode_once():
         yield
 
 
+def both_ends(images):
+    """First and last images of episodes that end as they begin."""
+    return torch.stack([images, images], dim=1)
+
+
 def fraction_found(matching, shapes, by_demonstration=False, words=lambda task: "", grasp=None):
     """Fraction of the other 12 episodes in which the object is found, by other episodes or by words.
 
@@ -178,7 +183,7 @@ def fraction_found(matching, shapes, by_demonstration=False, words=lambda task: 
     if by_demonstration:
         attended = locations[shown]
         grasps = attended if grasp is None else torch.full_like(attended, grasp)
-        described = matching.describe(scenes[shown], scenes[shown], grasps, attended).descriptors
+        described = matching.describe(both_ends(scenes[shown]), scenes[shown], grasps, attended).descriptors
         demonstrated = torch.zeros(12)
     candidates = matching.find(scenes, scenes, [*map(words, tasks)], described, demonstrated)
     assert candidates.locations.shape == (12, N_OBJECTS, 2)
@@ -335,7 +340,8 @@ def test_objects_of_any_size_stand_out_whether_they_were_grasped_or_not(side):
     distances = nearest_distances(proposed, locations[24:])
     assert (distances < 0.6 * side / 96).float().mean() > 0.9
     # A training scene is not compared with itself.
-    distances = nearest_distances(background(images[:24], torch.arange(24)), locations[:24, :2])
+    masks = background.masks(images[:24], torch.arange(24))
+    distances = nearest_distances(background.objects(masks, images[:24]), locations[:24, :2])
     assert (distances < 0.6 * side / 96).float().mean() > 0.85
 
 
@@ -362,7 +368,8 @@ def test_crops_show_what_the_policys_small_images_do_not(matching):
     torch.testing.assert_close(*small)
     at = torch.zeros(1, 2)
     plain, striped, blurred = (
-        matching.describe(small[0], images, at, at).descriptors for images in (plain, striped, small[1])
+        matching.describe(both_ends(small[0]), images, at, at).descriptors
+        for images in (plain, striped, small[1])
     )
     similar, different = ((plain * other).sum() / plain.square().sum() for other in (blurred, striped))
     assert different < 0.75 < similar

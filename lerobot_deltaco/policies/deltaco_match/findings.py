@@ -164,9 +164,9 @@ def demonstrated_crop(policy: DeltacoMatchPolicy, shown: Demonstration) -> Image
     """
     given = policy._batch_demonstrations([[shown]], policy.step.device)
     assert given is not None
-    small, full_resolution = given.ends[0, :, 0], given.first_images[0]
+    ends, full_resolution = given.ends[0], given.first_images[0]
     grasps = policy.state_regressor.pick_locations(given.pick_states[0])
-    center, _ = policy.matching.demonstrated(small, full_resolution, grasps, grasps)
+    center, _ = policy.matching.demonstrated(ends, full_resolution, grasps, grasps)
     return _crop(policy.matching, full_resolution, center)
 
 

@@ -20,6 +20,8 @@ from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.matching import Crops, MatchingHead, word_scores
 from lerobot_deltaco.policies.deltaco_match.proposals import (
     MAX_REMEMBERED,
+    changed_areas,
+    demonstrated_centers,
     fit_perspective,
     nearest_proposals,
 )
@@ -86,13 +88,15 @@ def fit_feature_matching(
             if isinstance(layer, (nn.Conv2d, nn.Linear, nn.BatchNorm2d)):
                 layer.reset_parameters()
         matching.requires_grad_(True)
-        proposed = _fit_proposals(matching, images, full_resolution, locations, drawn, generator, autocast)
+        proposed, shown = _fit_proposals(
+            matching, images, last, full_resolution, locations, drawn, generator, autocast
+        )
         if not bool(matching.uses_background):
             rows = grasps.to(device)
             matching.perspective.copy_(fit_perspective(images[rows], last[rows], locations[rows]))
         matching.compare.feature_weight.fill_(settings.feature_weight)
         features, target, kept = _crops_of_proposals(
-            *(matching, full_resolution, locations, drawn, proposed, generator, autocast)
+            *(matching, full_resolution, locations, drawn, proposed, shown, generator, autocast)
         )
         held_out = _held_out([tasks[row] for row in drawn.tolist()], settings)
         is_kept = torch.isin(drawn, kept)
@@ -137,13 +141,14 @@ def fit_feature_matching(
 def _fit_proposals(
     matching: FeatureMatching,
     images: Tensor,
+    last: Tensor,
     full_resolution: Tensor,
     locations: Tensor,
     drawn: Tensor,
     generator: torch.Generator,
     autocast: torch.autocast,
-) -> Tensor:
-    """Fits the proposals, and returns those in the drawn scenes, (drawn, n, 2).
+) -> tuple[Tensor, Tensor]:
+    """Fits the proposals. Returns those in the drawn scenes, (drawn, n, 2), and what was grasped, (drawn, 2).
 
     Where objects do not stand out from the background, as if the camera was moved, a network learns where
     grippers closed, and is used if it finds more of the grasps.
@@ -152,29 +157,34 @@ def _fit_proposals(
     chosen = torch.randperm(len(drawn), generator=generator)[:MAX_REMEMBERED].sort().values
     remembered = torch.full((len(drawn),), -1)
     remembered[chosen] = torch.arange(len(chosen))
+    parts = []
     with torch.no_grad():
         some = drawn[chosen]
         background.fit(full_resolution[some.to(full_resolution.device)], locations[some.to(locations.device)])
         batches = list(zip(drawn.split(_SCENES_AT_A_TIME), remembered.split(_SCENES_AT_A_TIME), strict=True))
-        progress = tqdm(batches, desc="Looking for objects", unit="batch", leave=False)
-        proposed = torch.cat(
-            [background(full_resolution[some.to(full_resolution.device)], own) for some, own in progress]
-        ).to(images.device)
+        for some, own in tqdm(batches, desc="Looking for objects", unit="batch", leave=False):
+            scenes, here = full_resolution[some.to(full_resolution.device)], some.to(images.device)
+            masks = background.masks(scenes, own)
+            changed = changed_areas(torch.stack([images[here], last[here]], dim=1).float() / 255)
+            parts.append([background.objects(each, scenes) for each in (masks, masks * changed.to(masks))])
+    proposed, changed = (torch.cat(each).to(images.device) for each in zip(*parts, strict=True))
     matching.uses_background.fill_(True)
     matching.perspective.copy_(matching.background.perspective)
-    _, stands_out = nearest_proposals(proposed, locations[rows], matching.grasp_radius)
+    grasps, radius = locations[rows], matching.grasp_radius
+    _, stands_out = nearest_proposals(proposed, grasps, radius)
+    shown, _ = demonstrated_centers(proposed, changed, grasps, grasps, radius)
     if bool(stands_out.float().mean() >= settings.min_coverage):
-        return proposed
+        return proposed, shown
     held_out = torch.arange(len(rows), device=rows.device) % settings.held_out_every == 0
     fitted = rows[~held_out]
     matching.propose.fit(images[fitted], locations[fitted], generator, autocast, settings)
     with torch.no_grad():
         learned = torch.cat([matching.propose(images[some].float() / 255) for some in rows.split(256)])
-    _, is_found = nearest_proposals(learned, locations[rows], settings.grasp_radius)
+    _, is_found = nearest_proposals(learned, grasps, settings.grasp_radius)
     if bool(is_found[held_out].float().mean() <= stands_out[held_out].float().mean()):
-        return proposed
+        return proposed, shown
     matching.uses_background.fill_(False)
-    return learned
+    return learned, demonstrated_centers(learned, learned, grasps, grasps, settings.grasp_radius)[0]
 
 
 def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:
@@ -197,27 +207,29 @@ def _crops_of_proposals(
     locations: Tensor,
     drawn: Tensor,
     proposed: Tensor,
+    shown: Tensor,
     generator: torch.Generator,
     autocast: torch.autocast,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Returns features of the proposals in scenes, which of them was grasped, and the scenes' rows.
 
+    The last crop of each scene is of what was grasped, as a demonstration shows it.
+
     A scene in which no proposal is near the grasp is left out. Few scenes have variants: crops that are a
     little off, and of every second variant from the third on, of other colors, as of new objects.
 
     Returns:
-        (variants, scenes, n, features), (scenes,) and (scenes,).
+        (variants, scenes, n + 1, features), (scenes,) and (scenes,).
     """
     settings = matching.settings
     n_variants = min(max(settings.variant_scenes // len(drawn), 1), settings.max_variants)
     changes = random_color_changes(n_variants, 1.0, generator)
     features, targets, kept = [], [], []
     with tqdm(total=len(drawn), desc="Encoding crops", unit="scene", leave=False) as progress:
-        for some, of_some in zip(
-            drawn.split(_SCENES_AT_A_TIME), proposed.split(_SCENES_AT_A_TIME), strict=True
-        ):
+        every = torch.cat([proposed, shown[:, None]], dim=1)
+        for some, of_some in zip(drawn.split(_SCENES_AT_A_TIME), every.split(_SCENES_AT_A_TIME), strict=True):
             rows = some.to(locations.device)
-            nearest, near = nearest_proposals(of_some, locations[rows], matching.grasp_radius)
+            nearest, near = nearest_proposals(of_some[:, :-1], locations[rows], matching.grasp_radius)
             if bool(near.any()):
                 scenes = full_resolution[rows[near].to(full_resolution.device)]
                 variants = []
@@ -267,8 +279,9 @@ def fit_matching_head(
 
     Args:
         matching: What is fitted.
-        features: Features of the crops of the proposals, (variants, scenes, n, features); they are
-            overwritten. Every second variant from the third on has other colors.
+        features: Features of the crops of the proposals, and behind them of what a demonstration shows,
+            (variants, scenes, n + 1, features); they are overwritten. Every second variant from the third on
+            has other colors.
         target: The proposal that was grasped in each scene, (scenes,).
         heights: Height offsets of the grasps, (scenes,).
         tasks: Task of each scene.
@@ -316,8 +329,8 @@ def fit_matching_head(
     for step in tqdm(range(steps), desc="Fitting the matching head", unit="step", leave=False):
         scenes, others = (rows.to(device) for rows in pairs.draw(settings.matching_batch, generator))
         variant = torch.randint(len(features), (len(scenes),), generator=generator).to(device)
-        shown = features[variant, others, target[others]]
-        crops = torch.cat([features[variant, scenes], shown[:, None]], dim=1).float()
+        shown = features[variant, others, -1:]
+        crops = torch.cat([features[variant, scenes, :-1], shown], dim=1).float()
         named = torch.tensor([not has_other_colors(n) for n in variant.tolist()], device=device)
         with autocast:
             described = head.describe(crops, generator)
@@ -360,8 +373,8 @@ def _begin_at_features(
 ) -> None:
     """Sets the scales and the gate to where the features' cosines separate objects from other proposals."""
     scenes, others = (rows.to(features.device) for rows in pairs)
-    crops = head.describe(features[scenes].float())
-    shown = head.describe(features[others, target[others]][:, None].float())
+    crops = head.describe(features[scenes, :-1].float())
+    shown = head.describe(features[others, -1:].float())
     _, cosines = head.match(crops, shown.descriptors[:, 0])
     right = cosines.gather(1, target[scenes, None])
     wrong = cosines.scatter(1, target[scenes, None], -1.0).amax(dim=1)
@@ -426,7 +439,8 @@ class HeldOut:
 
     Args:
         matching: What is fitted.
-        features: Normalized features of the proposals of all scenes, (scenes, n, features).
+        features: Normalized features of the proposals of all scenes, and behind them of what demonstrations
+            show, (scenes, n + 1, features).
         target: The right proposals, (scenes,).
         tasks: Task of each scene.
         encoded: Words of all sentences.
@@ -455,8 +469,8 @@ class HeldOut:
         shown = torch.tensor([own[(n * len(own)) // _LOOKS] for _, n, own in pairs])
         texts = torch.tensor([int(spans[row, 0]) + (n * int(spans[row, 1])) // _LOOKS for row, n, _ in pairs])
         self._matching, self._target = matching, target[self._scenes]
-        self._inputs = features[self._scenes]
-        self._shown = features[shown, target[shown]][:, None]
+        self._inputs = features[self._scenes, :-1]
+        self._shown = features[shown, -1:]
         self._words = encoded[texts]
         self._best = math.inf
         self._state: dict[str, Tensor] = {}

@@ -39,7 +39,12 @@ from lerobot_deltaco.policies.deltaco_match.matching import (
     uniform,
     word_scores,
 )
-from lerobot_deltaco.policies.deltaco_match.proposals import Background, ProposalNetwork, nearest_proposals
+from lerobot_deltaco.policies.deltaco_match.proposals import (
+    Background,
+    ProposalNetwork,
+    changed_areas,
+    demonstrated_centers,
+)
 from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner, correlations, cut_templates
 from lerobot_deltaco.policies.deltaco_match.words import (
     UNKNOWN_WORD,
@@ -290,42 +295,40 @@ class FeatureMatching(nn.Module):
         return self.settings.grasp_error + self.settings.grasp_size * float(self.background.object_size)
 
     @torch.no_grad()
-    def describe(
-        self, images: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor
-    ) -> Described:
+    def describe(self, ends: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor) -> Described:
         """Describes what was grasped in demonstrations.
 
         An object that was pushed before it was grasped, as by an attempt that failed, is no longer where it
         was in the first image: no proposal is near the grasp. The attention then tells where it was.
 
         Args:
-            images: First images, (batch, 3, H, W) in 0..1, as small as the policy's.
-            full_resolution: The same at full resolution, (batch, 3, H', W').
+            ends: First and last images, (batch, 2, 3, H, W) in 0..1, as small as the policy's.
+            full_resolution: The first images at full resolution, (batch, 3, H', W').
             grasps: Locations of the grasps, (batch, 2) in -1..1; NaN where they are not known.
             attended: Locations of what moved, by the attention, (batch, 2) in -1..1.
         """
-        with torch.autocast(images.device.type, enabled=False):
-            centers, is_near = self.demonstrated(images, full_resolution, grasps, attended)
+        with torch.autocast(ends.device.type, enabled=False):
+            centers, is_near = self.demonstrated(ends, full_resolution, grasps, attended)
             features = self.features(full_resolution, centers[:, None])
             shown = torch.where(is_near[:, None], grasps, torch.nan)
             templates = cut_templates(full_resolution, shown, self.object_sizes(grasps))
             return Described(centers, self.compare(features).descriptors[:, 0], templates)
 
     def demonstrated(
-        self, images: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor
+        self, ends: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Finds what was grasped in demonstrations. See `describe` for the arguments.
 
         Returns:
             The centers of the objects, (batch, 2) in -1..1, and whether the grasp was there, (batch,) bool.
         """
-        proposed, radius = self.proposals(images, full_resolution), self.grasp_radius
-        by_grasp, is_near = nearest_proposals(proposed, grasps, radius)
-        by_attention, is_attended = nearest_proposals(proposed, attended, radius)
-        nearest = torch.where(is_near, by_grasp, by_attention)
-        # A gripper is not always above the middle of an object, but a proposal is.
-        near = proposed[torch.arange(len(proposed), device=proposed.device), nearest]
-        return torch.where((is_near | is_attended)[:, None], near, attended), is_near
+        if not bool(self.uses_background):
+            proposed = changed = self.propose(ends[:, 0])
+        else:
+            masks = self.background.masks(full_resolution)
+            proposed = self.background.objects(masks, full_resolution)
+            changed = self.background.objects(masks * changed_areas(ends), full_resolution)
+        return demonstrated_centers(proposed, changed, grasps, attended, self.grasp_radius)
 
     @torch.no_grad()
     def understood(self, instruction: str) -> list[tuple[str, str]]:

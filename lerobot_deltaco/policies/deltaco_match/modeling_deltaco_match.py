@@ -440,7 +440,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 self.state_regressor.pick_locations(states),
                 given.first_images.flatten(0, 1),
             )
-            described = self.matching.describe(ends[:, 0], first_images, picks, attended)
+            described = self.matching.describe(ends, first_images, picks, attended)
             descriptors = described.descriptors.unflatten(0, (-1, n_each)).mean(dim=1)
             templates = described.templates.unflatten(0, (-1, n_each))
             centers = described.centers[::n_each]

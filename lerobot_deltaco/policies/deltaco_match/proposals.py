@@ -82,23 +82,20 @@ class Background(nn.Module):
     def _forget_bounds(module: Background, _: object) -> None:
         module._bounds = module._static = None
 
-    def forward(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
-        """Proposes objects, the most prominent first.
+    def forward(self, scenes: Tensor) -> Tensor:
+        """Proposes objects. See `objects`."""
+        return self.objects(self.masks(scenes), scenes)
+
+    def objects(self, masks: Tensor, scenes: Tensor) -> Tensor:
+        """Proposes what masks show.
 
         Args:
-            scenes: First images, (batch, 3, H, W), uint8 or in 0..1, at full resolution.
-            remembered: Row of each scene among the remembered images, which is left out, (batch,); -1 for a
-                scene that is not among them.
+            masks: How clearly each pixel stands out, (batch, 128, 128) in 0..1.
+            scenes: The scenes, (batch, 3, H, W), uint8 or in 0..1.
 
         Returns:
-            Locations in -1..1, (batch, N_OBJECTS, 2); NaN behind the last object.
+            Locations in -1..1, the most prominent first, (batch, N_OBJECTS, 2); NaN behind the last object.
         """
-        masks = torch.cat(
-            [
-                self.mask(some, None if remembered is None else remembered[n : n + _AT_A_TIME])
-                for n, some in zip(range(0, len(scenes), _AT_A_TIME), scenes.split(_AT_A_TIME), strict=True)
-            ]
-        )
         diameter, perspective = float(self.object_size), self.perspective.cpu()
         found = [
             segment(mask, image, diameter, perspective)
@@ -118,9 +115,20 @@ class Background(nn.Module):
                 row[0] = centers[mask.argmax()]
         return padded
 
-    def mask(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
-        """Returns how clearly each pixel stands out, (batch, 128, 128) in 0..1. See `forward`."""
-        return ((self._differences(scenes, remembered) - self.contrast) / self.contrast).clamp(0, 1)
+    def masks(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
+        """Returns how clearly each pixel stands out, (batch, 128, 128) in 0..1.
+
+        Args:
+            scenes: First images, (batch, 3, H, W), uint8 or in 0..1, at full resolution.
+            remembered: Row of each scene among the remembered images, which is left out, (batch,); -1 for a
+                scene that is not among them.
+        """
+        parts = []
+        for first in range(0, len(scenes), _AT_A_TIME):
+            some = slice(first, first + _AT_A_TIME)
+            differences = self._differences(scenes[some], None if remembered is None else remembered[some])
+            parts.append(((differences - self.contrast) / self.contrast).clamp(0, 1))
+        return torch.cat(parts)
 
     def camera_motion(self, scene: Tensor) -> CameraMotion | None:
         """Compares a scene with what never moved; None with too few remembered images to know that.
@@ -194,6 +202,16 @@ class Background(nn.Module):
                 away[remembered[n]] = 2.0
             results.append(_kth_smallest(away, n_common))
         return torch.stack(results).clamp_min(0)
+
+
+def changed_areas(ends: Tensor) -> Tensor:
+    """Returns where the first and the last images of episodes differ, (batch, 128, 128) bool.
+
+    Args:
+        ends: First and last images, (batch, 2, 3, H, W) in 0..1.
+    """
+    change = (ends[:, 1] - ends[:, 0]).abs().amax(dim=1, keepdim=True)
+    return F.interpolate(change, (_SIDE, _SIDE), mode="bilinear", align_corners=False)[:, 0] > _CHANGE
 
 
 def _over_neighbors(images: Tensor, extreme: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
@@ -347,3 +365,31 @@ def nearest_proposals(proposed: Tensor, locations: Tensor, radius: float) -> tup
     """Returns the nearest proposal to locations (batch, 2), and whether it is near, (batch,) each."""
     distance, nearest = (proposed - locations[:, None]).norm(dim=2).nan_to_num(nan=torch.inf).min(dim=1)
     return nearest, distance < radius
+
+
+def demonstrated_centers(
+    proposed: Tensor, changed: Tensor, grasps: Tensor, attended: Tensor, radius: float
+) -> tuple[Tensor, Tensor]:
+    """Returns the centers of what was grasped, (batch, 2), and whether the grasp was there, (batch,) bool.
+
+    A gripper is not always above the middle of an object, but a proposal is. What disappeared is the object
+    alone, even if it touched others.
+
+    Args:
+        proposed: Proposals in the first images, (batch, n, 2) in -1..1.
+        changed: Those in what has changed by the end, (batch, n, 2).
+        grasps: Locations of the grasps, (batch, 2); NaN where they are not known.
+        attended: Where the object was otherwise, (batch, 2).
+        radius: Distance within which a proposal stands for the object.
+    """
+    rows = torch.arange(len(proposed), device=proposed.device)
+    centers, is_near = attended, torch.zeros_like(rows, dtype=torch.bool)
+    for found, at, is_grasp in (
+        (proposed, attended, False),
+        (proposed, grasps, True),
+        (changed, grasps, True),
+    ):
+        nearest, is_there = nearest_proposals(found, at, radius)
+        centers = torch.where(is_there[:, None], found[rows, nearest], centers)
+        is_near |= is_there & is_grasp
+    return centers, is_near
