@@ -185,6 +185,8 @@ class MatchingSettings:
         grasp_size: Part of that distance that grows with the objects, in their diameters.
         template_weight: Weight of the correlation of a proposal with the demonstrated grasp, where an unknown
             word describes the object: the object is new, and the learned descriptors tell less of it.
+        few_episodes: Number of training episodes up to which a demonstration without an instruction is taken
+            to show a new object, whose grasp looks like the demonstrated one.
         template_reach: How far from a proposal the demonstrated grasp is looked for, in diameters.
         refinement_steps: Steps of the fit of where on an object the gripper closes.
         min_matching_steps: Smallest number of steps of the fit of the matching head.
@@ -229,6 +231,7 @@ class MatchingSettings:
     grasp_size: float = 0.75
     template_weight: float = 20.0
     template_reach: float = 0.5
+    few_episodes: int = 600
     refinement_steps: int = 300
     min_matching_steps: int = 300
     max_matching_steps: int = 1500

@@ -101,6 +101,7 @@ def fit_feature_matching(
         held_out = _held_out([tasks[row] for row in drawn.tolist()], settings)
         is_kept = torch.isin(drawn, kept)
         matching.held_out.copy_(torch.tensor([0, int(held_out.sum())]))
+        matching.n_episodes.fill_(len(grasps))
         matching.sharpness.fill_(1.0)
         matching.error_rate.zero_()
         fit_matching_head(

@@ -58,7 +58,7 @@ from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
 logger = logging.getLogger(__name__)
 
 _MIN_PROBABILITY = 1e-9
-_MIN_P_UNKNOWN = 0.01  # of an unknown word, below which templates are not compared
+_MIN_NOVELTY = 0.01  # of an object, below which templates are not compared
 _MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
 # Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
 _APPEARANCE_STD = 0.7
@@ -128,6 +128,7 @@ class FeatureMatching(nn.Module):
         sharpness: Factor of the scores, (), and
         error_rate: the rate of errors that no score excludes, (), by held-out episodes.
         held_out: Number of held-out episodes in which the object was found, and of all, (2,) int64.
+        n_episodes: Number of training episodes, () int64.
     """
 
     perspective: Tensor
@@ -136,6 +137,7 @@ class FeatureMatching(nn.Module):
     sharpness: Tensor
     error_rate: Tensor
     held_out: Tensor
+    n_episodes: Tensor
 
     def __init__(
         self, vocabulary: Sequence[str], crop_size: float, settings: MatchingSettings | None = None
@@ -156,6 +158,7 @@ class FeatureMatching(nn.Module):
         self.register_buffer("sharpness", torch.ones(()))
         self.register_buffer("error_rate", torch.zeros(()))
         self.register_buffer("held_out", torch.zeros(2, dtype=torch.int64))
+        self.register_buffer("n_episodes", torch.zeros((), dtype=torch.int64))
         self.requires_grad_(False)
         self.eval()
 
@@ -191,7 +194,7 @@ class FeatureMatching(nn.Module):
             crops = self.compare(self.features(full_resolution, locations))
             words = encode_words(instructions, self.vocabulary).to(scenes.device)
             scores, similarity = self.scores(crops, words, described)
-            if templates is not None and bool((self._p_unknown(words) > _MIN_P_UNKNOWN).any()):
+            if templates is not None and bool((self._p_unknown(words) > _MIN_NOVELTY).any()):
                 alike = self._correlations(full_resolution, locations, templates)
                 scores = scores + self.settings.template_weight * self._p_unknown(words)[:, None] * alike
             if demonstrated is None:
@@ -264,7 +267,13 @@ class FeatureMatching(nn.Module):
         """Returns where something could be grasped in scenes, (batch, n, 2) in -1..1. See `find`."""
         return self.background(full_resolution) if bool(self.uses_background) else self.propose(scenes)
 
-    def grasps(self, full_resolution: Tensor, proposals: Tensor, templates: Tensor | None = None) -> Tensor:
+    def grasps(
+        self,
+        full_resolution: Tensor,
+        proposals: Tensor,
+        templates: Tensor | None = None,
+        novelty: Tensor | None = None,
+    ) -> Tensor:
         """Returns where the gripper closes on proposed objects, (batch, 2) in -1..1.
 
         Args:
@@ -272,8 +281,20 @@ class FeatureMatching(nn.Module):
             proposals: A proposal in each, (batch, 2) in -1..1.
             templates: Surroundings of demonstrated grasps, (batch, demonstrations, 3, h, w); None without
                 demonstrations. See `Described`.
+            novelty: How likely each object is new, (batch,). See `novelty`.
         """
-        return self.refine(full_resolution, proposals, self.object_sizes(proposals), templates)
+        sizes = self.object_sizes(proposals)
+        return self.refine(full_resolution, proposals, sizes, templates, novelty)
+
+    def novelty(self, instructions: Sequence[str]) -> Tensor:
+        """Returns how likely demonstrated objects are new to the training, (batch,) in 0..1.
+
+        They are if an unknown word describes them; and without an instruction, after few training episodes.
+        """
+        words = encode_words(instructions, self.vocabulary).to(self.fitted.device)
+        of_few = (self.n_episodes <= self.settings.few_episodes).to(self.sharpness)
+        is_empty = torch.tensor([not text for text in instructions], device=self.fitted.device)
+        return torch.where(is_empty, of_few, self._p_unknown(words))
 
     @property
     def report(self) -> str:

@@ -450,7 +450,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if prompts:
             candidates = choose_prompted(candidates, prompts, self.matching.grasp_radius)
         proposal, confidence, height = candidates.best
-        pick = self.matching.grasps(batch[camera], proposal, templates)
+        novelty = self.matching.novelty(instructions)
+        pick = self.matching.grasps(batch[camera], proposal, templates, novelty)
         place_maps = self._place_maps(
             scenes, by_instruction, instructions, last, None if attention is None else attention[:, 1]
         )

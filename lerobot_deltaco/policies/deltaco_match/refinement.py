@@ -36,6 +36,7 @@ _TEMPLATE_WINDOW = 0.7  # standard deviation of the weights of a template's pixe
 _CORRELATION_WEIGHT = 40.0  # of a correlation, as a logit beside the network's
 _LEAST_LOG_PROBABILITY = -8.0  # of a cell, by the network: it may be wrong
 _MIN_VARIANCE = 1e-4  # of colors in 0..1
+_MIN_NOVELTY = 0.01  # of an object, below which templates are not compared
 
 
 class GraspRefiner(nn.Module):
@@ -66,7 +67,12 @@ class GraspRefiner(nn.Module):
         self.register_buffer("errors", torch.zeros(2))
 
     def forward(
-        self, images: Tensor, locations: Tensor, sizes: Tensor, templates: Tensor | None = None
+        self,
+        images: Tensor,
+        locations: Tensor,
+        sizes: Tensor,
+        templates: Tensor | None = None,
+        novelty: Tensor | None = None,
     ) -> Tensor:
         """Returns where the gripper closes, (batch, 2) in -1..1.
 
@@ -76,10 +82,16 @@ class GraspRefiner(nn.Module):
             sizes: Diameters of typical objects there, as fractions of the image's side, (batch,).
             templates: Surroundings of demonstrated grasps, (batch, demonstrations, 3, h, w); NaN where the
                 grasp is not known. See `cut_templates`.
+            novelty: How likely each object is new, and its grasp looks like the demonstrated one, (batch,);
+                by default, 1.
         """
-        if templates is None and not bool(self.is_used):
+        is_new = templates is not None and (novelty is None or bool((novelty > _MIN_NOVELTY).any()))
+        if not is_new and not bool(self.is_used):
             return locations
-        return self._refine(images, locations, sizes, templates, uses_network=bool(self.is_used))
+        weights = locations.new_ones(len(locations)) if novelty is None else novelty
+        return self._refine(
+            images, locations, sizes, templates if is_new else None, weights, uses_network=bool(self.is_used)
+        )
 
     @torch.no_grad()
     def _refine(
@@ -88,6 +100,7 @@ class GraspRefiner(nn.Module):
         locations: Tensor,
         sizes: Tensor,
         templates: Tensor | None = None,
+        weights: Tensor | None = None,
         *,
         uses_network: bool = True,
     ) -> Tensor:
@@ -101,10 +114,14 @@ class GraspRefiner(nn.Module):
             if templates is not None:
                 found = correlations(images, locations, sizes, templates, _EXTENT / 2)
                 found = F.interpolate(found[:, None], maps.shape[1:], mode="bilinear", align_corners=True)
-                maps = maps.clamp_min(_LEAST_LOG_PROBABILITY) + _CORRELATION_WEIGHT * found[:, 0]
+                assert weights is not None
+                scale = _CORRELATION_WEIGHT * weights[:, None, None]
+                maps = maps.clamp_min(_LEAST_LOG_PROBABILITY) + scale * found[:, 0]
             best, cells = maps.flatten(1).max(dim=1)
-            weights = (maps - best[:, None, None]).exp()
-            locations = locations + extent[:, None] * mean_near(weights, cells, _PEAK_RADIUS)
+            likelihoods = (maps - best[:, None, None]).exp()
+            moves = extent[:, None] * mean_near(likelihoods, cells, _PEAK_RADIUS)
+            tells_nothing = (best == maps.flatten(1).amin(dim=1))[:, None]  # no template, and no network
+            locations = torch.where(tells_nothing, locations, locations + moves)
         # Another object would be another choice.
         is_near = (locations - proposals).norm(dim=1) < 2 * _MAX_MOVE * sizes
         return torch.where(is_near[:, None], locations, proposals).clamp(-1, 1)
