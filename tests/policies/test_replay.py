@@ -139,3 +139,22 @@ def test_an_action_stays_within_those_of_the_training_and_of_the_demonstration(f
     for _ in range(60):
         reference, action = replay.follow(reference, shown.states[:1])
         assert (action.abs() <= shown.actions.abs().amax().clamp_min(1)).all()
+
+
+def test_pauses_are_not_repeated_but_the_gripper_gets_its_time(fitted):
+    _, _, demonstrations, replay = fitted
+    shown = demonstrations[0]
+    opening = shown.actions[:, GRIPPER]
+    (closing,) = (opening[1:] < opening[:-1]).nonzero().flatten().tolist()
+    # It hesitates on the way, and waits after it has closed.
+    repeats = torch.ones(len(opening), dtype=torch.int64)
+    hesitates = closing // 2
+    repeats[hesitates], repeats[closing + 2] = 30, 7
+    states, slow_opening = (each.repeat_interleave(repeats, dim=0) for each in (shown.states, opening))
+    kept = replay._moving(states, slow_opening)
+    original = torch.arange(len(opening)).repeat_interleave(repeats)[kept].tolist()
+    assert original.count(hesitates) == 1
+    assert original.count(closing + 2) >= 7
+    assert set(range(closing)) - set(original) <= {0, 1}
+    assert kept[0] == 0
+    assert kept[-1] == len(states) - 1

@@ -35,6 +35,8 @@ _STEPS_APART, _LEAST_APART = 1.0, 0.05
 _PASSED = 3.0  # tolerances within which a state counts as reached if the one after it is nearer
 _LEAST_APPROACH = 0.1  # of the tolerance, in a frame that comes closer
 _MAX_WAIT = 2  # frames that a state is waited for without coming closer
+_STILL = 0.05  # of a usual step, within which an arm stands still
+_COMMAND_CHANGE = 0.05  # of the range of a gripper's commands; less is no change
 _LEAST_EXPLAINED = 0.1  # of the variance of an action, by the dimension of the state that it moves
 _VELOCITY = 0.8  # coefficient of determination above which a dimension is a velocity
 _MAX_STORED = 48  # trajectories of training episodes
@@ -233,6 +235,9 @@ class TrajectoryReplay(nn.Module):
     def _trajectory(self, states: Tensor, actions: Tensor, command: Gripper) -> Trajectory | str:
         """Returns the trajectory of an episode, or the reason why it has no grasp."""
         states, actions = (each.to(self.is_arm.device).float() for each in (states, actions))
+        scaled = states * self.state_scale + self.state_shift
+        moving = self._moving(scaled, command.opening(actions))
+        states, scaled, actions = (each[moving] for each in (states, scaled, actions))
         span = (0, len(states) - 1)
         (grasp,) = find_grasps(command.opening(actions), [span], command.usual_range, states)
         if isinstance(grasp, str):
@@ -240,11 +245,30 @@ class TrajectoryReplay(nn.Module):
         # The command to close takes effect one step later.
         grasp = grasp._replace(grasp=min(grasp.grasp + 1, grasp.release))
         return Trajectory(
-            states * self.state_scale + self.state_shift,
+            scaled,
             actions * self.action_scale + self.action_shift,
             grasp,
             states[[grasp.grasp, grasp.release]],
         )
+
+    def _moving(self, states: Tensor, opening: Tensor) -> list[int]:
+        """Returns the frames that are not pauses: none is repeated in which the arm hesitated.
+
+        While the gripper closes or opens, the arm waits on purpose.
+
+        Args:
+            states: States of an episode, normalized, (frames, state).
+            opening: How far the gripper is commanded to open, (frames,).
+        """
+        least = _STILL * self.usual_step
+        is_change = (opening[1:] - opening[:-1]).abs() > _COMMAND_CHANGE * (opening.max() - opening.min())
+        kept, waits = [0], False
+        for frame in range(1, len(states)):
+            has_moved = bool(self._distance(states[frame] - states[kept[-1]]) > least)
+            waits = bool(is_change[frame - 1]) or (waits and not has_moved)
+            if has_moved or waits or frame == len(states) - 1:
+                kept.append(frame)
+        return kept
 
     def start(
         self,
