@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lerobot_env_libero_pro.grasps import find_grasp, turn
+from lerobot_env_libero_pro.grasps import FAR, find_grasp, turn
 from lerobot_env_libero_pro.scene import CONTROL_FPS, Scene
 
 NEAR = 0.015  # m from where a stage ends, within which it may end early
@@ -19,12 +19,13 @@ RELEASE = 0.01  # m between them when the gripper opens
 HOLLOW = "contain_region"
 FINGERTIP = 0.012  # m below the point between the fingertips
 # Far out, the hand tilts: where the elbow becomes straight, the controller loses the way back.
-FAR = 0.72  # m from the robot's axis, where the tilt begins
 TILT_LENGTH = 0.2  # m per rad
 MAX_TILT = 0.4  # rad
 CLOSING_STEPS = 9
+RIM_CLOSING_STEPS = 14  # where the outer finger may push the object first
 OPENING_STEPS = 10  # until the fingers are off the object
 RISING_STEPS = 8
+SLOW = 0.0015  # m per action, below which the hand does not drift along a rim while the fingers close
 STALLED = 0.0005  # m per action, below which the hand touches something that holds it back
 TIMEOUT = 3 * CONTROL_FPS  # actions after which a stage ends anyway
 
@@ -45,20 +46,23 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
     grasp = find_grasp(scene, target, _hand_axis(scene))
     origin = scene.position(target)[2]
     bottom = scene.vertices(target)[:, 2].min() - origin
-    rim, release = _rim(scene, place), _release_height(scene, place, grasp.point[2] - origin - bottom)
+    release = _release_height(scene, place, grasp.point[2] - origin - bottom)
+    crossing = max(_rim(scene, place), origin + bottom) + CROSSING
     tallest = max(scene.vertices(name)[:, 2].max() for name in scene.task.objects)
     above = np.array([*grasp.point[:2], max(grasp.point[2] + APPROACH, tallest + PASSING)])
 
-    def hand_to(point: np.ndarray, tolerance: float, opening: float, slow: float = 1) -> Iterator[np.ndarray]:
+    def hand_to(point: np.ndarray, tolerance: float, speed: float = np.inf) -> Iterator[np.ndarray]:
+        """Moves the open hand until it is that near, m, and that slow, m per action."""
         before = np.full(3, np.inf)
         for _ in range(TIMEOUT):
             hand = scene.hand_position()
             offset, moved = np.linalg.norm(point - hand), np.linalg.norm(hand - before)
             is_turned = abs(turn(grasp.axis, _hand_axis(scene))) < 0.05
-            if is_turned and (offset < tolerance or (offset < NEAR and moved < STALLED)):
+            is_there = offset < tolerance and moved <= speed
+            if is_turned and (is_there or (offset < NEAR and moved < STALLED)):
                 return
             before = hand
-            yield _action(scene, point - hand, grasp.axis, opening, slow)
+            yield _action(scene, point - hand, grasp.axis, -1)
 
     def object_to(height: float, tolerance: float, level: bool, slow: float = 1) -> Iterator[np.ndarray]:
         """Moves until the object's lowest point is that high, and, if level, its origin over the place."""
@@ -71,14 +75,16 @@ def pick_and_place(scene: Scene, target: str, place: str) -> Iterator[np.ndarray
                 return
             yield _action(scene, offset, grasp.axis, 1, slow)
 
-    yield from hand_to(above, 0.006, -1)
-    yield from hand_to(grasp.point, 0.004, -1)
-    for _ in range(CLOSING_STEPS):
-        yield _action(scene, np.zeros(3), grasp.axis, 1)
-    yield from object_to(rim + CROSSING, 1, level=False)
+    yield from hand_to(above, 0.006)
+    yield from hand_to(grasp.point, 0.004, SLOW if grasp.is_at_rim else np.inf)
+    for _ in range(RIM_CLOSING_STEPS if grasp.is_at_rim else CLOSING_STEPS):
+        # Around an object, the fingers center the hand; at a rim, it would drift.
+        offset = grasp.point - scene.hand_position() if grasp.is_at_rim else np.zeros(3)
+        yield _action(scene, offset, grasp.axis, 1)
+    yield from object_to(crossing, 1, level=False)
     if target not in scene.lifted():
         return
-    yield from object_to(rim + CROSSING, 0.015, level=True)
+    yield from object_to(crossing, 0.015, level=True)
     yield from object_to(release, 0.01, level=True, slow=0.6)
     for _ in range(OPENING_STEPS):
         yield _action(scene, np.zeros(3), grasp.axis, -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,10 @@ PAD = 0.009  # m above and below the point that the fingertips touch
 FINGERS = ((0.036, 0.068), 0.016)
 PALM = ((0.0, 0.105), 0.035)
 PALM_HEIGHT = 0.032
+# m from the rim to the point between the fingertips. From further in, the outer finger pushes the object.
+INWARDS = (0.005, 0.02)
+FAR = 0.72  # m from the robot's axis, where the arm begins to be straight
+FAR_COST = 20  # rad/m: so much rather turns the hand than the arm reaches beyond
 ANGLES = np.radians(np.arange(0, 180, 5))
 
 
@@ -28,14 +33,16 @@ class Grasp:
     Attributes:
         point: Where the point between the fingertips is to be, (3,), m.
         axis: Horizontal direction in which the fingers close, (2,), a unit vector. Its sign has no meaning.
+        is_at_rim: Whether only one side of a hollow object is between the fingers.
     """
 
     point: np.ndarray
     axis: np.ndarray
+    is_at_rim: bool = False
 
 
 def find_grasp(scene: Scene, name: str, hand_axis: np.ndarray) -> Grasp:
-    """Returns the grasp that leaves most room for the fingers and turns the hand least.
+    """Returns the grasp at which the hand hits nothing else, turns least and does not reach far.
 
     Args:
         scene: The scene.
@@ -43,12 +50,15 @@ def find_grasp(scene: Scene, name: str, hand_axis: np.ndarray) -> Grasp:
         hand_axis: Horizontal direction in which the fingers close now, (2,).
     """
     solids = scene.solids(name)
-    height = _even_height(solids)
-    slab = _slab(solids, height - PAD, height + PAD)
     others = [scene.vertices(other)[::10] for other in scene.task.objects if other != name]
-    around = np.concatenate([*others, np.zeros((0, 3))])
-    candidates = across(slab, height) or at_rim(slab, height)
-    return min(candidates, key=lambda grasp: _cost(grasp, around, hand_axis))
+    around = np.concatenate([*others, *scene.fixture_points(), np.zeros((0, 3))])
+    base = scene.base_position()
+
+    def touched(height: float) -> tuple[np.ndarray, float]:
+        return _slab(solids, height - PAD, height + PAD), height
+
+    candidates = across(*touched(_even_height(solids))) or at_rim(*touched(_rim_height(solids)))
+    return min(candidates, key=lambda grasp: _cost(grasp, around, hand_axis, base))
 
 
 def across(slab: np.ndarray, height: float) -> list[Grasp]:
@@ -74,10 +84,10 @@ def at_rim(slab: np.ndarray, height: float) -> list[Grasp]:
     """Returns grasps with one finger in a hollow object and one outside. Arguments as in `across`."""
     center = (slab.min(0) + slab.max(0)) / 2
     grasps = []
-    for angle in np.radians(np.arange(0, 360, 10)):
+    for inwards, angle in itertools.product(INWARDS, np.radians(np.arange(0, 360, 10))):
         axis = np.array([np.cos(angle), np.sin(angle)])
-        point = center + axis * (((slab - center) @ axis).max() - 0.005)
-        grasps.append(Grasp(np.array([*point, height]), axis))
+        point = center + axis * (((slab - center) @ axis).max() - inwards)
+        grasps.append(Grasp(np.array([*point, height]), axis, is_at_rim=True))
     return grasps
 
 
@@ -91,6 +101,12 @@ def _slab(solids: list[np.ndarray], low: float, high: float) -> np.ndarray:
     """Returns the corners, (n, 2), of the parts of an object that are between two heights."""
     parts = [part[:, :2] for part in solids if part[:, 2].min() < high and part[:, 2].max() > low]
     return np.concatenate([*parts, np.zeros((0, 2))])
+
+
+def _rim_height(solids: list[np.ndarray]) -> float:
+    """Returns the height of a grasp at the rim: high, where the palm is above what the object stands in."""
+    heights = np.concatenate(solids)[:, 2]
+    return float(max(heights.max() - HIGHEST, heights.min() + LOWEST))
 
 
 def _even_height(solids: list[np.ndarray]) -> float:
@@ -109,12 +125,14 @@ def _even_height(solids: list[np.ndarray]) -> float:
     return min(np.arange(lowest, max(lowest, top - HIGHEST) + 1e-6, 0.003), key=unevenness)
 
 
-def _cost(grasp: Grasp, around: np.ndarray, hand_axis: np.ndarray) -> float:
-    """Returns the hand's turn, rad, and 10 where a finger or the palm would come down on another object."""
+def _cost(grasp: Grasp, around: np.ndarray, hand_axis: np.ndarray, base: np.ndarray) -> float:
+    """Returns the hand's turn, rad; more where it would come down on something else, or at a far rim."""
     relative = around - grasp.point
     along = np.abs(relative[:, :2] @ grasp.axis)
     beside = np.abs(relative[:, :2] @ [-grasp.axis[1], grasp.axis[0]])
     cost = abs(turn(grasp.axis, hand_axis))
+    if grasp.is_at_rim:  # otherwise, all grasps are at the same place
+        cost += FAR_COST * max(0, np.linalg.norm((grasp.point - base)[:2]) - FAR)
     for ((inner, outer), half_width), height in ((FINGERS, -PAD), (PALM, PALM_HEIGHT)):
         is_hit = (along >= inner) & (along < outer) & (beside < half_width) & (relative[:, 2] > height)
         cost += 10 * bool(is_hit.any())

@@ -149,6 +149,11 @@ class Scene:
         """Returns the convex parts of an object that collide, by their corners: (n, 3) each, m."""
         return [self._geom_vertices(geom) for geom in self._geoms(name, group=0)]
 
+    def fixture_points(self, spacing: float = 0.015) -> list[np.ndarray]:
+        """Returns points, (n, 3) m each, of the boxes that fixtures consist of, where they collide."""
+        geoms = [geom for name in self._inner.fixtures_dict for geom in self._geoms(name, group=0)]
+        return [self._box_points(geom, spacing) for geom in geoms]
+
     def lifted(self) -> tuple[str, ...]:
         """Returns the names of the movable objects that are higher than at first, by more than `LIFTED`."""
         return tuple(
@@ -193,6 +198,13 @@ class Scene:
         else:  # a box, or what fills one
             corners = np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3)
             points = corners * self.model.geom_size[geom]
+        return self._to_world(geom, points)
+
+    def _box_points(self, geom: int, spacing: float) -> np.ndarray:
+        axes = [np.linspace(-size, size, 2 + int(2 * size / spacing)) for size in self.model.geom_size[geom]]
+        return self._to_world(geom, np.stack(np.meshgrid(*axes), -1).reshape(-1, 3))
+
+    def _to_world(self, geom: int, points: np.ndarray) -> np.ndarray:
         return points @ self.data.geom_xmat[geom].reshape(3, 3).T + self.data.geom_xpos[geom]
 
 
