@@ -1,5 +1,7 @@
 """What `deltaco_match` consists of: heights, places, feature matching."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -218,6 +220,29 @@ def test_certainty_is_limited_by_the_number_of_held_out_episodes(matching, shape
     assert limit < 0.9
 
 
+def test_objects_are_new_by_an_unknown_noun_or_without_words_after_few_episodes(matching, monkeypatch):
+    known, unknown, nothing = matching.novelty(["move the ring left", "move the gizmo left", ""]).tolist()
+    assert known < 0.1 < 0.5 < unknown
+    assert matching.n_episodes == 24
+    assert nothing == 1
+    monkeypatch.setattr(matching, "settings", replace(matching.settings, few_episodes=23))
+    assert matching.novelty([""]).tolist() == [0]
+
+
+def test_what_disappeared_is_the_demonstrated_object_also_beside_others(matching, shapes):
+    first = shapes[0][:1].float() / 255
+    last = first.clone()
+    (column, row), grasp = ((shapes[1][0] + 1) * SIZE / 2).round().long(), shapes[1][:1]
+    # Something as large touches it, and stays.
+    table = first[0, :, 0, 0, None, None]
+    first[0, :, row - 4 : row + 5, column + 5 : column + 14] = torch.tensor([0.3, 0.4, 0.6])[:, None, None]
+    last[0, :, row - 4 : row + 5, column + 5 : column + 14] = torch.tensor([0.3, 0.4, 0.6])[:, None, None]
+    last[0, :, row - 4 : row + 5, column - 4 : column + 5] = table
+    center, is_near = matching.demonstrated(torch.stack([first, last], dim=1), first, grasp, grasp)
+    assert is_near.all()
+    assert (center - grasp).norm() * SIZE / 2 < 1  # px
+
+
 def test_words_that_describe_another_object_do_not_outweigh_a_clear_demonstration(matching, shapes):
     def other_shape(task):
         return SHAPE_TASKS[task == SHAPE_TASKS[0]]
@@ -343,6 +368,21 @@ def test_objects_of_any_size_stand_out_whether_they_were_grasped_or_not(side):
     masks = background.masks(images[:24], torch.arange(24))
     distances = nearest_distances(background.objects(masks, images[:24]), locations[:24, :2])
     assert (distances < 0.6 * side / 96).float().mean() > 0.85
+
+
+def test_objects_of_many_colors_in_other_scenes_hide_none():
+    """In a quarter of the scenes, something with all colors stands where an object stands now."""
+    generator = torch.Generator().manual_seed(0)
+    images = torch.full((48, 3, 128, 128), 120, dtype=torch.uint8)
+    for image in images[::4]:
+        image[:, 40:70, 50:80] = torch.randint(0, 256, (3, 30, 30), generator=generator)
+    background = Background()
+    background.fit(images, torch.zeros(48, 2))
+    scene = torch.full((1, 3, 128, 128), 120, dtype=torch.uint8)
+    scene[0, :, 48:62, 58:72] = torch.tensor([90, 140, 60], dtype=torch.uint8)[:, None, None]
+    mask = background.masks(scene)[0] > 0.5
+    assert mask[48:62, 58:72].float().mean() > 0.95
+    assert mask.sum() < 1.1 * 14**2
 
 
 def test_crops_are_centered_and_see_the_native_resolution():
