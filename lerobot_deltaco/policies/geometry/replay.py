@@ -36,6 +36,7 @@ _PASSED = 3.0  # tolerances within which a state counts as reached if the one af
 _LEAST_APPROACH = 0.1  # of the tolerance, in a frame that comes closer
 _MAX_WAIT = 2  # frames that a state is waited for without coming closer
 _STILL = 0.05  # of a usual step, within which an arm stands still
+_LEAVES = 0.5  # usual steps away from where the gripper was commanded, from which on an arm no longer waits
 _COMMAND_CHANGE = 0.05  # of the range of a gripper's commands; less is no change
 _LEAST_EXPLAINED = 0.1  # of the variance of an action, by the dimension of the state that it moves
 _VELOCITY = 0.8  # coefficient of determination above which a dimension is a velocity
@@ -254,7 +255,7 @@ class TrajectoryReplay(nn.Module):
     def _moving(self, states: Tensor, opening: Tensor) -> list[int]:
         """Returns the frames that are not pauses: none is repeated in which the arm hesitated.
 
-        While the gripper closes or opens, the arm waits on purpose.
+        After a command to close or to open, the arm waits on purpose until it leaves.
 
         Args:
             states: States of an episode, normalized, (frames, state).
@@ -262,11 +263,15 @@ class TrajectoryReplay(nn.Module):
         """
         least = _STILL * self.usual_step
         is_change = (opening[1:] - opening[:-1]).abs() > _COMMAND_CHANGE * (opening.max() - opening.min())
-        kept, waits = [0], False
+        kept, waits_at = [0], None
         for frame in range(1, len(states)):
+            if bool(is_change[frame - 1]):
+                waits_at = frame
+            elif waits_at is not None:
+                left = bool(self._distance(states[frame] - states[waits_at]) > _LEAVES * self.usual_step)
+                waits_at = None if left else waits_at
             has_moved = bool(self._distance(states[frame] - states[kept[-1]]) > least)
-            waits = bool(is_change[frame - 1]) or (waits and not has_moved)
-            if has_moved or waits or frame == len(states) - 1:
+            if has_moved or waits_at is not None or frame == len(states) - 1:
                 kept.append(frame)
         return kept
 
