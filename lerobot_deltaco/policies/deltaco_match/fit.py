@@ -172,8 +172,10 @@ def _fit_proposals(
     matching.uses_background.fill_(True)
     matching.perspective.copy_(matching.background.perspective)
     grasps, radius = locations[rows], matching.grasp_radius
-    _, stands_out = nearest_proposals(proposed, grasps, radius)
-    shown, _ = demonstrated_centers(proposed, changed, grasps, grasps, radius)
+    nearest, stands_out = nearest_proposals(proposed, grasps, radius)
+    errors = (proposed[torch.arange(len(rows)), nearest] - grasps).norm(dim=1)
+    usual_error = float(errors[stands_out].median()) if stands_out.any() else 0.0
+    shown, _ = demonstrated_centers(proposed, changed, grasps, grasps, radius, usual_error)
     if bool(stands_out.float().mean() >= settings.min_coverage):
         return proposed, shown
     held_out = torch.arange(len(rows), device=rows.device) % settings.held_out_every == 0
@@ -185,7 +187,7 @@ def _fit_proposals(
     if bool(is_found[held_out].float().mean() <= stands_out[held_out].float().mean()):
         return proposed, shown
     matching.uses_background.fill_(False)
-    return learned, demonstrated_centers(learned, learned, grasps, grasps, settings.grasp_radius)[0]
+    return learned, demonstrated_centers(learned, learned, grasps, grasps, settings.grasp_radius, 0.0)[0]
 
 
 def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:

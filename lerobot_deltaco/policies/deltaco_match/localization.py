@@ -58,7 +58,8 @@ from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
 logger = logging.getLogger(__name__)
 
 _MIN_PROBABILITY = 1e-9
-_MIN_NOVELTY = 0.01  # of an object, below which templates are not compared
+_MIN_NOVELTY = 0.01  # of an object, below which templates are not compared with proposals
+_NOVEL = 0.5  # novelty of an object above which its grasp is taken to look like the demonstrated one
 _MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
 # Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
 _APPEARANCE_STD = 0.7
@@ -284,7 +285,11 @@ class FeatureMatching(nn.Module):
             novelty: How likely each object is new, (batch,). See `novelty`.
         """
         sizes = self.object_sizes(proposals)
-        return self.refine(full_resolution, proposals, sizes, templates, novelty)
+        expected = self.refine(full_resolution, proposals, sizes)
+        if templates is None or novelty is None or not bool((novelty > _NOVEL).any()):
+            return expected
+        alike = self.refine(full_resolution, proposals, sizes, templates)
+        return torch.where((novelty > _NOVEL)[:, None], alike, expected)
 
     def novelty(self, instructions: Sequence[str]) -> Tensor:
         """Returns how likely demonstrated objects are new to the training, (batch,) in 0..1.
@@ -349,7 +354,8 @@ class FeatureMatching(nn.Module):
             masks = self.background.masks(full_resolution)
             proposed = self.background.objects(masks, full_resolution)
             changed = self.background.objects(masks * changed_areas(ends), full_resolution)
-        return demonstrated_centers(proposed, changed, grasps, attended, self.grasp_radius)
+        usual_error = float(self.refine.errors[0])
+        return demonstrated_centers(proposed, changed, grasps, attended, self.grasp_radius, usual_error)
 
     @torch.no_grad()
     def understood(self, instruction: str) -> list[tuple[str, str]]:

@@ -40,6 +40,7 @@ _AT_A_TIME = 16
 N_PROPOSALS = 5  # of `ProposalNetwork`
 _CHANNELS = 32
 _MIN_DISTANCE = 1 / 6  # between two proposals, where an image's edges are at -1 and 1
+_UNUSUAL = 2.0  # median distances of proposals from grasps, from which on a distance is unusual
 _PEAK_RADIUS = 1.6  # of the cells around a peak whose mean is a proposal
 _LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
 # Change of a pixel (in 0..1) that counts for an object's size, and its distance from the grasp (in -1..1).
@@ -368,12 +369,12 @@ def nearest_proposals(proposed: Tensor, locations: Tensor, radius: float) -> tup
 
 
 def demonstrated_centers(
-    proposed: Tensor, changed: Tensor, grasps: Tensor, attended: Tensor, radius: float
+    proposed: Tensor, changed: Tensor, grasps: Tensor, attended: Tensor, radius: float, usual_error: float
 ) -> tuple[Tensor, Tensor]:
     """Returns the centers of what was grasped, (batch, 2), and whether the grasp was there, (batch,) bool.
 
-    A gripper is not always above the middle of an object, but a proposal is. What disappeared is the object
-    alone, even if it touched others.
+    A gripper is not always above the middle of an object, but a proposal is. Where the nearest one is
+    unusually far from the grasp, the object touched others; what has disappeared is the object alone.
 
     Args:
         proposed: Proposals in the first images, (batch, n, 2) in -1..1.
@@ -381,15 +382,17 @@ def demonstrated_centers(
         grasps: Locations of the grasps, (batch, 2); NaN where they are not known.
         attended: Where the object was otherwise, (batch, 2).
         radius: Distance within which a proposal stands for the object.
+        usual_error: Median distance of a proposal from the grasp.
     """
     rows = torch.arange(len(proposed), device=proposed.device)
-    centers, is_near = attended, torch.zeros_like(rows, dtype=torch.bool)
-    for found, at, is_grasp in (
-        (proposed, attended, False),
-        (proposed, grasps, True),
-        (changed, grasps, True),
-    ):
-        nearest, is_there = nearest_proposals(found, at, radius)
-        centers = torch.where(is_there[:, None], found[rows, nearest], centers)
-        is_near |= is_there & is_grasp
-    return centers, is_near
+    by_grasp, is_near = nearest_proposals(proposed, grasps, radius)
+    by_change, is_changed = nearest_proposals(changed, grasps, radius)
+    by_attention, is_attended = nearest_proposals(proposed, attended, radius)
+    centers = torch.where(is_attended[:, None], proposed[rows, by_attention], attended)
+    centers = torch.where(is_near[:, None], proposed[rows, by_grasp], centers)
+    distance, of_changed = (
+        (found[rows, nearest] - grasps).norm(dim=1)
+        for found, nearest in ((proposed, by_grasp), (changed, by_change))
+    )
+    is_better = is_changed & (of_changed < distance) & (distance > _UNUSUAL * usual_error)
+    return torch.where(is_better[:, None], changed[rows, by_change], centers), is_near | is_changed

@@ -36,7 +36,6 @@ _TEMPLATE_WINDOW = 0.7  # standard deviation of the weights of a template's pixe
 _CORRELATION_WEIGHT = 40.0  # of a correlation, as a logit beside the network's
 _LEAST_LOG_PROBABILITY = -8.0  # of a cell, by the network: it may be wrong
 _MIN_VARIANCE = 1e-4  # of colors in 0..1
-_MIN_NOVELTY = 0.01  # of an object, below which templates are not compared
 
 
 class GraspRefiner(nn.Module):
@@ -67,12 +66,7 @@ class GraspRefiner(nn.Module):
         self.register_buffer("errors", torch.zeros(2))
 
     def forward(
-        self,
-        images: Tensor,
-        locations: Tensor,
-        sizes: Tensor,
-        templates: Tensor | None = None,
-        novelty: Tensor | None = None,
+        self, images: Tensor, locations: Tensor, sizes: Tensor, templates: Tensor | None = None
     ) -> Tensor:
         """Returns where the gripper closes, (batch, 2) in -1..1.
 
@@ -80,18 +74,12 @@ class GraspRefiner(nn.Module):
             images: Images at full resolution, (batch, 3, H, W), uint8 or in 0..1.
             locations: Proposals, (batch, 2) in -1..1.
             sizes: Diameters of typical objects there, as fractions of the image's side, (batch,).
-            templates: Surroundings of demonstrated grasps, (batch, demonstrations, 3, h, w); NaN where the
-                grasp is not known. See `cut_templates`.
-            novelty: How likely each object is new, and its grasp looks like the demonstrated one, (batch,);
-                by default, 1.
+            templates: Surroundings of demonstrated grasps that these ones look like, (batch, demonstrations,
+                3, h, w); NaN where the grasp is not known. See `cut_templates`.
         """
-        is_new = templates is not None and (novelty is None or bool((novelty > _MIN_NOVELTY).any()))
-        if not is_new and not bool(self.is_used):
+        if templates is None and not bool(self.is_used):
             return locations
-        weights = locations.new_ones(len(locations)) if novelty is None else novelty
-        return self._refine(
-            images, locations, sizes, templates if is_new else None, weights, uses_network=bool(self.is_used)
-        )
+        return self._refine(images, locations, sizes, templates, uses_network=bool(self.is_used))
 
     @torch.no_grad()
     def _refine(
@@ -100,7 +88,6 @@ class GraspRefiner(nn.Module):
         locations: Tensor,
         sizes: Tensor,
         templates: Tensor | None = None,
-        weights: Tensor | None = None,
         *,
         uses_network: bool = True,
     ) -> Tensor:
@@ -114,9 +101,7 @@ class GraspRefiner(nn.Module):
             if templates is not None:
                 found = correlations(images, locations, sizes, templates, _EXTENT / 2)
                 found = F.interpolate(found[:, None], maps.shape[1:], mode="bilinear", align_corners=True)
-                assert weights is not None
-                scale = _CORRELATION_WEIGHT * weights[:, None, None]
-                maps = maps.clamp_min(_LEAST_LOG_PROBABILITY) + scale * found[:, 0]
+                maps = maps.clamp_min(_LEAST_LOG_PROBABILITY) + _CORRELATION_WEIGHT * found[:, 0]
             best, cells = maps.flatten(1).max(dim=1)
             likelihoods = (maps - best[:, None, None]).exp()
             moves = extent[:, None] * mean_near(likelihoods, cells, _PEAK_RADIUS)
