@@ -186,13 +186,18 @@ def test_location_and_height_give_the_state_at_the_pick(joints, n_episodes, acci
     assert (np.quantile(errors, 0.9, axis=0) < p90).all()
 
 
-def test_a_novel_rotation_of_the_hand_moves_no_location_where_positions_are_known():
+def unfitted():
+    """A recording, a regressor for it, the scale and shift of its states, and their dimensions."""
     recording = record(60, 0)
     states = recording.grasps.states
     scale = 1 / states.flatten(0, 1).std(dim=0)
     shift = -states.flatten(0, 1).mean(dim=0) * scale
-    dims = torch.arange(states.shape[2])
-    regressor = StateRegressor(states.shape[2])
+    return recording, StateRegressor(states.shape[2]), (scale, shift), torch.arange(states.shape[2])
+
+
+def test_a_novel_rotation_of_the_hand_moves_no_location_where_positions_are_known():
+    recording, regressor, (scale, shift), dims = unfitted()
+    states = recording.grasps.states
     regressor.fit(recording.grasps, *recording.images, scale, shift, dims < 6, position_dims=[0, 1, 2])
     turned = states[:, 0] + torch.where((dims >= 3) & (dims < 6), 2.0, 0.0)
     torch.testing.assert_close(regressor.pick_locations(turned), regressor.pick_locations(states[:, 0]))
@@ -202,12 +207,8 @@ def test_a_novel_rotation_of_the_hand_moves_no_location_where_positions_are_know
 
 
 def test_a_release_keeps_the_height_and_the_rotation_that_were_demonstrated():
-    recording = record(60, 0)
+    recording, regressor, (scale, shift), dims = unfitted()
     states = recording.grasps.states
-    scale = 1 / states.flatten(0, 1).std(dim=0)
-    shift = -states.flatten(0, 1).mean(dim=0) * scale
-    dims = torch.arange(states.shape[2])
-    regressor = StateRegressor(states.shape[2])
     located = regressor.fit(
         recording.grasps, *recording.images, scale, shift, dims < 6, position_dims=[0, 1, 2]
     )
