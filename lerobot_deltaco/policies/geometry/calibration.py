@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers, mean_near
+from lerobot_deltaco.policies.geometry.camera import fit_camera, point_at, project
 from lerobot_deltaco.policies.geometry.regression import robust_regression
 
 logger = logging.getLogger(__name__)
@@ -35,12 +37,17 @@ _DOUBTFUL = 0.35
 
 
 class ImageProjection(nn.Module):
-    """Projects robot states to locations in the image, by a map that is quadratic in the state.
+    """Projects robot states to locations in the image.
+
+    If it is known which dimensions are the hand's position, as a camera sees that; otherwise, by a map that is
+    quadratic in the state.
 
     Args:
         state_dim: Size of the robot's state.
 
     Attributes:
+        position_dims: Dimensions that are the hand's position along x, y and z, (3,) int64; -1 if these are
+            not known.
         residual: Median distance of changes in the training episodes from where they are expected, as a
             fraction of the image's side, (); negative if it is not known.
     """
@@ -49,6 +56,8 @@ class ImageProjection(nn.Module):
     mean: Tensor
     scale: Tensor
     weights: Tensor
+    position_dims: Tensor
+    camera: Tensor
 
     def __init__(self, state_dim: int) -> None:
         super().__init__()
@@ -56,6 +65,8 @@ class ImageProjection(nn.Module):
         self.register_buffer("scale", torch.zeros(state_dim))
         self.register_buffer("weights", torch.zeros(_quadratic(self.mean).shape[-1], 2))
         self.register_buffer("residual", torch.tensor(-1.0))
+        self.register_buffer("position_dims", torch.full((3,), -1))
+        self.register_buffer("camera", torch.zeros(3, 4))
         self.register_load_state_dict_pre_hook(self._add_residual)
 
     @staticmethod
@@ -63,7 +74,20 @@ class ImageProjection(nn.Module):
         """Lets checkpoints that do not tell the residual be loaded."""
         state_dict.setdefault(f"{prefix}residual", module.residual)
 
-    def fit(self, first: Tensor, carried: Tensor, last: Tensor, states: Tensor, scale: Tensor) -> None:
+    @property
+    def has_camera(self) -> bool:
+        """Whether the hand's position is known, and a camera sees it."""
+        return bool((self.position_dims >= 0).all())
+
+    def fit(
+        self,
+        first: Tensor,
+        carried: Tensor,
+        last: Tensor,
+        states: Tensor,
+        scale: Tensor,
+        position_dims: Sequence[int] | None = None,
+    ) -> None:
         """Learns the map from episodes; warns if it fits badly.
 
         Args:
@@ -73,6 +97,7 @@ class ImageProjection(nn.Module):
             states: States at their grasps, (episodes, state), at least `MIN_EPISODES`.
             scale: Factor by which each dimension counts, (state,), such as 1 / its standard deviation over
                 all frames. So velocities, which are only noise at a grasp, hardly count.
+            position_dims: Dimensions that are the hand's position along x, y and z; None if not known.
         """
         states = states.float()
         mean, std = states.mean(dim=0), states.std(dim=0)
@@ -81,10 +106,11 @@ class ImageProjection(nn.Module):
         changes = _changes(first, carried, last)  # (episodes, H, W)
         x = (states - mean) * self.scale.to(mean)
         smooth = _blurred(changes)
-        starts = [_fit_to_changes(x, changes, smooth, seed) for seed in range(_N_STARTS)]
-        weights, near = max(starts, key=lambda start: _change_at(smooth, _quadratic(x) @ start[0]))
-        self.weights.copy_(weights)
-        locations = _quadratic(x) @ weights
+        self.position_dims.copy_(torch.tensor([-1] * 3 if position_dims is None else list(position_dims)))
+        starts = [self._fit_to_changes(x, changes, smooth, seed) for seed in range(_N_STARTS)]
+        best, near = max(starts, key=lambda start: _change_at(smooth, self._map(x, start[0])))
+        (self.camera if self.has_camera else self.weights).copy_(best)
+        locations = self._map(x, best)
         distance = _distance(near, locations)
         self.residual.fill_(distance)
         # As near as this, something changes in any episode.
@@ -101,7 +127,58 @@ class ImageProjection(nn.Module):
 
     def forward(self, states: Tensor) -> Tensor:
         """Maps states (..., state) to locations (..., 2)."""
-        return _quadratic((states.float() - self.mean) * self.scale) @ self.weights
+        x = (states.float() - self.mean) * self.scale
+        return self._map(x, self.camera if self.has_camera else self.weights)
+
+    def positions_at(self, locations: Tensor, states: Tensor) -> Tensor:
+        """Moves states to where the camera sees the hand at locations, as high as it is.
+
+        Args:
+            locations: Locations, (..., 2) in -1..1.
+            states: States, (..., state).
+
+        Returns:
+            Another x and y in the states, (..., state).
+        """
+        *across, up = self.position_dims.tolist()
+        mean, scale = self.mean, self.scale
+        x_and_y = point_at(self.camera, locations, (states[..., up] - mean[up]) * scale[up])
+        moved = states.clone()
+        moved[..., across] = x_and_y / scale[across] + mean[across]
+        return moved
+
+    def _map(self, x: Tensor, weights: Tensor) -> Tensor:
+        """Maps normalized states (..., dims) to locations (..., 2)."""
+        if self.has_camera:
+            return project(weights, x[..., self.position_dims])
+        return _quadratic(x) @ weights
+
+    def _fit_to_changes(self, x: Tensor, changes: Tensor, smooth: Tensor, seed: int) -> tuple[Tensor, Tensor]:
+        """Fits the map from normalized states (episodes, dims) to where images change.
+
+        Args:
+            x: The states.
+            changes: Change of each pixel, (episodes, H, W).
+            smooth: The same, blurred.
+            seed: Seed of the clusters with which the fit begins.
+
+        Returns:
+            Weights of the map, and the location of the change in each episode, (episodes, 2).
+        """
+        centers, members = _clusters(x, seed)
+        # A change in the episodes of a cluster, but not in others, belongs to the states of the cluster.
+        average = torch.stack([changes[members == k].mean(dim=0) for k in range(len(centers))])
+        peaks = _peaks(_blurred(average - average.mean(dim=0)))
+        locations = _linear(x) @ _fit(_linear(centers), peaks, x.shape[1])
+        # Refine with each episode's own change near the expected location, which gives many more points.
+        for _ in range(_REFINEMENTS):
+            near = _peaks_near(smooth, locations)
+            if self.has_camera:
+                weights = fit_camera(x[:, self.position_dims], near)
+            else:
+                weights = _fit(_quadratic(x), near, x.shape[1])
+            locations = self._map(x, weights)
+        return weights, near
 
 
 def _changes(first: Tensor, carried: Tensor, last: Tensor) -> Tensor:
@@ -115,32 +192,6 @@ def _changes(first: Tensor, carried: Tensor, last: Tensor) -> Tensor:
     )
     # But it has left its first place in every episode.
     return (changes - changes.mean(dim=0)) / (changes.std(dim=0) + 0.02)
-
-
-def _fit_to_changes(x: Tensor, changes: Tensor, smooth: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Fits the map from normalized states (episodes, dims) to where images change.
-
-    Args:
-        x: The states.
-        changes: Change of each pixel, (episodes, H, W).
-        smooth: The same, blurred.
-        seed: Seed of the clusters with which the fit begins.
-
-    Returns:
-        Weights on `_quadratic`, and the location of the change in each episode, (episodes, 2).
-    """
-    centers, members = _clusters(x, seed)
-    # A change in the episodes of a cluster, but not in others, belongs to the states of the cluster.
-    average = torch.stack([changes[members == k].mean(dim=0) for k in range(len(centers))])
-    peaks = _peaks(_blurred(average - average.mean(dim=0)))
-    weights = _fit(_linear(centers), peaks, x.shape[1])
-    locations = _linear(x) @ weights
-    # Refine with each episode's own change near the expected location, which gives many more points.
-    for _ in range(_REFINEMENTS):
-        near = _peaks_near(smooth, locations)
-        weights = _fit(_quadratic(x), near, x.shape[1])
-        locations = _quadratic(x) @ weights
-    return weights, near
 
 
 def _change_at(maps: Tensor, locations: Tensor) -> float:

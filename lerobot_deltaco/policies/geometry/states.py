@@ -114,12 +114,13 @@ class StateRegressor(nn.Module):
             The locations and heights of the episodes.
         """
         has_grasp = grasps.has_grasp
+        seen = position_dims if int(has_grasp.sum()) < _MAX_BY_POSITION else None
         is_related = is_arm
-        if position_dims is not None and int(has_grasp.sum()) < _MAX_BY_POSITION:
+        if seen is not None:
             is_related = torch.zeros_like(is_arm)
-            is_related[list(position_dims)] = True
+            is_related[list(seen)] = True
         first, carried, last = (images[has_grasp] for images in (first, carried, last))
-        self.to_image.fit(first, carried, last, grasps.states[has_grasp, 0], scale * is_related)
+        self.to_image.fit(first, carried, last, grasps.states[has_grasp, 0], scale * is_related, seen)
         locations = self.to_image(grasps.states).clamp(-1, 1)
         self.state_scale.copy_(scale)
         self.state_shift.copy_(shift)
@@ -132,7 +133,10 @@ class StateRegressor(nn.Module):
                 robust_regression(features[:, n], states[:, n], degrees, _LEAST_ERROR, is_arm.float())
             )
         self._fit_follows_place(features[:, 1], states[:, 1], position_dims)
-        self._fit_heights(features[:, 0], states[:, 0], last_moves, is_related)
+        if seen is not None:
+            self._measure_heights(states[:, 0], seen[2])
+            return self.locate(grasps)
+        self._fit_heights(features[:, 0], states[:, 0], last_moves, is_arm)
         if tasks is not None:
             self._level(
                 features[:, 0], states[:, 0], [t for t, has in zip(tasks, has_grasp, strict=True) if has]
@@ -172,6 +176,20 @@ class StateRegressor(nn.Module):
         degrees = torch.tensor([0, 1, 1], device=states.device)
         weights = robust_regression(linear, states[:, [up]], degrees, _LEAST_ERROR)
         self.follows_place[up] = _explained(states[:, [up]], linear @ weights)[0]
+
+    def _measure_heights(self, states: Tensor, up: int) -> None:
+        """Takes the height of the hand for the height of a grasp.
+
+        Args:
+            states: States at grasps, normalized, (episodes, state).
+            up: Dimension that is the hand's height.
+        """
+        self.location_to_state[0, :, up] = 0
+        self.location_to_state[0, 0, up] = states[:, up].mean()
+        self.height_to_state.zero_()
+        self.height_to_state[0, up] = -states[:, up].std()  # nearer to the table is farther
+        self.rest_scale.zero_()
+        self.rest_scale[up] = 1
 
     def _fit_heights(self, features: Tensor, states: Tensor, last_moves: Tensor, is_arm: Tensor) -> None:
         """Learns how an unknown height moves the state at a grasp, and what a location predicts without it.
@@ -312,7 +330,12 @@ class StateRegressor(nn.Module):
         features = _location_features(locations)
         states = torch.einsum("bgf,gfs->bgs", features, self.location_to_state)
         further = (features[:, 0, :_N_HEIGHT_FEATURES] * heights[:, None]) @ self.height_to_state
-        return torch.cat([states[:, :1] + further[:, None], states[:, 1:]], dim=1)
+        pick = states[:, 0] + further
+        if self.to_image.has_camera:
+            as_recorded = (pick - self.state_shift) / self.state_scale
+            pick = self.to_image.positions_at(locations[:, 0], as_recorded)
+            pick = pick * self.state_scale + self.state_shift
+        return torch.cat([pick[:, None], states[:, 1:]], dim=1)
 
 
 def _explained(values: Tensor, predicted: Tensor) -> Tensor:
