@@ -71,10 +71,18 @@ def test_peak_of_a_map_is_its_location():
     maps = gaussian_maps(locations, 24, 32, 0.1)
     torch.testing.assert_close(peak_locations(20 * maps), locations, atol=0.03, rtol=0)
     found, logits = torch.tensor([[[-0.5, 0.2], [0.6, -0.4]]]), torch.tensor([[0.2, 0.8]]).log()
-    candidates = Candidates(found, logits, torch.zeros(1, 2))
+    candidates = Candidates(found, logits, torch.zeros(1, 2), 0.1)
     maps = candidates.map((24, 30))
     assert maps.shape == (1, 24, 30)
     torch.testing.assert_close(peak_locations(maps[:, None])[0, 0], candidates.best[0][0], atol=0.05, rtol=0)
+
+
+def test_parts_of_an_object_are_as_sure_together_as_the_object():
+    locations = torch.tensor([[[-0.5, 0.2], [-0.45, 0.2], [0.6, -0.4]]])
+    candidates = Candidates(locations, torch.tensor([[0.5, 0.3, 0.2]]).log(), torch.zeros(1, 3), radius=0.1)
+    location, probability, _ = candidates.best
+    assert location.tolist() == [[-0.5, pytest.approx(0.2)]]
+    assert probability.item() == pytest.approx(0.8)
 
 
 def test_the_demonstration_or_the_instruction_says_where():
@@ -309,11 +317,12 @@ def test_words_that_describe_the_container_do_not_count():
     features[:, :2, :100] += 4.0 * color[..., None]
     features[:, 2, 100:200] += 4.0
     matching.requires_grad_(True)
+    distances = 2.0 * (torch.arange(2) != target[:, None])
     sentences = {text: [text] for text in tasks}
     drawn = [tasks[n] for n in task]
     autocast = torch.autocast("cpu", enabled=False)
     fit_matching_head(
-        *(matching, features[None], target, torch.zeros(n_scenes)),
+        *(matching, features[None], distances, torch.zeros(n_scenes)),
         *(drawn, sentences, generator, 150, autocast),
     )
     sentence = "Putt the red cubee in the red bin"

@@ -24,6 +24,7 @@ from small_policies import (
     write_table,
 )
 
+from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.normalization import StateLimits
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, PickPlace
@@ -215,6 +216,17 @@ def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
     after = resumed.matching.state_dict()
     assert all(torch.equal(before[name], value) for name, value in after.items())
     assert resumed.config.known_words == ["blue", "left", "move", "object", "red", "right", "the"]
+
+
+def test_words_of_tasks_that_are_not_trained_on_are_unknown(table):
+    policy, _, _ = small_policy(table, "deltaco_match", prepare=False)
+    assert "blue" in policy.config.known_words
+    of_red = [n for n, episode in enumerate(table.meta.episodes) if episode["tasks"] == [RED]]
+    dataset = LeRobotDataset(table.repo_id, root=table.root, episodes=of_red)
+    policy.fit(TrainingData.read(DatasetEpisodes(dataset, of_red), policy.config.demonstration_format))
+    assert policy.config.known_words == ["", "left", "move", "object", "red", "", "the"]
+    blue, unheard = policy.matching.novelty(["move the blue object left", "move the mauve object left"])
+    assert blue == unheard
 
 
 def test_feature_matching_takes_images_of_any_size(table):

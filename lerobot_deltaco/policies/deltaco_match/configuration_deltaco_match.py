@@ -72,8 +72,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.2
     scheduler_warmup_steps: int = 200
-    # Filled in by training: the vocabulary of feature matching, the episodes that were held out of its fit,
-    # the number of frames of their dataset, and the range of the gripper's commands.
+    # Filled in by training: the vocabulary of feature matching (with "" for words of tasks that are not trained
+    # on), the episodes that were held out of its fit, the number of frames of their dataset, and the range of
+    # the gripper's commands.
     known_words: list[str] = field(default_factory=list)
     held_out_episodes: list[int] = field(default_factory=list)
     n_dataset_frames: int | None = None

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -95,7 +94,7 @@ def fit_feature_matching(
             rows = grasps.to(device)
             matching.perspective.copy_(fit_perspective(images[rows], last[rows], locations[rows]))
         matching.compare.feature_weight.fill_(settings.feature_weight)
-        features, target, kept = _crops_of_proposals(
+        features, distances, kept = _crops_of_proposals(
             *(matching, full_resolution, locations, drawn, proposed, shown, generator, autocast)
         )
         held_out = _held_out([tasks[row] for row in drawn.tolist()], settings)
@@ -107,7 +106,7 @@ def fit_feature_matching(
         fit_matching_head(
             matching,
             features,
-            target,
+            distances,
             heights[kept.to(heights.device)],
             [tasks[row] for row in kept.tolist()],
             sentences,
@@ -118,7 +117,7 @@ def fit_feature_matching(
         )
         if bool(matching.uses_background):
             rows = kept.to(device)
-            nearest = proposed[is_kept.to(device)][torch.arange(len(kept)), target]
+            nearest = proposed[is_kept.to(device)][torch.arange(len(kept)), distances.argmin(dim=1)]
             matching.refine.fit(
                 full_resolution[kept.to(full_resolution.device)],
                 locations[rows],
@@ -214,7 +213,7 @@ def _crops_of_proposals(
     generator: torch.Generator,
     autocast: torch.autocast,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns features of the proposals in scenes, which of them was grasped, and the scenes' rows.
+    """Returns features of the proposals in scenes, how far they are from the grasps, and the scenes' rows.
 
     The last crop of each scene is of what was grasped, as a demonstration shows it.
 
@@ -222,17 +221,19 @@ def _crops_of_proposals(
     little off, and of every second variant from the third on, of other colors, as of new objects.
 
     Returns:
-        (variants, scenes, n + 1, features), (scenes,) and (scenes,).
+        (variants, scenes, n + 1, features), (scenes, n) in radii within which a proposal stands for what was
+        grasped, infinite where there is none, and (scenes,).
     """
     settings = matching.settings
     n_variants = min(max(settings.variant_scenes // len(drawn), 1), settings.max_variants)
     changes = random_color_changes(n_variants, 1.0, generator)
-    features, targets, kept = [], [], []
+    features, distances, kept = [], [], []
     with tqdm(total=len(drawn), desc="Encoding crops", unit="scene", leave=False) as progress:
         every = torch.cat([proposed, shown[:, None]], dim=1)
         for some, of_some in zip(drawn.split(_SCENES_AT_A_TIME), every.split(_SCENES_AT_A_TIME), strict=True):
             rows = some.to(locations.device)
-            nearest, near = nearest_proposals(of_some[:, :-1], locations[rows], matching.grasp_radius)
+            away = (of_some[:, :-1] - locations[rows, None]).norm(dim=2) / matching.grasp_radius
+            near = (away < 1).any(dim=1)
             if bool(near.any()):
                 scenes = full_resolution[rows[near].to(full_resolution.device)]
                 variants = []
@@ -249,7 +250,7 @@ def _crops_of_proposals(
                     with autocast:
                         variants.append(matching.features(images, at, sizes).half())
                 features.append(torch.stack(variants))
-                targets.append(nearest[near])
+                distances.append(away[near].nan_to_num(nan=torch.inf))
                 kept.append(some[near.cpu()])
             progress.update(len(some))
     if not kept:
@@ -258,7 +259,7 @@ def _crops_of_proposals(
             "that the first camera stands still and shows the objects, or name another with "
             "--policy.demo_camera."
         )
-    return torch.cat(features, dim=1), torch.cat(targets), torch.cat(kept)
+    return torch.cat(features, dim=1), torch.cat(distances), torch.cat(kept)
 
 
 def has_other_colors(variant: int) -> bool:
@@ -269,7 +270,7 @@ def has_other_colors(variant: int) -> bool:
 def fit_matching_head(
     matching: FeatureMatching,
     features: Tensor,
-    target: Tensor,
+    distances: Tensor,
     heights: Tensor,
     tasks: Sequence[str],
     sentences: Mapping[str, Sequence[str]],
@@ -285,7 +286,8 @@ def fit_matching_head(
         features: Features of the crops of the proposals, and behind them of what a demonstration shows,
             (variants, scenes, n + 1, features); they are overwritten. Every second variant from the third on
             has other colors.
-        target: The proposal that was grasped in each scene, (scenes,).
+        distances: Distances of the proposals from the grasp of their scene, (scenes, n), in radii within
+            which a proposal stands for what was grasped: several may. Infinite for no proposal.
         heights: Height offsets of the grasps, (scenes,).
         tasks: Task of each scene.
         sentences: Instructions of each task.
@@ -298,17 +300,18 @@ def fit_matching_head(
     if held_out is None:
         held_out = torch.zeros(len(tasks), dtype=torch.bool)
     pairs = EpisodePairs(tasks, (~held_out).nonzero().flatten().tolist())
-    head.set_statistics(features[0])
+    head.set_statistics(features[0, :, :-1])
+    is_grasped, target = distances < 1, distances.argmin(dim=1)
     for some in features.flatten(0, 1).split(_NORMALIZED_AT_A_TIME):  # once and in place: they are large
         some.copy_(head.inputs(some))
     encoded, spans = _encode_sentences(matching.vocabulary, tasks, sentences, device)
-    check = (
-        HeldOut(matching, features[0], target, tasks, encoded, spans, held_out) if held_out.any() else None
-    )
+    check = None
+    if held_out.any():
+        check = HeldOut(matching, features[0], is_grasped, tasks, encoded, spans, held_out)
     each_word = torch.arange(int(encoded.max()) + 1, device=device)
     frequency = (encoded[..., None] == each_word).any(dim=1).float().mean(dim=0)
     some = pairs.draw(settings.max_proposal_batch, generator)
-    _begin_at_features(head, features[0], target, some, settings.initial_separation)
+    _begin_at_features(head, features[0], is_grasped, some, settings.initial_separation)
     rate, decay = settings.learning_rate, settings.weight_decay
     scales = [head.log_scale, head.gate]
     groups: list[dict[str, Any]] = [
@@ -338,7 +341,7 @@ def fit_matching_head(
         with autocast:
             described = head.describe(crops, generator)
         matches, _ = head.match(described.among(slice(-1)), described.descriptors[:, -1])
-        loss = F.nll_loss(matches, target[scenes])
+        loss = object_loss(matches, is_grasped[scenes]).mean()
         draws = torch.rand(len(scenes), generator=generator)
         drawn = (spans[scenes.cpu(), 0] + draws * spans[scenes.cpu(), 1]).long()
         dropped = torch.rand(len(scenes), encoded.shape[1], generator=generator) < settings.p_drop_word
@@ -348,7 +351,7 @@ def fit_matching_head(
         if named.any():
             loss = loss + _word_losses(
                 *(matching, Crops(*(part[named] for part in proposals)), left[named], sentence[named]),
-                *(target[scenes][named], frequency),
+                *(is_grasped[scenes][named], target[scenes][named], frequency),
             )
         rows = torch.arange(len(scenes), device=device)
         with torch.no_grad():  # as similar as they are without dropout
@@ -370,17 +373,27 @@ def fit_matching_head(
         check.finish()
 
 
+def object_loss(log_probabilities: Tensor, is_object: Tensor) -> Tensor:
+    """Returns the negative log probability that one of the proposals of an object is chosen, (...).
+
+    Args:
+        log_probabilities: Log probabilities of proposals, (..., n).
+        is_object: Whether each is of the object, (..., n) bool.
+    """
+    return -log_probabilities.masked_fill(~is_object, -torch.inf).logsumexp(dim=-1)
+
+
 @torch.no_grad()
 def _begin_at_features(
-    head: MatchingHead, features: Tensor, target: Tensor, pairs: tuple[Tensor, Tensor], separation: float
+    head: MatchingHead, features: Tensor, is_grasped: Tensor, pairs: tuple[Tensor, Tensor], separation: float
 ) -> None:
     """Sets the scales and the gate to where the features' cosines separate objects from other proposals."""
     scenes, others = (rows.to(features.device) for rows in pairs)
     crops = head.describe(features[scenes, :-1].float())
     shown = head.describe(features[others, -1:].float())
     _, cosines = head.match(crops, shown.descriptors[:, 0])
-    right = cosines.gather(1, target[scenes, None])
-    wrong = cosines.scatter(1, target[scenes, None], -1.0).amax(dim=1)
+    right = cosines.masked_fill(~is_grasped[scenes], -1.0).amax(dim=1)
+    wrong = cosines.masked_fill(is_grasped[scenes], -1.0).amax(dim=1)
     high, low = right.median(), wrong.median()
     slope = (separation / (high - low).clamp_min(_MIN_DIFFERENCE)).clamp_min(1.0)
     head.log_scale.fill_(float(slope.log()))
@@ -392,6 +405,7 @@ def _word_losses(
     crops: Crops,
     words: Tensor,
     sentence: Tensor,
+    is_grasped: Tensor,
     target: Tensor,
     frequency: Tensor,
 ) -> Tensor:
@@ -402,13 +416,15 @@ def _word_losses(
         crops: The proposals.
         words: Indices of the words, of which some are left out, (batch, length).
         sentence: The same with all words.
-        target: The right proposal, (batch,).
+        is_grasped: Whether each proposal is of what was grasped, (batch, n) bool.
+        target: The proposal nearest to the grasp, (batch,).
         frequency: Fraction of the sentences in which each word occurs, (vocabulary and special words,).
     """
     settings, weights = matching.settings, matching.word_weights(words)
     named = crops.words[torch.arange(len(target)), target]  # (batch, vocabulary)
     logits = word_scores(crops.words, words, weights) + crops.objectness
-    loss = F.cross_entropy(logits.masked_fill(~crops.exists, -torch.inf), target)
+    by_words = logits.masked_fill(~crops.exists, -torch.inf).log_softmax(dim=1)
+    loss = object_loss(by_words, is_grasped).mean()
     known_weights = weights.detach() * (words > UNKNOWN_WORD)
     of_words = named.gather(1, (words - UNKNOWN_WORD - 1).clamp_min(0))
     naming = -(known_weights * of_words).sum(dim=1) / known_weights.sum(dim=1).clamp_min(1e-6)
@@ -444,7 +460,7 @@ class HeldOut:
         matching: What is fitted.
         features: Normalized features of the proposals of all scenes, and behind them of what demonstrations
             show, (scenes, n + 1, features).
-        target: The right proposals, (scenes,).
+        is_grasped: Whether each proposal is of what was grasped, (scenes, n) bool.
         tasks: Task of each scene.
         encoded: Words of all sentences.
         spans: First row and number of the sentences of each scene, (scenes, 2).
@@ -455,7 +471,7 @@ class HeldOut:
         self,
         matching: FeatureMatching,
         features: Tensor,
-        target: Tensor,
+        is_grasped: Tensor,
         tasks: Sequence[str],
         encoded: Tensor,
         spans: Tensor,
@@ -471,7 +487,7 @@ class HeldOut:
         self._scenes = torch.tensor([row for row, _, _ in pairs])
         shown = torch.tensor([own[(n * len(own)) // _LOOKS] for _, n, own in pairs])
         texts = torch.tensor([int(spans[row, 0]) + (n * int(spans[row, 1])) // _LOOKS for row, n, _ in pairs])
-        self._matching, self._target = matching, target[self._scenes]
+        self._matching, self._is_grasped = matching, is_grasped[self._scenes]
         self._inputs = features[self._scenes, :-1]
         self._shown = features[shown, -1:]
         self._words = encoded[texts]
@@ -490,7 +506,7 @@ class HeldOut:
 
     def look(self) -> None:
         """Keeps the weights if they are the best so far."""
-        loss = float(F.cross_entropy(self._scores().flatten(0, 1), self._target.repeat(3)))
+        loss = float(object_loss(self._scores().log_softmax(dim=2), self._is_grasped).mean())
         if loss < self._best:
             self._best = loss
             self._state = {name: value.clone() for name, value in self._matching.state_dict().items()}
@@ -502,8 +518,9 @@ class HeldOut:
         if self._state:
             matching.load_state_dict(self._state)
         scores = self._scores()
-        is_right = (scores.argmax(dim=2) == self._target).float().mean(dim=1)  # by each, and by both
-        n_seen, n_all = len(self._target) / _LOOKS, int(matching.held_out[1])  # a proposal is near; all
+        chosen = scores.argmax(dim=2, keepdim=True)
+        is_right = self._is_grasped.expand(3, -1, -1).gather(2, chosen).float().mean(dim=(1, 2))
+        n_seen, n_all = len(self._is_grasped) / _LOOKS, int(matching.held_out[1])  # a proposal is near; all
         matching.held_out[0] = round(float(is_right[2]) * n_seen)
         n_wrong = n_all - float(is_right[0] + is_right[2]) / 2 * n_seen
         error_rate = torch.tensor((n_wrong + 1) / (n_all + 2))  # by Laplace's rule of succession
@@ -511,7 +528,7 @@ class HeldOut:
         for sharpness in matching.settings.sharpnesses:
             p = (sharpness * scores).softmax(dim=2)
             p = torch.lerp(p, torch.full_like(p, 1 / p.shape[2]), error_rate.to(p))
-            losses[sharpness] = float(F.nll_loss(p.flatten(0, 1).log(), self._target.repeat(3)))
+            losses[sharpness] = float(object_loss(p.log(), self._is_grasped).mean())
         matching.sharpness.fill_(min(losses, key=lambda sharpness: losses[sharpness]))
         matching.error_rate.copy_(error_rate)
 

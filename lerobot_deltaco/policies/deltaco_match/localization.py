@@ -73,20 +73,25 @@ class Candidates(NamedTuple):
         log_probabilities: How likely each is what the task asks for, (batch, n). What they lack to 1 is the
             probability that it is none of them.
         heights: Height offset of a grasp of each, (batch, n).
+        radius: Distance from a candidate within which others are of the same object.
         map_std: Standard deviation of a candidate in a map, in cells.
     """
 
     locations: Tensor
     log_probabilities: Tensor
     heights: Tensor
+    radius: float
     map_std: float = MatchingSettings.map_std
 
     @property
     def best(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Location (batch, 2), probability (batch,) and height offset (batch,) of the likeliest."""
-        log_p, best = self.log_probabilities.max(dim=1)
+        """Location (batch, 2) and height offset (batch,) of the likeliest, and its object's probability."""
+        best = self.log_probabilities.argmax(dim=1)
         rows = torch.arange(len(best), device=best.device)
-        return self.locations[rows, best], log_p.exp(), self.heights[rows, best]
+        chosen = self.locations[rows, best]
+        of_object = (self.locations - chosen[:, None]).norm(dim=2) < self.radius
+        probability = (self.log_probabilities.exp() * of_object).sum(dim=1)
+        return chosen, probability, self.heights[rows, best]
 
     def map(self, shape: Sequence[int]) -> Tensor:
         """Returns the candidates as maps of a shape (h, w), as logits (batch, h, w)."""
@@ -204,7 +209,9 @@ class FeatureMatching(nn.Module):
             log_p = (self.sharpness * scores).masked_fill(~crops.exists, -torch.inf).log_softmax(dim=1)
             # The object may be none of these, however few they are.
             p = torch.lerp(log_p.exp(), crops.exists / crops.exists.shape[1], self.error_rate)
-            return Candidates(locations.nan_to_num(), p.log(), heights, self.settings.map_std)
+            return Candidates(
+                locations.nan_to_num(), p.log(), heights, self.grasp_radius, self.settings.map_std
+            )
 
     def scores(self, crops: Crops, words: Tensor, described: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scores the crops of proposals by demonstrations and words.

@@ -95,7 +95,7 @@ class PickPlace(NamedTuple):
             without demonstrations.
         by_demonstration: Whether the demonstration decided on the pick and on the place location. Otherwise,
             the attention is meaningless.
-        confidence: Probability of the pick location among the proposals, (batch,).
+        confidence: Probability of the object at the pick location among what is proposed, (batch,).
         proposal: The proposal that was chosen, (batch, 2) in -1..1.
         demonstrated: Center of what the (first) demonstration grasped, in its first image, (batch, 2); None
             without demonstrations.
@@ -448,7 +448,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             attention, last = attentions[::n_each], ends[::n_each, 1]
         candidates = self.matching.find(scenes, batch[camera], instructions, descriptors, heights, templates)
         if prompts:
-            candidates = choose_prompted(candidates, prompts, self.matching.grasp_radius)
+            candidates = choose_prompted(candidates, prompts)
         proposal, confidence, height = candidates.best
         novelty = self.matching.novelty(instructions)
         pick = self.matching.grasps(batch[camera], proposal, templates, novelty)
@@ -673,6 +673,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert self.training_data is not None
         assert self.training_locations is not None
         bank, located = self.training_data.demonstrations, self.training_locations
+        sentences = self._sentences(bank.tasks)
+        self._forget_words(chain.from_iterable(sentences.values()))
         held_out = fit_feature_matching(
             self.matching,
             bank.frames[:, 0],
@@ -681,12 +683,18 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             torch.where(located.has_grasp[:, None], located.locations[:, 0], torch.nan),
             located.heights,
             bank.tasks,
-            self._sentences(bank.tasks),
+            sentences,
             self.config.seed,
             in_bfloat16=self.config.precision == "bfloat16",
         )
         self.config.held_out_episodes = bank.episodes[held_out].tolist()
         self.config.n_dataset_frames = None if self._meta is None else self._meta.total_frames
+
+    def _forget_words(self, sentences: Iterable[str]) -> None:
+        """Empties the rows of words that no sentence has: those of tasks that are not trained on are unknown."""
+        known = set(vocabulary_of(sentences))
+        words = [word if word in known else "" for word in self.config.known_words]
+        self.config.known_words[:] = self.matching.vocabulary[:] = words
 
     def _recorded_locations(self, episodes: Sequence[int], rows: Sequence[int]) -> TrainingLocations:
         """Returns the locations of episodes, (batch, ...); reads those that are held out."""

@@ -113,16 +113,15 @@ def cut_box(image: Tensor, box: Sequence[float], size: tuple[int, int]) -> Tenso
     return F.interpolate(padded[..., rows, columns], size, mode="bilinear", antialias=True)[0]
 
 
-def choose_prompted(candidates: Candidates, prompts: Sequence[ObjectPrompt], radius: float) -> Candidates:
+def choose_prompted(candidates: Candidates, prompts: Sequence[ObjectPrompt]) -> Candidates:
     """Chooses what was pointed at in the scenes themselves: no other candidate is likely any more.
 
     Args:
         candidates: The candidates.
         prompts: A prompt for each sample; those with a picture of their own change nothing.
-        radius: Distance from a point within which a proposal stands for the object there.
     """
     points = candidates.locations.new_tensor([prompt.location for prompt in prompts])
-    nearest, is_near = nearest_proposals(candidates.locations, points, radius)
+    nearest, is_near = nearest_proposals(candidates.locations, points, candidates.radius)
     locations, heights = candidates.locations.clone(), candidates.heights.clone()
     log_probabilities = candidates.log_probabilities.clone()
     for n, prompt in enumerate(prompts):
@@ -132,4 +131,4 @@ def choose_prompted(candidates: Candidates, prompts: Sequence[ObjectPrompt], rad
             locations[n, nearest[n]], heights[n, nearest[n]] = points[n], 0
         log_probabilities[n] = -torch.inf
         log_probabilities[n, nearest[n]] = 0
-    return Candidates(locations, log_probabilities, heights, candidates.map_std)
+    return candidates._replace(locations=locations, log_probabilities=log_probabilities, heights=heights)

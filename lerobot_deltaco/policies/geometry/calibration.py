@@ -39,7 +39,7 @@ _DOUBTFUL = 0.35
 class ImageProjection(nn.Module):
     """Projects robot states to locations in the image.
 
-    If it is known which dimensions are the hand's position, as a camera sees that; otherwise, by a map that is
+    If it is known which dimensions are the hand's position, a camera sees that; otherwise, the map is
     quadratic in the state.
 
     Args:
