@@ -260,7 +260,7 @@ def small(images: Tensor) -> Tensor:
     return scaled.round().to(torch.uint8)
 
 
-def fit(data: Data, seed: int, crop_size: float = 0.17, **options: Any) -> Any:
+def fit(data: Data, seed: int) -> Any:
     """Fits feature matching to the training episodes of a case."""
     from lerobot_deltaco.policies.base.configuration import has_bfloat16
     from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
@@ -274,7 +274,7 @@ def fit(data: Data, seed: int, crop_size: float = 0.17, **options: Any) -> Any:
     picks = picks + LOCATION_NOISE * torch.randn(picks.shape, generator=generator)
     sentences = {e.task: e.sentences for e in train}
     vocabulary = vocabulary_of(text for texts in sentences.values() for text in texts)
-    matching = FeatureMatching(vocabulary, crop_size, **options)
+    matching = FeatureMatching(vocabulary)
     tasks = [e.task for e in train]
     fit_feature_matching(
         matching,
@@ -310,7 +310,7 @@ def measure(matching: Any, pairs: Sequence[tuple[StillEpisode, StillEpisode]]) -
         ("words", texts, (None, None, None)),
         ("both", texts, (described.descriptors, heights, templates)),
     ):
-        candidates = matching.find(small(scenes).float() / 255, scenes.float() / 255, words, *by)
+        candidates = matching.find(scenes.float() / 255, words, *by)
         location, p, _ = candidates.best
         right, near = [], []
         for n, (scene, _) in enumerate(pairs):

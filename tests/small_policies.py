@@ -86,7 +86,7 @@ _fits = {}
 def fit_once(matching, *data, **options):
     """Fits feature matching, or takes the result of an earlier fit to the same data."""
     digest = hashlib.sha256()
-    arguments = [matching.vocabulary, matching.crop_size, matching.settings, options]
+    arguments = [matching.vocabulary, matching.settings, options]
     for part in data:
         if isinstance(part, torch.Tensor):
             digest.update(part.cpu().contiguous().numpy())
@@ -113,9 +113,8 @@ class ColorEncoder:
 def use_short_fit(monkeypatch, steps=2, **settings):
     """Fits feature matching in a few steps, to colors instead of a pretrained encoder's features."""
     short = {
-        "proposal_steps": 2 * steps,
         "refinement_steps": steps,
-        "grasp_radius": 9.0,  # any proposal will do
+        "grasp_error": 9.0,  # any proposal will do
         "min_matching_steps": steps,
         "max_matching_steps": steps,
         **settings,

@@ -35,10 +35,9 @@ def test_the_warning_says_how_far_in_the_pictures_own_pixels(caplog):
     generator = torch.Generator().manual_seed(0)
     table = torch.nn.functional.interpolate(torch.rand(1, 3, 24, 24, generator=generator), (240, 240))[0]
     scenes = (255 * table.expand(12, -1, -1, -1)).to(torch.uint8)
-    matching = FeatureMatching([], 0.17)
+    matching = FeatureMatching([])
     assert matching.camera_motion(table) is None  # nothing is known of the training
     matching.background.fit(scenes, torch.zeros(12, 2))
-    matching.uses_background.fill_(True)
     assert not matching.camera_motion(table).is_significant
     assert not caplog.text
     assert matching.camera_motion(table.roll((-12, 0, 24), (1, 0, 2))).is_significant

@@ -66,7 +66,7 @@ def found_in(policy, scenes, instructions, demonstrations):
 def trained(table):
     """A policy that has learned, on 36 of the 48 episodes, to find the locations."""
     with pytest.MonkeyPatch.context() as patch:
-        use_short_fit(patch, 40, min_proposal_batch=16, max_proposal_batch=16, matching_batch=32)
+        use_short_fit(patch, 40, matching_batch=32)
         patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._PLACE_FRACTION", 1.0)
         patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._SHIFT_PADDING", 1)
         policy, before, _ = small_policy(table, "deltaco_match")

@@ -91,14 +91,14 @@ def test_a_photo_has_the_descriptor_of_the_object_in_it(table, trained):
     seen = []
 
     def find(*arguments):
-        seen.append(arguments[3])
+        seen.append(arguments[2])
         return type(matching).find(matching, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(matching, "find", find)
         # Both the point and the box of the red object, in another picture, and that picture's own point
-        x, y = ((MOVES[0][1] + 1) / 2).tolist()
-        box = (x - 2.5 / TABLE_SIZE, y - 2.5 / TABLE_SIZE, x + 2.5 / TABLE_SIZE, y + 2.5 / TABLE_SIZE)
+        middle = ((MOVES[0][1] + 1) / 2 * TABLE_SIZE).round()  # px, of a square of 4 x 4
+        box = tuple(np.concatenate([middle - 2.5, middle + 2.5]) / TABLE_SIZE)
         for prompt in (point_at(MOVES[0][1], photo), ObjectPrompt(box, photo), point_at(MOVES[0][2], photo)):
             policy.reset()
             policy.set_tasks([TABLE_TASKS[0]], [[prompt]])

@@ -72,11 +72,11 @@ def test_bfloat16_needs_instructions_of_the_processor(monkeypatch, caplog):
 
 def test_command_line_of_lerobot_logs_what_is_wrong(monkeypatch, caplog):
     """LeRobot's parser says no more than which class it cannot make."""
-    options = ["--dataset.repo_id=user/data", "--policy.type=deltaco_match", "--policy.crop_size=2"]
+    options = ["--dataset.repo_id=user/data", "--policy.type=deltaco_match", "--policy.location_noise=2"]
     monkeypatch.setattr("sys.argv", ["lerobot-train", *options])
     with pytest.raises((SystemExit, draccus.utils.ParsingError)):
         lerobot_train.train()
-    assert "`crop_size` must be from 0.01" in caplog.text
+    assert "`location_noise` must be from 0" in caplog.text
 
 
 def features_config(action=(3,), **options):

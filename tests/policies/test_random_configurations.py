@@ -34,7 +34,6 @@ OPTIONS = {
     },
     "deltaco_match": {
         "gripper": ["auto", "2", "7", "left"],
-        "crop_size": [0.17, 0.3, 0.0],
         "grasp_height_bias": [0.0, 0.75, 99],
         "location_noise": [0.0, 0.01, -1],
         "state_noise": [0.0, 0.5, -1],

@@ -3,7 +3,7 @@
 # No `from __future__ import annotations`: LeRobot's parser reads the annotations.
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -27,9 +27,6 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             policy picks and places; without a demonstrated one, that of the training episode whose grasp and
             release were nearest. "network": the policy network acts. Training is the same: a checkpoint acts
             either way. With None, training chooses "replay" for up to 200 episodes.
-        crop_size: Side of the square around an object that is compared, in the middle of the first camera's
-            image and as a fraction of its side. Used only where objects do not stand out from other scenes,
-            such as after a camera was moved during recording; otherwise, the size of objects is measured.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation.
         demo_point: Point [x, y] or box [left, top, right, bottom] on the object to pick, px, in place of a
             demonstration: in the first image of the episode by the camera of demonstrations, or in
@@ -52,11 +49,8 @@ class DeltacoMatchConfig(TaskConditionedConfig):
             all.
     """
 
-    trained_options: ClassVar[tuple[str, ...]] = (*TaskConditionedConfig.trained_options, "crop_size")
-
     chunk_size: int | None = None
     acting: str | None = None
-    crop_size: float = 0.17
     n_demonstrations: int = 1
     demo_point: list[float] | None = None
     demo_photo: str | None = None
@@ -72,9 +66,9 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.2
     scheduler_warmup_steps: int = 200
-    # Filled in by training: the vocabulary of feature matching (with "" for words of tasks that are not trained
-    # on), the episodes that were held out of its fit, the number of frames of their dataset, and the range of
-    # the gripper's commands.
+    # Filled in by training: the vocabulary of feature matching (with "" for words of tasks that are not
+    # trained on), the episodes that were held out of its fit, the number of frames of their dataset, and the
+    # range of the gripper's commands.
     known_words: list[str] = field(default_factory=list)
     held_out_episodes: list[int] = field(default_factory=list)
     n_dataset_frames: int | None = None
@@ -89,7 +83,6 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         super().check()
         self.check_choices(acting=(None, "network", "replay"))
         self.check_ranges(
-            crop_size=(0.01, 1),
             n_demonstrations=(1, 1000),
             grasp_height_bias=(-10, 10),
             location_noise=(0, 1),
@@ -164,8 +157,8 @@ class MatchingSettings:
         shown_word_weight: Pages mark words above this weight as describing the object.
         map_std: Standard deviation of a candidate in a map, in cells.
         crop_factor: Side of a crop in diameters of a typical object.
-        min_coverage: Fraction of the grasps of training episodes that stand out from the background from
-            which on proposals are what stands out; below, a network is fitted to the grasps as well.
+        min_coverage: Fraction of the grasps of training episodes at something that stands out from the
+            background, below which a warning says so.
         feature_weight: Weight of the cosine of the encoder's features beside that of learned descriptors.
         max_variants: Number of variants of each scene, of which some have other colors, at most.
         variant_scenes: Scenes and variants together are about this many, at most.
@@ -176,13 +169,8 @@ class MatchingSettings:
         min_held_out: Smallest number of episodes that are held out.
         n_checks: How often the held-out episodes are looked at.
         max_episodes: Number of episodes that are drawn for the fit, at most.
-        proposal_steps: Steps of the fit of the proposal network.
-        proposal_draws: How often each scene is drawn in them, as far as the bounds of the batch allow.
-        min_proposal_batch: Smallest number of scenes in a step.
-        max_proposal_batch: Largest number of scenes in a step.
-        grasp_radius: Distance from a grasp within which a network's proposal stands for the grasped object,
-            where an image's edges are at -1 and 1; 4.5 px of 48.
-        grasp_error: The same where objects stand out from the background, in addition to `grasp_size`.
+        grasp_error: Distance from a grasp within which a proposal stands for the grasped object, where an
+            image's edges are at -1 and 1, in addition to `grasp_size`.
         grasp_size: Part of that distance that grows with the objects, in their diameters.
         template_weight: Weight of the correlation of a proposal with the demonstrated grasp, where an unknown
             word describes the object: the object is new, and the learned descriptors tell less of it.
@@ -213,7 +201,7 @@ class MatchingSettings:
     shown_word_weight: float = 0.5
     map_std: float = 0.8
     crop_factor: float = 1.0
-    min_coverage: float = 0.9
+    min_coverage: float = 0.75
     feature_weight: float = 0.8
     max_variants: int = 5
     variant_scenes: int = 1000
@@ -223,11 +211,6 @@ class MatchingSettings:
     min_held_out: int = 4
     n_checks: int = 10
     max_episodes: int = 10_000
-    proposal_steps: int = 800
-    proposal_draws: int = 10
-    min_proposal_batch: int = 24
-    max_proposal_batch: int = 48
-    grasp_radius: float = 0.19
     grasp_error: float = 0.06
     grasp_size: float = 0.75
     template_weight: float = 20.0

@@ -140,11 +140,9 @@ def compared_crops(
     """
     matching, localization = policy.matching, policy.localization
     assert localization is not None
-    camera, scene = policy.config.cameras[0], image[None]
-    crops = []
+    scene, crops = image[None], []
     if isinstance(shown, ObjectPrompt):
-        small = policy._camera_image({camera: scene}, camera)
-        crops.append(draw_crop(*prompted_crop(matching, shown, image, small.shape[-2:])))
+        crops.append(draw_crop(*prompted_crop(matching, shown, image)))
         if shown.image is None:  # which shows what is chosen
             return crops
     elif shown is not None:

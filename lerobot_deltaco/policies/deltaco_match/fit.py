@@ -21,7 +21,6 @@ from lerobot_deltaco.policies.deltaco_match.proposals import (
     MAX_REMEMBERED,
     changed_areas,
     demonstrated_centers,
-    fit_perspective,
     nearest_proposals,
 )
 from lerobot_deltaco.policies.deltaco_match.words import UNKNOWN_WORD, encode_words
@@ -46,7 +45,7 @@ def fit_feature_matching(
     *,
     in_bfloat16: bool = False,
 ) -> Tensor:
-    """Fits the proposals, and then the matching head.
+    """Measures the background and objects, and fits the matching head.
 
     The head learns to tell the object grasped in one episode of a task from the other proposals in the scene
     of another episode, by the demonstration and by words.
@@ -87,12 +86,7 @@ def fit_feature_matching(
             if isinstance(layer, (nn.Conv2d, nn.Linear, nn.BatchNorm2d)):
                 layer.reset_parameters()
         matching.requires_grad_(True)
-        proposed, shown = _fit_proposals(
-            matching, images, last, full_resolution, locations, drawn, generator, autocast
-        )
-        if not bool(matching.uses_background):
-            rows = grasps.to(device)
-            matching.perspective.copy_(fit_perspective(images[rows], last[rows], locations[rows]))
+        proposed, shown = _propose(matching, images, last, full_resolution, locations, drawn, generator)
         matching.compare.feature_weight.fill_(settings.feature_weight)
         features, distances, kept = _crops_of_proposals(
             *(matching, full_resolution, locations, drawn, proposed, shown, generator, autocast)
@@ -115,19 +109,18 @@ def fit_feature_matching(
             autocast,
             held_out=held_out[is_kept],
         )
-        if bool(matching.uses_background):
-            rows = kept.to(device)
-            nearest = proposed[is_kept.to(device)][torch.arange(len(kept)), distances.argmin(dim=1)]
-            matching.refine.fit(
-                full_resolution[kept.to(full_resolution.device)],
-                locations[rows],
-                nearest,
-                matching.object_sizes(nearest),
-                held_out[is_kept],
-                settings.refinement_steps,
-                generator,
-                autocast,
-            )
+        rows = kept.to(device)
+        nearest = proposed[is_kept.to(device)][torch.arange(len(kept)), distances.argmin(dim=1)]
+        matching.refine.fit(
+            full_resolution[kept.to(full_resolution.device)],
+            locations[rows],
+            nearest,
+            matching.object_sizes(nearest),
+            held_out[is_kept],
+            settings.refinement_steps,
+            generator,
+            autocast,
+        )
     matching.requires_grad_(False)
     for weights in matching.parameters():
         weights.grad = None
@@ -138,7 +131,8 @@ def fit_feature_matching(
     return drawn[held_out]
 
 
-def _fit_proposals(
+@torch.no_grad()
+def _propose(
     matching: FeatureMatching,
     images: Tensor,
     last: Tensor,
@@ -146,47 +140,39 @@ def _fit_proposals(
     locations: Tensor,
     drawn: Tensor,
     generator: torch.Generator,
-    autocast: torch.autocast,
 ) -> tuple[Tensor, Tensor]:
-    """Fits the proposals. Returns those in the drawn scenes, (drawn, n, 2), and what was grasped, (drawn, 2).
+    """Fits the background.
 
-    Where objects do not stand out from the background, as if the camera was moved, a network learns where
-    grippers closed, and is used if it finds more of the grasps.
+    Returns:
+        Proposals in the drawn scenes, (drawn, n, 2), and the centers of what was grasped, (drawn, 2).
     """
-    settings, background, rows = matching.settings, matching.background, drawn.to(images.device)
+    background, grasps = matching.background, locations[drawn.to(locations.device)]
     chosen = torch.randperm(len(drawn), generator=generator)[:MAX_REMEMBERED].sort().values
     remembered = torch.full((len(drawn),), -1)
     remembered[chosen] = torch.arange(len(chosen))
+    some = drawn[chosen]
+    background.fit(full_resolution[some.to(full_resolution.device)], locations[some.to(locations.device)])
     parts = []
-    with torch.no_grad():
-        some = drawn[chosen]
-        background.fit(full_resolution[some.to(full_resolution.device)], locations[some.to(locations.device)])
-        batches = list(zip(drawn.split(_SCENES_AT_A_TIME), remembered.split(_SCENES_AT_A_TIME), strict=True))
-        for some, own in tqdm(batches, desc="Looking for objects", unit="batch", leave=False):
-            scenes, here = full_resolution[some.to(full_resolution.device)], some.to(images.device)
-            masks = background.masks(scenes, own)
-            changed = changed_areas(torch.stack([images[here], last[here]], dim=1).float() / 255)
-            parts.append([background.objects(each, scenes) for each in (masks, masks * changed.to(masks))])
+    batches = list(zip(drawn.split(_SCENES_AT_A_TIME), remembered.split(_SCENES_AT_A_TIME), strict=True))
+    for some, own in tqdm(batches, desc="Looking for objects", unit="batch", leave=False):
+        scenes, here = full_resolution[some.to(full_resolution.device)], some.to(images.device)
+        masks = background.masks(scenes, own)
+        changed = changed_areas(torch.stack([images[here], last[here]], dim=1).float() / 255)
+        parts.append([background.objects(each, scenes) for each in (masks, masks * changed.to(masks))])
     proposed, changed = (torch.cat(each).to(images.device) for each in zip(*parts, strict=True))
-    matching.uses_background.fill_(True)
-    matching.perspective.copy_(matching.background.perspective)
-    grasps, radius = locations[rows], matching.grasp_radius
-    nearest, stands_out = nearest_proposals(proposed, grasps, radius)
-    errors = (proposed[torch.arange(len(rows)), nearest] - grasps).norm(dim=1)
+    nearest, stands_out = nearest_proposals(proposed, grasps, matching.grasp_radius)
+    coverage = float(stands_out.float().mean())
+    if coverage < matching.settings.min_coverage:
+        logger.warning(
+            "Only %.0f %% of the grasped objects stand out from what the camera sees in other episodes; the "
+            "others are not trained on. Feature matching needs a camera that stands still, and objects that "
+            "do not lie in the same place in most episodes. Look at the circles of `deltaco look`.",
+            100 * coverage,
+        )
+    errors = (proposed[torch.arange(len(drawn)), nearest] - grasps).norm(dim=1)
     usual_error = float(errors[stands_out].median()) if stands_out.any() else 0.0
-    shown, _ = demonstrated_centers(proposed, changed, grasps, grasps, radius, usual_error)
-    if bool(stands_out.float().mean() >= settings.min_coverage):
-        return proposed, shown
-    held_out = torch.arange(len(rows), device=rows.device) % settings.held_out_every == 0
-    fitted = rows[~held_out]
-    matching.propose.fit(images[fitted], locations[fitted], generator, autocast, settings)
-    with torch.no_grad():
-        learned = torch.cat([matching.propose(images[some].float() / 255) for some in rows.split(256)])
-    _, is_found = nearest_proposals(learned, grasps, settings.grasp_radius)
-    if bool(is_found[held_out].float().mean() <= stands_out[held_out].float().mean()):
-        return proposed, shown
-    matching.uses_background.fill_(False)
-    return learned, demonstrated_centers(learned, learned, grasps, grasps, settings.grasp_radius, 0.0)[0]
+    shown, _ = demonstrated_centers(proposed, changed, grasps, grasps, matching.grasp_radius, usual_error)
+    return proposed, shown
 
 
 def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:
@@ -255,7 +241,7 @@ def _crops_of_proposals(
             progress.update(len(some))
     if not kept:
         raise UserError(
-            "Feature matching finds nothing to grasp in the first images where the gripper closes. Check "
+            "Nothing stands out from the background in the first images where the gripper closes. Check "
             "that the first camera stands still and shows the objects, or name another with "
             "--policy.demo_camera."
         )
@@ -310,7 +296,7 @@ def fit_matching_head(
         check = HeldOut(matching, features[0], is_grasped, tasks, encoded, spans, held_out)
     each_word = torch.arange(int(encoded.max()) + 1, device=device)
     frequency = (encoded[..., None] == each_word).any(dim=1).float().mean(dim=0)
-    some = pairs.draw(settings.max_proposal_batch, generator)
+    some = pairs.draw(settings.matching_batch, generator)
     _begin_at_features(head, features[0], is_grasped, some, settings.initial_separation)
     rate, decay = settings.learning_rate, settings.weight_decay
     scales = [head.log_scale, head.gate]

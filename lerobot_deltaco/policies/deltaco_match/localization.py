@@ -41,7 +41,6 @@ from lerobot_deltaco.policies.deltaco_match.matching import (
 )
 from lerobot_deltaco.policies.deltaco_match.proposals import (
     Background,
-    ProposalNetwork,
     changed_areas,
     demonstrated_centers,
 )
@@ -122,45 +121,34 @@ class FeatureMatching(nn.Module):
 
     Args:
         vocabulary: Known words.
-        crop_size: Side of a crop in the middle of an image, as a fraction of the image's.
         settings: Constants of the method; by default, those of `MatchingSettings`.
 
     Attributes:
         encoder: Describes crops of images.
-        perspective: How the log of the apparent size of objects changes along x and y in the image, (2,).
         fitted: Whether it has been fitted, () bool.
-        uses_background: Whether proposals are what stands out from the background, and crops as large as
-            objects there; otherwise, proposals are a network's, and crops of `crop_size`, () bool.
         sharpness: Factor of the scores, (), and
         error_rate: the rate of errors that no score excludes, (), by held-out episodes.
         held_out: Number of held-out episodes in which the object was found, and of all, (2,) int64.
         n_episodes: Number of training episodes, () int64.
     """
 
-    perspective: Tensor
     fitted: Tensor
-    uses_background: Tensor
     sharpness: Tensor
     error_rate: Tensor
     held_out: Tensor
     n_episodes: Tensor
 
-    def __init__(
-        self, vocabulary: Sequence[str], crop_size: float, settings: MatchingSettings | None = None
-    ) -> None:
+    def __init__(self, vocabulary: Sequence[str], settings: MatchingSettings | None = None) -> None:
         super().__init__()
-        self.vocabulary, self.crop_size = list(vocabulary), crop_size
+        self.vocabulary = list(vocabulary)
         self.settings = settings or MatchingSettings()
-        self.propose = ProposalNetwork()
         self.background = Background()
         self.refine = GraspRefiner()
         self.encoder = CropEncoder()
         self.compare = MatchingHead(len(vocabulary), self.encoder.feature_dim, self.encoder.color_dim)
         self.word_weights = WordWeights(len(vocabulary))
         self.grasp_height = GraspHeightEstimator(HIDDEN_DIM)
-        self.register_buffer("perspective", torch.zeros(2))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("uses_background", torch.zeros((), dtype=torch.bool))
         self.register_buffer("sharpness", torch.ones(()))
         self.register_buffer("error_rate", torch.zeros(()))
         self.register_buffer("held_out", torch.zeros(2, dtype=torch.int64))
@@ -176,7 +164,6 @@ class FeatureMatching(nn.Module):
     def find(
         self,
         scenes: Tensor,
-        full_resolution: Tensor,
         instructions: Sequence[str],
         described: Tensor | None,
         demonstrated: Tensor | None,
@@ -185,8 +172,7 @@ class FeatureMatching(nn.Module):
         """Finds what tasks ask for.
 
         Args:
-            scenes: First images of episodes, (batch, 3, H, W) in 0..1, as small as the policy's.
-            full_resolution: The same at full resolution, (batch, 3, H', W').
+            scenes: First images of episodes at full resolution, (batch, 3, H, W) in 0..1.
             instructions: Instruction of each sample, "" for none.
             described: Descriptors of the demonstrated objects, (batch, descriptor); None without
                 demonstrations.
@@ -196,12 +182,12 @@ class FeatureMatching(nn.Module):
                 `Described`.
         """
         with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
-            locations = self.proposals(scenes, full_resolution)
-            crops = self.compare(self.features(full_resolution, locations))
+            locations = self.background(scenes)
+            crops = self.compare(self.features(scenes, locations))
             words = encode_words(instructions, self.vocabulary).to(scenes.device)
             scores, similarity = self.scores(crops, words, described)
             if templates is not None and bool((self._p_unknown(words) > _MIN_NOVELTY).any()):
-                alike = self._correlations(full_resolution, locations, templates)
+                alike = self._correlations(scenes, locations, templates)
                 scores = scores + self.settings.template_weight * self._p_unknown(words)[:, None] * alike
             if demonstrated is None:
                 demonstrated = torch.full_like(scores[:, 0], torch.nan)
@@ -244,10 +230,10 @@ class FeatureMatching(nn.Module):
         """Returns how likely an unknown word describes the object, (batch,)."""
         return (self.word_weights(words) * (words == UNKNOWN_WORD)).amax(dim=1)
 
-    def _correlations(self, full_resolution: Tensor, locations: Tensor, templates: Tensor) -> Tensor:
+    def _correlations(self, scenes: Tensor, locations: Tensor, templates: Tensor) -> Tensor:
         """Returns how well the surroundings of proposals agree with templates, (batch, n); 0 for none."""
         n_each, flat = locations.shape[1], locations.nan_to_num().flatten(0, 1)
-        images, repeated = (part.repeat_interleave(n_each, 0) for part in (full_resolution, templates))
+        images, repeated = (part.repeat_interleave(n_each, 0) for part in (scenes, templates))
         reach = self.settings.template_reach
         found = correlations(images, flat, self.object_sizes(flat), repeated, reach)
         return found.flatten(1).amax(dim=1).view(-1, n_each)
@@ -259,9 +245,9 @@ class FeatureMatching(nn.Module):
             scene: First image of an episode, (3, H, W) in 0..1, at full resolution.
 
         Returns:
-            The motion; None if the camera did not stand still in the training, or it is not known.
+            The motion; None if it is not known.
         """
-        motion = self.background.camera_motion(scene) if bool(self.uses_background) else None
+        motion = self.background.camera_motion(scene)
         if motion is not None and motion.is_significant:
             height, width = scene.shape[-2:]
             logger.warning(
@@ -270,10 +256,6 @@ class FeatureMatching(nn.Module):
                 motion.describe(width, height),
             )
         return motion
-
-    def proposals(self, scenes: Tensor, full_resolution: Tensor) -> Tensor:
-        """Returns where something could be grasped in scenes, (batch, n, 2) in -1..1. See `find`."""
-        return self.background(full_resolution) if bool(self.uses_background) else self.propose(scenes)
 
     def grasps(
         self,
@@ -323,8 +305,6 @@ class FeatureMatching(nn.Module):
     @property
     def grasp_radius(self) -> float:
         """Distance from a grasp within which a proposal stands for the grasped object, in -1..1."""
-        if not bool(self.uses_background):
-            return self.settings.grasp_radius
         return self.settings.grasp_error + self.settings.grasp_size * float(self.background.object_size)
 
     @torch.no_grad()
@@ -355,12 +335,9 @@ class FeatureMatching(nn.Module):
         Returns:
             The centers of the objects, (batch, 2) in -1..1, and whether the grasp was there, (batch,) bool.
         """
-        if not bool(self.uses_background):
-            proposed = changed = self.propose(ends[:, 0])
-        else:
-            masks = self.background.masks(full_resolution)
-            proposed = self.background.objects(masks, full_resolution)
-            changed = self.background.objects(masks * changed_areas(ends), full_resolution)
+        masks = self.background.masks(full_resolution)
+        proposed = self.background.objects(masks, full_resolution)
+        changed = self.background.objects(masks * changed_areas(ends), full_resolution)
         usual_error = float(self.refine.errors[0])
         return demonstrated_centers(proposed, changed, grasps, attended, self.grasp_radius, usual_error)
 
@@ -388,16 +365,12 @@ class FeatureMatching(nn.Module):
 
     def crop_sizes(self, locations: Tensor) -> Tensor:
         """Returns the sides of crops at locations (..., 2), as fractions of the image's, (...)."""
-        side = self.settings.crop_factor * self.background.object_size
-        return (side if bool(self.uses_background) else self.crop_size) * self._perspective_factor(locations)
+        return self.settings.crop_factor * self.object_sizes(locations)
 
     def object_sizes(self, locations: Tensor) -> Tensor:
         """Returns the diameters of objects at locations (..., 2), as fractions of the image's side."""
-        return self.background.object_size * self._perspective_factor(locations)
-
-    def _perspective_factor(self, locations: Tensor) -> Tensor:
         # Not as a product of matrices, which autocast would round.
-        return (locations * self.perspective).sum(dim=-1).exp()
+        return self.background.object_size * (locations * self.background.perspective).sum(dim=-1).exp()
 
 
 class GraspHeightEstimator(nn.Module):
@@ -442,7 +415,10 @@ class GraspHeightEstimator(nn.Module):
         """
         by_appearance = self.by_appearance(features)[..., 0]
         variance = torch.exp(2 * self._log_std(similarity))
-        weight = _APPEARANCE_STD**2 / (_APPEARANCE_STD**2 + variance)
+        # Where they contradict each other, the object looks like none of the training, whose heights misled.
+        surprise = (demonstrated - by_appearance).square() / (_APPEARANCE_STD**2 + variance)
+        of_appearance = _APPEARANCE_STD**2 * surprise.clamp_min(1)
+        weight = of_appearance / (of_appearance + variance)
         weight = torch.where(demonstrated.isnan(), 0.0, weight)
         return weight * demonstrated.nan_to_num() + (1 - weight) * by_appearance
 

@@ -186,7 +186,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         )
         self.state_regressor = StateRegressor(config.state_dim)
         self.replay = TrajectoryReplay(config.state_dim, config.action_feature.shape[0])
-        self.matching = FeatureMatching(config.known_words, config.crop_size)
+        self.matching = FeatureMatching(config.known_words)
         self.attention = DemonstrationAttention()
         self.place = PlaceNetwork(INSTRUCTION_DIM)
         self.instruction_encoder = InstructionEncoder(len(config.known_words))
@@ -427,7 +427,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         given = None if prompts else self._batch_demonstrations(demonstrations, scenes.device)
         attention = last = centers = descriptors = heights = templates = None
         if prompts:
-            descriptors = describe_prompts(self.matching, prompts, scenes, batch[camera])
+            descriptors = describe_prompts(self.matching, prompts, batch[camera])
         elif given is None:
             if not bool(by_instruction.all()):
                 raise UserError("Neither a demonstration nor an instruction is given. Pass one of them.")
@@ -446,7 +446,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             centers = described.centers[::n_each]
             heights = self.state_regressor.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
             attention, last = attentions[::n_each], ends[::n_each, 1]
-        candidates = self.matching.find(scenes, batch[camera], instructions, descriptors, heights, templates)
+        candidates = self.matching.find(batch[camera], instructions, descriptors, heights, templates)
         if prompts:
             candidates = choose_prompted(candidates, prompts)
         proposal, confidence, height = candidates.best
@@ -691,7 +691,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         self.config.n_dataset_frames = None if self._meta is None else self._meta.total_frames
 
     def _forget_words(self, sentences: Iterable[str]) -> None:
-        """Empties the rows of words that no sentence has: those of tasks that are not trained on are unknown."""
+        """Forgets words that no sentence has: those of tasks that are not trained on are unknown."""
         known = set(vocabulary_of(sentences))
         words = [word if word in known else "" for word in self.config.known_words]
         self.config.known_words[:] = self.matching.vocabulary[:] = words

@@ -39,27 +39,23 @@ def prompts_of(
 
 
 @torch.no_grad()
-def describe_prompts(
-    matching: FeatureMatching, prompts: Sequence[ObjectPrompt], scenes: Tensor, full_resolution: Tensor
-) -> Tensor:
+def describe_prompts(matching: FeatureMatching, prompts: Sequence[ObjectPrompt], scenes: Tensor) -> Tensor:
     """Returns descriptors of prompted objects, (batch, descriptor).
 
     Args:
         matching: Feature matching, fitted.
         prompts: A prompt for each sample.
-        scenes: First images of the episodes, (batch, 3, H, W) in 0..1, as small as the policy's.
-        full_resolution: The same at full resolution, (batch, 3, H', W').
+        scenes: First images of the episodes at full resolution, (batch, 3, H, W) in 0..1.
     """
     with torch.autocast(scenes.device.type, enabled=False):
         crops = [
-            prompted_crop(matching, prompt, scene, scenes.shape[-2:])
-            for prompt, scene in zip(prompts, full_resolution, strict=True)
+            prompted_crop(matching, prompt, scene) for prompt, scene in zip(prompts, scenes, strict=True)
         ]
         return torch.cat([matching.compare(matching.features(*crop)).descriptors[:, 0] for crop in crops])
 
 
 def prompted_crop(
-    matching: FeatureMatching, prompt: ObjectPrompt, scene: Tensor, size: Sequence[int]
+    matching: FeatureMatching, prompt: ObjectPrompt, scene: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Returns an image (1, 3, H, W), and the center (1, 1, 2) and the side (1, 1) of a prompt's crop of it.
 
@@ -68,8 +64,7 @@ def prompted_crop(
     Args:
         matching: Feature matching, fitted.
         prompt: The prompt.
-        scene: First image of the episode, (3, H', W') in 0..1, at full resolution.
-        size: Height and width of scenes as small as the policy's.
+        scene: First image of the episode, (3, H, W) in 0..1, at full resolution.
     """
     image = scene if prompt.image is None else prompt.image.to(scene.device).float() / 255
     if prompt.image is not None and not prompt.is_point:
@@ -79,8 +74,7 @@ def prompted_crop(
         crop = cut_box(image, prompt.box, extent)[None]
         return crop, crop.new_zeros(1, 1, 2), crop.new_ones(1, 1)
     point = image.new_tensor([prompt.location])  # (1, 2)
-    small = F.interpolate(image[None], tuple(size), mode="bilinear", antialias=True)
-    proposed = matching.proposals(small, image[None])
+    proposed = matching.background(image[None])
     nearest, is_near = nearest_proposals(proposed, point, matching.grasp_radius)
     location = torch.where(is_near[:, None], proposed[0, nearest], point)[:, None]
     return image[None], location, matching.crop_sizes(location)

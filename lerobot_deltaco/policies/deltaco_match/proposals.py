@@ -7,12 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
-from tqdm import tqdm
 
-from lerobot_deltaco.policies.base.image_coordinates import cell_centers, grid_of_centers, mean_near
-from lerobot_deltaco.policies.base.losses import location_loss
-from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu
-from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
+from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers
 from lerobot_deltaco.policies.deltaco_match.segmentation import segment
 from lerobot_deltaco.policies.geometry.camera_motion import (
     CameraMotion,
@@ -37,14 +33,10 @@ _MAX_SLOPE = 1.5  # of the log of a size along an image's half
 _LEAST_ERROR = 0.02  # of the log of a size, below which errors are all alike
 _DEFAULT_SIZE = 0.12
 _AT_A_TIME = 16
-N_PROPOSALS = 5  # of `ProposalNetwork`
-_CHANNELS = 32
-_MIN_DISTANCE = 1 / 6  # between two proposals, where an image's edges are at -1 and 1
 _UNUSUAL = 2.0  # median distances of proposals from grasps, from which on a distance is unusual
-_PEAK_RADIUS = 1.6  # of the cells around a peak whose mean is a proposal
-_LEARNING_RATE, _WEIGHT_DECAY, _WARMUP_FRACTION = 4e-3, 0.05, 0.1
-# Change of a pixel (in 0..1) that counts for an object's size, and its distance from the grasp (in -1..1).
-_CHANGE, _CHANGE_RADIUS = 0.1, 1 / 3
+_CHANGE = (
+    0.1  # of a pixel (in 0..1) between the first and the last image, from which on something disappeared
+)
 
 
 class Background(nn.Module):
@@ -247,119 +239,12 @@ def _scaled(images: Tensor) -> Tensor:
     return F.interpolate(images, (_SIDE, _SIDE), mode="bilinear", align_corners=False)
 
 
-class ProposalNetwork(nn.Module):
-    """Proposes where grippers closed in training scenes, if objects do not stand out from the background.
-
-    The network is not told what to look for, so its map has a peak at each thing that can be grasped.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            conv_norm_relu(3, _CHANNELS, 5, 2),
-            conv_norm_relu(_CHANNELS, _CHANNELS),
-            conv_norm_relu(_CHANNELS, _CHANNELS, 5),
-            nn.Conv2d(_CHANNELS, 1, 1),
-        )
-
-    def forward(self, scenes: Tensor) -> Tensor:
-        """Returns the proposals in scenes (batch, 3, H, W), the likeliest first: (batch, 5, 2) in -1..1."""
-        return peaks(self.layers(channels_last(scenes))[:, 0].float(), N_PROPOSALS)
-
-    def fit(
-        self,
-        images: Tensor,
-        locations: Tensor,
-        generator: torch.Generator,
-        autocast: torch.autocast,
-        settings: MatchingSettings,
-    ) -> None:
-        """Fits the network.
-
-        Args:
-            images: First images of episodes, (episodes, 3, H, W) uint8.
-            locations: Locations of their grasps, (episodes, 2) in -1..1.
-            generator: Source of the draws, on the CPU.
-            autocast: Context of the forward pass.
-            settings: Number of steps, and size of the batches.
-        """
-        steps = settings.proposal_steps
-        self.layers.train()
-        optimizer = torch.optim.AdamW(
-            self.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, fused=True
-        )
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, _LEARNING_RATE, steps, pct_start=_WARMUP_FRACTION
-        )
-        n_scenes = settings.proposal_draws * len(images) // steps
-        n_scenes = min(max(n_scenes, settings.min_proposal_batch), settings.max_proposal_batch)
-        for _ in tqdm(range(steps), desc="Fitting the proposals", unit="step", leave=False):
-            rows = torch.randint(len(images), (n_scenes,), generator=generator).to(images.device)
-            with autocast:
-                maps = self.layers(channels_last(images[rows].float() / 255)).float()
-            loss = location_loss(maps, locations[rows, None]).mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-        self.layers.eval()
-
-
-def fit_perspective(first: Tensor, last: Tensor, locations: Tensor) -> Tensor:
-    """Returns how the log of the apparent size of objects changes along x and y in the image, (2,).
-
-    Things that are farther from the camera look smaller. The size of an object is the square root of the area
-    around its grasp that differs between the first and the last image of the episode, since it is gone then.
-
-    Args:
-        first: First images of episodes, (episodes, 3, H, W) uint8.
-        last: Last images of the same episodes.
-        locations: Locations of the grasps, (episodes, 2) in -1..1.
-    """
-    height, width = first.shape[-2:]
-    x, y = cell_centers(width, first.device), cell_centers(height, first.device)
-    changes = torch.stack(
-        [(b.int() - a.int()).abs().amax(dim=0) / 255 for a, b in zip(first, last, strict=True)]
-    )  # (episodes, H, W)
-    # The robot itself changes in every episode.
-    changes = changes * (changes.median(dim=0).values < _CHANGE)
-    away = torch.hypot(x - locations[:, :1, None], y[:, None] - locations[:, 1:, None])  # (episodes, H, W)
-    side = ((changes > _CHANGE) & (away < _CHANGE_RADIUS)).float().sum(dim=(1, 2)).sqrt() - _EDGE
-    seen = side > _EDGE
-    if int(seen.sum()) < 3 * _MIN_IMAGES:
-        return torch.zeros(2, device=first.device)
-    return _perspective(side[seen], locations[seen])[1]
-
-
 def _perspective(sizes: Tensor, locations: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the size of objects in the middle of the image, (), and the slopes of its log, (2,)."""
     features = torch.cat([torch.ones_like(locations[:, :1]), locations], dim=1)
     degrees = torch.tensor([0, 1, 1], device=features.device)
     fitted = robust_regression(features, sizes.log()[:, None], degrees, _LEAST_ERROR)[:, 0]
     return fitted[0].exp(), fitted[1:].clamp(-_MAX_SLOPE, _MAX_SLOPE)
-
-
-def peaks(maps: Tensor, n_peaks: int) -> Tensor:
-    """Returns the highest peaks of maps, at a distance from one another.
-
-    Args:
-        maps: Logits, (batch, h, w).
-        n_peaks: Number of peaks.
-
-    Returns:
-        Means of the cells around each peak, the highest first, (batch, n_peaks, 2) in -1..1.
-    """
-    height, width = maps.shape[1:]
-    centers = grid_of_centers(height, width, maps.device)
-    left, locations = maps.flatten(1), []
-    for _ in range(n_peaks):
-        best, cell = left.max(dim=1)
-        # Beyond the last peak, all cells may be taken; then the highest is proposed again.
-        weights = (maps - best[:, None, None]).clamp(max=0).exp()
-        locations.append(mean_near(weights, cell, _PEAK_RADIUS))
-        away = (centers - centers[cell][:, None]).norm(dim=2)  # (batch, cells)
-        left = left.masked_fill(away < _MIN_DISTANCE, -1e9)
-    return torch.stack(locations, dim=1)
 
 
 def nearest_proposals(proposed: Tensor, locations: Tensor, radius: float) -> tuple[Tensor, Tensor]:
