@@ -218,6 +218,13 @@ def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
     assert resumed.config.known_words == ["blue", "left", "move", "object", "red", "right", "the"]
 
 
+def test_the_seed_of_a_training_is_that_of_the_fit(table):
+    for seed in (4, 5):
+        torch.manual_seed(seed)
+        assert small_policy(table, "deltaco_match", prepare=False)[0].config.seed == seed
+    assert small_policy(table, "deltaco_match", prepare=False, seed=7)[0].config.seed == 7
+
+
 def test_words_of_tasks_that_are_not_trained_on_are_unknown(table):
     policy, _, _ = small_policy(table, "deltaco_match", prepare=False)
     assert "blue" in policy.config.known_words

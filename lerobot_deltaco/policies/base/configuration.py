@@ -68,7 +68,8 @@ class TaskConditionedConfig(PreTrainedConfig):
         upsampled_tasks: Regular expression for the instructions of the tasks that get `upsampled_fraction` of
             each batch of `deltaco train`.
         upsampled_fraction: Fraction of each batch for the upsampled tasks; 0.5 in the paper's scenario B.
-        seed: Seed for drawing demonstrations and shifts; the draws also depend on the step.
+        seed: Seed for drawing demonstrations and shifts, and of what is learned before the first step; the
+            draws also depend on the step. By default, torch's, which LeRobot's training sets by --seed.
         precision: Precision of training: float32 or bfloat16; the last layers, and evaluation, always use
             float32. So does a CPU without bfloat16 instructions.
         optimizer_lr: Learning rate of AdamW.
@@ -99,7 +100,7 @@ class TaskConditionedConfig(PreTrainedConfig):
     tasks_per_batch: int = 16
     upsampled_tasks: str | None = None
     upsampled_fraction: float = 0.5
-    seed: int = 0
+    seed: int | None = None
     precision: str = "float32"
     optimizer_lr: float = 3e-4
     optimizer_weight_decay: float = 0.0

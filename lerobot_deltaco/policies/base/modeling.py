@@ -88,6 +88,8 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     ) -> None:
         super().__init__(config)
         self.config: Any = config
+        if config.seed is None:
+            config.seed = torch.initial_seed() % 2**63
         self._meta, self._stats = dataset_meta, dataset_stats
         if dataset_meta is not None:
             # `lerobot-train` opens the dataset itself, without the checks of `open_dataset`.
