@@ -116,7 +116,7 @@ def test_draws_are_a_function_of_the_seed_and_the_step(make, dataset):
     policy, before, _ = make(method="demo_only")
     batch = before(batch_of(dataset, list(range(15))))
     twin, other_seed = copy.deepcopy(policy), copy.deepcopy(policy)
-    other_seed.config.seed = 1
+    other_seed.seed = 1
     losses = [policy(batch)[0].item() for _ in range(3)]
     torch.manual_seed(99)
     assert [twin(batch)[0].item() for _ in range(3)] == losses

@@ -211,7 +211,7 @@ def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
     policy.save_pretrained(tmp_path)
     before = copy.deepcopy(policy.matching.state_dict())
     resumed = DeltacoMatchPolicy.from_pretrained(tmp_path, dataset_meta=table.meta).train()
-    resumed.config.seed = 5
+    resumed.seed = 5
     resumed(batch_of(table, [0]))
     after = resumed.matching.state_dict()
     assert all(torch.equal(before[name], value) for name, value in after.items())

@@ -69,6 +69,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         dataset_meta: Metadata of the training dataset; None in evaluation.
 
     Attributes:
+        seed: Seed of the draws in training.
         policy_network: Network that predicts actions.
         instructions: Embeddings of instructions; None if the policy uses no sentence encoder.
         demonstrations: Demonstrations for evaluation; None if the policy needs or has none.
@@ -90,6 +91,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         self.config: Any = config
         if config.seed is None:
             config.seed = torch.initial_seed() % 2**63
+        self.seed: int = config.seed
         self._meta, self._stats = dataset_meta, dataset_stats
         if dataset_meta is not None:
             # `lerobot-train` opens the dataset itself, without the checks of `open_dataset`.
@@ -388,7 +390,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         """Returns the random generator of a training step, on the CPU."""
         step = int(self.step) if self.training else 0
         rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
-        sequence = np.random.SeedSequence((self.config.seed, step, rank))
+        sequence = np.random.SeedSequence((self.seed, step, rank))
         (state,) = sequence.generate_state(1, np.uint64)
         return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 

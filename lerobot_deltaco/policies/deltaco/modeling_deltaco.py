@@ -249,7 +249,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         if self.config.demo_encoder == "pretrained":
             embedded = self.demo_encoder(torch.stack([self._features(each) for each in present]).to(device))
         else:
-            generator = torch.Generator().manual_seed(self.config.seed)
+            generator = torch.Generator().manual_seed(self.seed)
             frames = torch.stack([each.frames for each in present]).to(device)
             embedded = self.demo_encoder(sample_frames(frames, self.config.n_demo_frames, generator))
         embeddings[torch.tensor([bool(own) for own in demonstrations], device=device)] = embedded.float()
@@ -292,7 +292,7 @@ class DeltacoPolicy(TaskConditionedPolicy):
         padding, frames, rows = config.demo_shift_padding, config.n_demo_frames, config.demo_rows
         # The features do not depend on the precision of the training.
         with torch.autocast(bank.frames.device.type, enabled=False):
-            return encode_bank(bank, encoder, frames, rows, n_variants, padding, config.seed)
+            return encode_bank(bank, encoder, frames, rows, n_variants, padding, self.seed)
 
     def _check_demonstrations(self, data: TrainingData) -> None:
         if self.config.demo_encoder == "pretrained":

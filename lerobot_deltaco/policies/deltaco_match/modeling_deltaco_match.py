@@ -684,7 +684,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             located.heights,
             bank.tasks,
             sentences,
-            self.config.seed,
+            self.seed,
             in_bfloat16=self.config.precision == "bfloat16",
         )
         self.config.held_out_episodes = bank.episodes[held_out].tolist()
