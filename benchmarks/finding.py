@@ -310,7 +310,7 @@ def measure(matching: Any, pairs: Sequence[tuple[StillEpisode, StillEpisode]]) -
         ("words", texts, (None, None, None)),
         ("both", texts, (described.descriptors, heights, templates)),
     ):
-        candidates = matching.find(scenes.float() / 255, words, *by)
+        candidates = matching.find(scenes.float() / 255, words, *by, matching.novelty(words))
         location, p, _ = candidates.best
         right, near = [], []
         for n, (scene, _) in enumerate(pairs):

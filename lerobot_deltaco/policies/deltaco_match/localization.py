@@ -168,6 +168,7 @@ class FeatureMatching(nn.Module):
         described: Tensor | None,
         demonstrated: Tensor | None,
         templates: Tensor | None = None,
+        novelty: Tensor | None = None,
     ) -> Candidates:
         """Finds what tasks ask for.
 
@@ -180,15 +181,16 @@ class FeatureMatching(nn.Module):
                 None without demonstrations.
             templates: Surroundings of the demonstrated grasps, (batch, demonstrations, 3, h, w). See
                 `Described`.
+            novelty: How likely each demonstrated object is new to the training, (batch,). See `novelty`.
         """
         with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
             locations = self.background(scenes)
             crops = self.compare(self.features(scenes, locations))
             words = encode_words(instructions, self.vocabulary).to(scenes.device)
             scores, similarity = self.scores(crops, words, described)
-            if templates is not None and bool((self._p_unknown(words) > _MIN_NOVELTY).any()):
+            if templates is not None and novelty is not None and bool((novelty > _MIN_NOVELTY).any()):
                 alike = self._correlations(scenes, locations, templates)
-                scores = scores + self.settings.template_weight * self._p_unknown(words)[:, None] * alike
+                scores = scores + self.settings.template_weight * novelty[:, None] * alike
             if demonstrated is None:
                 demonstrated = torch.full_like(scores[:, 0], torch.nan)
             heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])

@@ -446,11 +446,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             centers = described.centers[::n_each]
             heights = self.state_regressor.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
             attention, last = attentions[::n_each], ends[::n_each, 1]
-        candidates = self.matching.find(batch[camera], instructions, descriptors, heights, templates)
+        novelty = self.matching.novelty(instructions)
+        candidates = self.matching.find(
+            *(batch[camera], instructions, descriptors, heights, templates, novelty)
+        )
         if prompts:
             candidates = choose_prompted(candidates, prompts)
         proposal, confidence, height = candidates.best
-        novelty = self.matching.novelty(instructions)
         pick = self.matching.grasps(batch[camera], proposal, templates, novelty)
         place_maps = self._place_maps(
             scenes, by_instruction, instructions, last, None if attention is None else attention[:, 1]
