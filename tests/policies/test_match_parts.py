@@ -237,7 +237,7 @@ def test_certainty_is_limited_by_the_number_of_held_out_episodes(matching, shape
     n_objects = candidates.locations.shape[1]
     limit = 1 - float(matching.error_rate) * (1 - 1 / n_objects)
     assert candidates.log_probabilities.exp().max() <= limit + 1e-5
-    assert limit < 0.9
+    assert limit < 0.92  # Jeffreys' prior: 1 - 0.5 / 5, and some of the rest
 
 
 def test_objects_are_new_by_an_unknown_noun_or_without_words_after_few_episodes(matching, monkeypatch):

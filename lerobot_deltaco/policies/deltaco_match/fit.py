@@ -509,7 +509,7 @@ class HeldOut:
         n_seen, n_all = len(self._is_grasped) / _LOOKS, int(matching.held_out[1])  # a proposal is near; all
         matching.held_out[0] = round(float(is_right[2]) * n_seen)
         n_wrong = n_all - float(is_right[0] + is_right[2]) / 2 * n_seen
-        error_rate = torch.tensor((n_wrong + 1) / (n_all + 2))  # by Laplace's rule of succession
+        error_rate = torch.tensor((n_wrong + 0.5) / (n_all + 1))  # with Jeffreys' prior
         losses = {}
         for sharpness in matching.settings.sharpnesses:
             p = (sharpness * scores).softmax(dim=2)
