@@ -54,7 +54,8 @@ class CropEncoder:
             PretrainedWeightsError: The network's weights are missing.
         """
         is_crop = ~locations.isnan().any(dim=2)
-        crops = cut_crops(images, locations.nan_to_num(), sizes.nan_to_num(nan=1.0), CROP_RESOLUTION)[is_crop]
+        rows, at = is_crop.nonzero()[:, 0], (locations[is_crop][:, None], sizes[is_crop][:, None])
+        crops = cut_crops(images[rows], *at, CROP_RESOLUTION)[:, 0]
         mean, std = (
             torch.tensor(values, device=crops.device)[:, None, None]
             for values in (IMAGENET_MEAN, IMAGENET_STD)

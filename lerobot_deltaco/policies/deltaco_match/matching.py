@@ -98,15 +98,19 @@ class MatchingHead(nn.Module):
             inputs: Normalized features, (batch, n, feature_dim); 0 for no crop.
             generator: Source of dropout's draws, on the CPU; None for no dropout.
         """
-        features, inputs = inputs, _dropout(inputs, generator)
+        exists = (inputs != 0).any(dim=-1)
+        features = inputs[exists]  # most scenes have few
+        inputs = _dropout(features, generator)
         hidden = _dropout(F.relu(self.hidden(inputs)), generator)
         descriptors = self.linear(inputs) + self.from_hidden(hidden)
         if bool(self.feature_weight > 0):
             descriptors = torch.cat([descriptors.float(), features.float()], dim=-1)
         words = self.words(hidden).float().log_softmax(dim=-1)
-        objectness = self.objectness(hidden)[..., 0].float()
-        exists = (features != 0).any(dim=-1)
-        return Crops(_unit(descriptors.float()), words, objectness, hidden.float(), exists)
+        objectness = self.objectness(hidden)[..., 0]
+        descriptors, words, objectness, hidden = (
+            _scatter(part.float(), exists) for part in (_unit(descriptors.float()), words, objectness, hidden)
+        )
+        return Crops(descriptors, words, objectness, hidden, exists)
 
     def match(
         self,
@@ -152,6 +156,13 @@ class MatchingHead(nn.Module):
 def uniform(exists: Tensor) -> Tensor:
     """Returns the uniform distribution over the crops that exist, (batch, n)."""
     return exists / exists.sum(dim=1, keepdim=True)
+
+
+def _scatter(values: Tensor, exists: Tensor) -> Tensor:
+    """Returns values (crops, ...) where crops exist (batch, n), and 0 elsewhere, (batch, n, ...)."""
+    scattered = values.new_zeros(*exists.shape, *values.shape[1:])
+    scattered[exists] = values
+    return scattered
 
 
 def _unit(descriptors: Tensor) -> Tensor:
