@@ -154,6 +154,7 @@ def matching(shapes, request):
     """A feature matching that is fitted to 24 of the episodes."""
     images, locations, tasks = (part[:24] for part in shapes)
     short = MatchingSettings(
+        refinement_steps=30,
         min_matching_steps=60,
         matching_batch=32,
         max_variants=2,
@@ -303,7 +304,9 @@ def test_fit_is_a_function_of_its_seed_and_trains_nothing_but_itself(shapes, sho
 def test_steps_of_the_fit_follow_the_number_of_scenes(n_scenes, steps, monkeypatch, short_fit):
     draws, draw = [], fit.EpisodePairs.draw
     monkeypatch.setattr(fit.EpisodePairs, "draw", lambda *own: draws.append(1) or draw(*own))
-    settings = MatchingSettings(grasp_error=9.0, min_matching_steps=2, max_matching_steps=9)
+    settings = MatchingSettings(
+        grasp_error=9.0, refinement_steps=2, min_matching_steps=2, max_matching_steps=9
+    )
     matching = FeatureMatching(["task"], settings)
     images = torch.zeros(n_scenes, 3, 16, 16, dtype=torch.uint8)
     tasks, sentences = ["task"] * n_scenes, {"task": ["task"]}
