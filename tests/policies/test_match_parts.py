@@ -1,5 +1,6 @@
 """What `deltaco_match` consists of: heights, places, feature matching."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 from small_policies import random_moves
 
+from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.augmentation import change_colors, random_color_changes
 from lerobot_deltaco.policies.base.configuration import has_bfloat16
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
@@ -314,6 +316,24 @@ def test_steps_of_the_fit_follow_the_number_of_scenes(n_scenes, steps, monkeypat
         matching, *[images] * 3, torch.zeros(n_scenes, 2), torch.zeros(n_scenes), tasks, sentences, 0
     )
     assert len(draws) == 1 + steps  # the first, for the scales
+
+
+def test_a_camera_that_moved_during_the_recording_is_told(shapes, short_fit, caplog):
+    images, locations, tasks = shapes
+    sentences = {task: [task] for task in tasks}
+    generator = torch.Generator().manual_seed(0)
+    ground = torch.randint(0, 255, (3, 8, 8), generator=generator).float()
+    ground = torch.nn.functional.interpolate(ground[None], (SIZE, SIZE))[0].to(torch.uint8)
+    settings = MatchingSettings(min_matching_steps=2, max_matching_steps=2, refinement_steps=2)
+    is_object = (images != 150).any(dim=1, keepdim=True)
+    for moves in (False, True):
+        shifts = torch.randint(-9, 10, (len(images), 2), generator=generator) * moves
+        grounds = torch.stack([ground.roll(shift.tolist(), dims=(1, 2)) for shift in shifts])
+        recorded = torch.where(is_object, images, grounds)
+        data = (*[recorded] * 3, locations, torch.zeros(len(images)), tasks, sentences, 0)
+        with pytest.raises(UserError, match="the first camera stands still") if moves else nullcontext():
+            fit_feature_matching(FeatureMatching(vocabulary_of(tasks), settings), *data)
+        assert ("Only 0 % of the grasped objects stand out" in caplog.text) == moves
 
 
 def test_words_that_describe_the_container_do_not_count():
