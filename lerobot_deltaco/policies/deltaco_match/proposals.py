@@ -176,6 +176,8 @@ class Background(nn.Module):
 
     def _differences(self, scenes: Tensor, remembered: Tensor | None) -> Tensor:
         """Returns the difference of each pixel from the colors that are common there, (batch, 128, 128)."""
+        if not int(self.n_images):  # before the fit, everything stands out
+            return torch.ones(len(scenes), _SIDE, _SIDE, device=self.images.device)
         if self._bounds is None or self._bounds[0].device != self.images.device:
             images = self.images[: int(self.n_images)]
             # A pixel may lie between two of the image: its neighbors count, as far as they usually differ
