@@ -288,8 +288,9 @@ def measure(matching: Any, pairs: Sequence[tuple[StillEpisode, StillEpisode]]) -
     """Looks for objects in new scenes.
 
     Returns:
-        Rates: a proposal at the object; the right object by demonstration, by words and by both; and of the
-        choices by both of 90 % and more, the number and how many are right.
+        Rates: a proposal at the object; the right object by the encoder's features alone, without any fit, by
+        demonstration, by words and by both; and of the choices by demonstration and by both, how many are
+        sure by 90 % and more, and how many of these are right.
     """
     scenes = torch.stack([scene.first for scene, _ in pairs])
     shown = torch.stack([demonstration.first for _, demonstration in pairs])
@@ -304,7 +305,14 @@ def measure(matching: Any, pairs: Sequence[tuple[StillEpisode, StillEpisode]]) -
     texts = [str(rng.choice(scene.sentences)) for scene, _ in pairs]
     nothing = [""] * len(pairs)
     heights = torch.full((len(pairs),), torch.nan)
-    result: dict[str, float] = {}
+    locations = matching.background(scenes.float() / 255)
+    inputs = (
+        matching.compare.inputs(matching.features(*crops))
+        for crops in ((scenes, locations), (shown, described.centers[:, None]))
+    )
+    cosines = F.cosine_similarity(*inputs, dim=2).masked_fill(locations[..., 0].isnan(), -1)
+    chosen = locations[torch.arange(len(pairs)), cosines.argmax(dim=1)]
+    result = {"raw": float(np.mean([_is_right(e, at) for (e, _), at in zip(pairs, chosen, strict=True)]))}
     for name, words, by in (
         ("demo", nothing, (described.descriptors, heights, templates)),
         ("words", texts, (None, None, None)),
@@ -314,8 +322,7 @@ def measure(matching: Any, pairs: Sequence[tuple[StillEpisode, StillEpisode]]) -
         location, p, _ = candidates.best
         right, near = [], []
         for n, (scene, _) in enumerate(pairs):
-            distance = (scene.locations - location[n]).norm(dim=1)
-            right.append(bool(distance.argmin() == 0 and distance[0] < 0.9 * scene.radius))
+            right.append(_is_right(scene, location[n]))
             offsets = (candidates.locations[n] - scene.locations[0]).norm(dim=1)
             near.append(bool((offsets < 0.9 * scene.radius).any()))
         result[name] = float(np.mean(right))
@@ -324,6 +331,12 @@ def measure(matching: Any, pairs: Sequence[tuple[StillEpisode, StillEpisode]]) -
         result[f"sure {name}"] = float(certain.mean())
         result[f"sure right {name}"] = float(np.mean(np.array(right)[certain])) if certain.any() else np.nan
     return result
+
+
+def _is_right(scene: StillEpisode, location: Tensor) -> bool:
+    """Returns whether a location (2,) is on the object that the task asks for."""
+    distance = (scene.locations - location).norm(dim=1)
+    return bool(distance.argmin() == 0 and distance[0] < 0.9 * scene.radius)
 
 
 def main() -> None:
@@ -335,6 +348,7 @@ def main() -> None:
     arguments = parser.parse_args()
     columns = (
         "near",
+        "raw",
         "demo",
         "words",
         "both",
