@@ -109,7 +109,7 @@ def fit_feature_matching(
             autocast,
             held_out=held_out[is_kept],
         )
-        rows = kept.to(device)
+        rows, kept_tasks = kept.to(device), [tasks[row] for row in kept.tolist()]
         nearest = proposed[is_kept.to(device)][torch.arange(len(kept)), distances.argmin(dim=1)]
         matching.refine.fit(
             full_resolution[kept.to(full_resolution.device)],
@@ -120,6 +120,13 @@ def fit_feature_matching(
             settings.refinement_steps,
             generator,
             autocast,
+        )
+        matching.refine.measure_templates(
+            full_resolution[kept.to(full_resolution.device)],
+            locations[rows],
+            nearest,
+            matching.object_sizes(nearest),
+            _other_episodes(kept_tasks).to(device),
         )
     matching.requires_grad_(False)
     for weights in matching.parameters():
@@ -173,6 +180,17 @@ def _propose(
     usual_error = float(errors[stands_out].median()) if stands_out.any() else 0.0
     shown, _ = demonstrated_centers(proposed, changed, grasps, grasps, matching.grasp_radius, usual_error)
     return proposed, shown
+
+
+def _other_episodes(tasks: Sequence[str]) -> Tensor:
+    """Returns the row of the next episode of the same task, (episodes,); its own if there is none."""
+    of_task: dict[str, list[int]] = {}
+    for row, task in enumerate(tasks):
+        of_task.setdefault(task, []).append(row)
+    others = torch.arange(len(tasks))
+    for rows in of_task.values():
+        others[rows] = torch.tensor(rows).roll(-1)
+    return others
 
 
 def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:

@@ -106,7 +106,8 @@ class Described(NamedTuple):
     Attributes:
         centers: Centers of the objects, (batch, 2) in -1..1.
         descriptors: Descriptors of the objects, (batch, descriptor).
-        templates: Surroundings of the grasps, (batch, 3, h, w); NaN where the grasp is not known.
+        templates: Surroundings of the grasps, (batch, 3, h, w); NaN where the grasp is not known, or where
+            templates are not used.
     """
 
     centers: Tensor
@@ -327,6 +328,8 @@ class FeatureMatching(nn.Module):
             features = self.features(full_resolution, centers[:, None])
             shown = torch.where(is_near[:, None], grasps, torch.nan)
             templates = cut_templates(full_resolution, shown, self.object_sizes(grasps))
+            if not bool(self.refine.uses_templates):
+                templates = torch.full_like(templates, torch.nan)
             return Described(centers, self.compare(features).descriptors[:, 0], templates)
 
     def demonstrated(

@@ -4,7 +4,8 @@ A proposal is somewhere on an object. Two things tell where its grasp is. A smal
 surroundings, enlarged from the full resolution; it learns from the training episodes, whose grasps are known,
 at centers and sizes that are off at random. And the demonstration shows what the grasp looked like: its
 surroundings there are a template, which is correlated with those of the proposal. The network is more exact
-on objects of the training, and can be wrong on others.
+on objects of the training, and can be wrong on others. Each counts only where it comes nearer to the grasps
+than the proposals do: where a demonstrator grasps objects anywhere, a template does not.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ _TEMPLATE_WINDOW = 0.7  # standard deviation of the weights of a template's pixe
 _CORRELATION_WEIGHT = 40.0  # of a correlation, as a logit beside the network's
 _LEAST_LOG_PROBABILITY = -8.0  # of a cell, by the network: it may be wrong
 _MIN_VARIANCE = 1e-4  # of colors in 0..1
+_N_MEASURED = 200  # episodes, at most, in which templates are measured
 
 
 class GraspRefiner(nn.Module):
@@ -43,11 +45,14 @@ class GraspRefiner(nn.Module):
 
     Attributes:
         is_used: Whether it comes nearer to the grasps of held-out episodes than the proposals do, () bool.
+        uses_templates: Whether templates of other episodes of a task come nearer to its grasps than the
+            proposals do, () bool.
         errors: Median distance from the grasps of held-out episodes, of proposals and of refined locations,
             where an image's edges are at -1 and 1, (2,).
     """
 
     is_used: Tensor
+    uses_templates: Tensor
     errors: Tensor
 
     def __init__(self) -> None:
@@ -63,6 +68,7 @@ class GraspRefiner(nn.Module):
             nn.Conv2d(_CHANNELS, 1, 1),
         )
         self.register_buffer("is_used", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("uses_templates", torch.zeros((), dtype=torch.bool))
         self.register_buffer("errors", torch.zeros(2))
 
     def forward(
@@ -164,6 +170,27 @@ class GraspRefiner(nn.Module):
             errors = [(each - grasps[rows]).norm(dim=1).median() for each in (proposals[rows], refined)]
             self.errors.copy_(torch.stack(errors))
             self.is_used.copy_(errors[1] < errors[0])
+
+    def measure_templates(
+        self, images: Tensor, grasps: Tensor, proposals: Tensor, sizes: Tensor, others: Tensor
+    ) -> None:
+        """Decides whether templates are used.
+
+        Args:
+            images: First images of episodes at full resolution, (episodes, 3, H, W) uint8.
+            grasps: Where their grasps are, (episodes, 2) in -1..1.
+            proposals: The nearest proposals, (episodes, 2) in -1..1.
+            sizes: Diameters of typical objects there, as fractions of the image's side, (episodes,).
+            others: Row of another episode of the task of each, (episodes,); its own if there is none.
+        """
+        rows = (others != torch.arange(len(others), device=others.device)).nonzero().flatten()
+        rows = rows[:: max(1, len(rows) // _N_MEASURED)]
+        shown = others[rows]
+        templates = cut_templates(images[shown.to(images.device)], grasps[shown], sizes[shown])[:, None]
+        given = (images[rows.to(images.device)], proposals[rows], sizes[rows], templates)
+        refined = self._refine(*given, uses_network=False)
+        errors = [(each - grasps[rows]).norm(dim=1).median() for each in (proposals[rows], refined)]
+        self.uses_templates.copy_(errors[1] < errors[0])
 
 
 def cut_templates(images: Tensor, grasps: Tensor, sizes: Tensor) -> Tensor:
