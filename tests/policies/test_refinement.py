@@ -103,3 +103,23 @@ def test_a_template_correlates_fully_with_itself_and_with_nothing_on_an_empty_ta
     assert int(found.argmax()) == middle * found.shape[2] + middle
     empty = correlations(images, torch.tensor([[-0.7, -0.7]]), sizes, templates, 0.1)
     assert empty.abs().max() < 0.1
+
+
+@pytest.mark.parametrize("anywhere", [False, True])
+def test_templates_count_where_they_tell_where_grasps_are(refined, anywhere):
+    _, (images, grasps, middles, sizes, _) = refined
+    if anywhere:  # on the object, and at its middle on the average
+        generator = torch.Generator().manual_seed(1)
+        grasps = middles + RADIUS / SIZE * torch.randn(middles.shape, generator=generator)
+    refiner = GraspRefiner()
+    # Of four episodes each, the disks look alike.
+    others = torch.arange(N_EPISODES) // 4 * 4 + (torch.arange(N_EPISODES) + 1) % 4
+    alike = images.clone()
+    for first in range(0, N_EPISODES, 4):
+        color = images[first][:, (images[first] != 120).any(dim=0)][:, 0]
+        for image in alike[first : first + 4]:
+            image[:, (image != 120).any(dim=0)] = color[:, None]
+    refiner.measure_templates(alike, grasps, middles, sizes, others)
+    assert bool(refiner.uses_templates) != anywhere
+    refiner.measure_templates(alike, grasps, middles, sizes, torch.arange(N_EPISODES))
+    assert not refiner.uses_templates  # no task has two episodes

@@ -185,6 +185,9 @@ class GraspRefiner(nn.Module):
         """
         rows = (others != torch.arange(len(others), device=others.device)).nonzero().flatten()
         rows = rows[:: max(1, len(rows) // _N_MEASURED)]
+        if not len(rows):
+            self.uses_templates.zero_()
+            return
         shown = others[rows]
         templates = cut_templates(images[shown.to(images.device)], grasps[shown], sizes[shown])[:, None]
         given = (images[rows.to(images.device)], proposals[rows], sizes[rows], templates)
