@@ -18,6 +18,7 @@ from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import M
 from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.matching import Crops, MatchingHead, word_scores
 from lerobot_deltaco.policies.deltaco_match.proposals import (
+    MAX_MEASURED,
     MAX_REMEMBERED,
     changed_areas,
     demonstrated_centers,
@@ -154,9 +155,9 @@ def _propose(
         Proposals in the drawn scenes, (drawn, n, 2), and the centers of what was grasped, (drawn, 2).
     """
     background, grasps = matching.background, locations[drawn.to(locations.device)]
-    chosen = torch.randperm(len(drawn), generator=generator)[:MAX_REMEMBERED].sort().values
+    chosen = torch.randperm(len(drawn), generator=generator)[:MAX_MEASURED]
     remembered = torch.full((len(drawn),), -1)
-    remembered[chosen] = torch.arange(len(chosen))
+    remembered[chosen[:MAX_REMEMBERED]] = torch.arange(min(len(chosen), MAX_REMEMBERED))
     some = drawn[chosen]
     background.fit(full_resolution[some.to(full_resolution.device)], locations[some.to(locations.device)])
     parts = []

@@ -19,7 +19,7 @@ from lerobot_deltaco.policies.geometry.regression import robust_regression
 
 N_OBJECTS = 14  # proposed in a scene by `Background`, at most
 _SIDE = 128  # px, of the images as they are compared
-MAX_REMEMBERED = 48  # images
+MAX_REMEMBERED, MAX_MEASURED = 48, 400  # images
 _MIN_IMAGES = 8
 # Fraction of the images that may show a pixel's color while it still stands out. It is more than an object
 # takes, and less than a container that stands in one of four places.
@@ -137,17 +137,21 @@ class Background(nn.Module):
         return estimate_motion(*self._static, _scaled(scene[None].to(self.images.device))[0], width / height)
 
     def fit(self, images: Tensor, locations: Tensor) -> None:
-        """Remembers images, and measures objects.
+        """Remembers images, and measures objects in all of them.
 
         Args:
-            images: First images of episodes, (up to 48, 3, H, W) uint8, at full resolution.
+            images: First images of episodes, (episodes, 3, H, W) uint8, at full resolution; the first 48 are
+                remembered.
             locations: Locations of their grasps, (episodes, 2) in -1..1.
         """
+        remembered = torch.arange(len(images))
+        remembered[MAX_REMEMBERED:] = -1
         self.images.zero_()
-        self.images[: len(images)] = _scaled(images).mul(255).round().to(self.images)
-        self.n_images.fill_(len(images))
+        some = _scaled(images[:MAX_REMEMBERED])
+        self.images[: len(some)] = some.mul(255).round().to(self.images)
+        self.n_images.fill_(len(some))
         self._bounds = self._static = None
-        differences = self._differences(images, torch.arange(len(images)))
+        differences = self._differences(images, remembered)
         noise = _NOISE_FACTOR * differences.flatten(1).median(dim=1).values.median()
         self.contrast.copy_(noise.clamp_min(_MIN_CONTRAST))
         self._measure(differences > 1.5 * self.contrast, locations.to(self.images.device))
