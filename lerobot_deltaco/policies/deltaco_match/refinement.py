@@ -174,13 +174,9 @@ class GraspRefiner(nn.Module):
     def measure_templates(
         self, images: Tensor, grasps: Tensor, proposals: Tensor, sizes: Tensor, others: Tensor
     ) -> None:
-        """Decides whether templates are used.
+        """Decides whether templates are used. See `fit` for the other arguments.
 
         Args:
-            images: First images of episodes at full resolution, (episodes, 3, H, W) uint8.
-            grasps: Where their grasps are, (episodes, 2) in -1..1.
-            proposals: The nearest proposals, (episodes, 2) in -1..1.
-            sizes: Diameters of typical objects there, as fractions of the image's side, (episodes,).
             others: Row of another episode of the task of each, (episodes,); its own if there is none.
         """
         rows = (others != torch.arange(len(others), device=others.device)).nonzero().flatten()
