@@ -174,10 +174,10 @@ class GraspRefiner(nn.Module):
     def measure_templates(
         self, images: Tensor, grasps: Tensor, proposals: Tensor, sizes: Tensor, others: Tensor
     ) -> None:
-        """Decides whether templates are used. See `fit` for the other arguments.
+        """Decides whether templates are used.
 
-        Args:
-            others: Row of another episode of the task of each, (episodes,); its own if there is none.
+        The arguments are those of `fit`, and the row of another episode of the task of each, (episodes,); its
+        own if there is none.
         """
         rows = (others != torch.arange(len(others), device=others.device)).nonzero().flatten()
         rows = rows[:: max(1, len(rows) // _N_MEASURED)]
