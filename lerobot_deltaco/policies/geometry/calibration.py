@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -67,12 +66,6 @@ class ImageProjection(nn.Module):
         self.register_buffer("residual", torch.tensor(-1.0))
         self.register_buffer("position_dims", torch.full((3,), -1))
         self.register_buffer("camera", torch.zeros(3, 4))
-        self.register_load_state_dict_pre_hook(self._add_residual)
-
-    @staticmethod
-    def _add_residual(module: ImageProjection, state_dict: dict[str, Tensor], prefix: str, *_: Any) -> None:
-        """Lets checkpoints that do not tell the residual be loaded."""
-        state_dict.setdefault(f"{prefix}residual", module.residual)
 
     @property
     def has_camera(self) -> bool:
