@@ -219,6 +219,14 @@ def test_an_object_may_be_higher_than_those_of_the_training_where_positions_are_
     assert np.median(np.abs(found - seen), axis=0).max() < 0.04
 
 
+def test_a_hand_that_never_moves_along_x_is_no_camera():
+    recording, regressor, (scale, shift), dims = unfitted()
+    recording.grasps.states[..., 0] = 0.5
+    regressor.fit(recording.grasps, *recording.images, scale, shift, dims < 6, position_dims=[0, 1, 2])
+    assert not regressor.to_image.has_camera
+    assert regressor(torch.zeros(1, 2, 2), torch.zeros(1)).isfinite().all()
+
+
 def test_a_release_keeps_the_height_and_the_rotation_that_were_demonstrated():
     recording, regressor, (scale, shift), dims = unfitted()
     states = recording.grasps.states

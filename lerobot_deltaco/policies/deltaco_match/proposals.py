@@ -34,9 +34,7 @@ _LEAST_ERROR = 0.02  # of the log of a size, below which errors are all alike
 _DEFAULT_SIZE = 0.12
 _AT_A_TIME = 16
 _UNUSUAL = 2.0  # median distances of proposals from grasps, from which on a distance is unusual
-_CHANGE = (
-    0.1  # of a pixel (in 0..1) between the first and the last image, from which on something disappeared
-)
+_CHANGE = 0.1  # of a pixel (in 0..1) between the first and the last image that counts
 
 
 class Background(nn.Module):

@@ -90,7 +90,8 @@ class ImageProjection(nn.Module):
             states: States at their grasps, (episodes, state), at least `MIN_EPISODES`.
             scale: Factor by which each dimension counts, (state,), such as 1 / its standard deviation over
                 all frames. So velocities, which are only noise at a grasp, hardly count.
-            position_dims: Dimensions that are the hand's position along x, y and z; None if not known.
+            position_dims: Dimensions that are the hand's position along x, y and z; None if they are
+                not known. Without any movement along x or y, they do not count.
         """
         states = states.float()
         mean, std = states.mean(dim=0), states.std(dim=0)
@@ -99,7 +100,8 @@ class ImageProjection(nn.Module):
         changes = _changes(first, carried, last)  # (episodes, H, W)
         x = (states - mean) * self.scale.to(mean)
         smooth = _blurred(changes)
-        self.position_dims.copy_(torch.tensor([-1] * 3 if position_dims is None else list(position_dims)))
+        is_seen = position_dims is not None and bool((self.scale[list(position_dims[:2])] != 0).all())
+        self.position_dims.copy_(torch.tensor(list(position_dims or ()) if is_seen else [-1] * 3))
         starts = [self._fit_to_changes(x, changes, smooth, seed) for seed in range(_N_STARTS)]
         best, near = max(starts, key=lambda start: _change_at(smooth, self._map(x, start[0])))
         (self.camera if self.has_camera else self.weights).copy_(best)

@@ -133,10 +133,10 @@ class StateRegressor(nn.Module):
                 robust_regression(features[:, n], states[:, n], degrees, _LEAST_ERROR, is_arm.float())
             )
         self._fit_follows_place(features[:, 1], states[:, 1], position_dims)
-        if seen is not None:
-            self._measure_heights(states[:, 0], seen[2])
+        if self.to_image.has_camera:
+            self._measure_heights(states[:, 0], int(self.to_image.position_dims[2]))
             return self.locate(grasps)
-        self._fit_heights(features[:, 0], states[:, 0], last_moves, is_arm)
+        self._fit_heights(features[:, 0], states[:, 0], last_moves, is_related)
         if tasks is not None:
             self._level(
                 features[:, 0], states[:, 0], [t for t, has in zip(tasks, has_grasp, strict=True) if has]
