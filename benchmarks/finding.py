@@ -263,8 +263,8 @@ def small(images: Tensor) -> Tensor:
 def fit(data: Data, seed: int) -> Any:
     """Fits feature matching to the training episodes of a case."""
     from lerobot_deltaco.policies.base.configuration import has_bfloat16
+    from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching
     from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
-    from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
     from lerobot_deltaco.policies.deltaco_match.words import vocabulary_of
 
     train = data.train

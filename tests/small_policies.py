@@ -23,7 +23,7 @@ from lerobot_deltaco.data.demonstrations import DemonstrationBank
 from lerobot_deltaco.data.frames import FramesInMemory
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.policies.base import language
-from lerobot_deltaco.policies.deltaco_match import fit, localization, modeling_deltaco_match
+from lerobot_deltaco.policies.deltaco_match import feature_matching, fit, modeling_deltaco_match
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import (
     DeltacoMatchConfig,
     MatchingSettings,
@@ -120,8 +120,8 @@ def use_short_fit(monkeypatch, steps=2, **settings):
         **settings,
     }
     monkeypatch.setattr(modeling_deltaco_match, "fit_feature_matching", fit_once)
-    monkeypatch.setattr(localization, "CropEncoder", ColorEncoder)
-    monkeypatch.setattr(localization, "MatchingSettings", functools.partial(MatchingSettings, **short))
+    monkeypatch.setattr(feature_matching, "CropEncoder", ColorEncoder)
+    monkeypatch.setattr(feature_matching, "MatchingSettings", functools.partial(MatchingSettings, **short))
 
 
 # Datasets

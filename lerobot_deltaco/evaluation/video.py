@@ -26,7 +26,7 @@ from lerobot_deltaco.evaluation.evaluate import run_episodes
 from lerobot_deltaco.evaluation.expert_demonstrations import expert_demonstration
 from lerobot_deltaco.evaluation.lerobot_env import check_policy_fits
 from lerobot_deltaco.policies.base.modeling import TaskConditionedPolicy
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
+from lerobot_deltaco.policies.deltaco_match.localization import PickPlace
 
 
 class Recording(NamedTuple):

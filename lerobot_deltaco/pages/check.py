@@ -38,10 +38,14 @@ from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments, list_of_numbers
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.findings import demonstrated_crop
 from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
-from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_mark
+from lerobot_deltaco.policies.deltaco_match.pictures import (
+    PICK_COLOR,
+    PLACE_COLOR,
+    demonstrated_crop,
+    draw_mark,
+)
 from lerobot_deltaco.policies.deltaco_match.proposals import N_OBJECTS
 from lerobot_deltaco.training.train import image_size_in_memory
 
@@ -118,7 +122,7 @@ class TrainingStart:
     @property
     def has_crops(self) -> bool:
         """Whether it is known how large the objects' crops are."""
-        return self.policy is not None and bool(self.policy.matching.fitted)
+        return self.policy is not None and bool(self.policy.localizer.matching.fitted)
 
 
 def check(arguments: CheckArguments) -> str:
@@ -224,7 +228,9 @@ def _read_episodes(
         if marks and start.has_crops:
             assert start.policy is not None
             assert start.bank is not None
-            pictures.append(picture_uri(demonstrated_crop(start.policy, start.bank[episode])))
+            given = start.policy.batch_demonstrations([[start.bank[episode]]], start.policy.step.device)
+            assert given is not None
+            pictures.append(picture_uri(demonstrated_crop(start.policy.localizer.matching, given)))
         text = f"{(last - first + 1) / meta.fps:.1f} s"
         if is_left_out[episode]:
             text += f", left out: {grasp}"
@@ -336,7 +342,7 @@ def _facts(
 
 def _finding(policy: DeltacoMatchPolicy) -> str:
     """Returns how often the object is found where that was not learned, and what to make of it."""
-    matching = policy.matching
+    matching = policy.localizer.matching
     if not bool(matching.fitted):
         return f"not tried with more than {_MAX_FITTED} episodes; training tells after its fit"
     n_right, n_all = matching.held_out.tolist()
@@ -399,9 +405,9 @@ def _estimates(start: TrainingStart, batch_size: int, steps: int) -> list[tuple[
     full_resolution = ends[:, 0] if bank.first_images is None else bank.first_images[:_DESCRIBED_EPISODES]
     middle = torch.zeros(len(ends), 2, device=ends.device)
     began = time.perf_counter()
-    policy.matching.describe(ends.float() / 255, full_resolution, middle, middle)
+    policy.localizer.matching.describe(ends.float() / 255, full_resolution, middle, middle)
     per_crop = (time.perf_counter() - began) / len(ends)
-    fit = min(len(bank), policy.matching.settings.max_episodes) * N_OBJECTS * per_crop
+    fit = min(len(bank), policy.localizer.matching.settings.max_episodes) * N_OBJECTS * per_crop
     total = start.reading + fit + steps * per_step
     memory = start.bytes + psutil.Process().memory_info().rss
     return [

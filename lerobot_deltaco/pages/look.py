@@ -27,9 +27,14 @@ from lerobot_deltaco.pages.player import Player
 from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.findings import compared_crops, describe_words
+from lerobot_deltaco.policies.deltaco_match.findings import describe_words
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
-from lerobot_deltaco.policies.deltaco_match.pictures import PICK_COLOR, PLACE_COLOR, draw_localization
+from lerobot_deltaco.policies.deltaco_match.pictures import (
+    PICK_COLOR,
+    PLACE_COLOR,
+    compared_crops,
+    draw_localization,
+)
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -88,7 +93,7 @@ def look(arguments: LookArguments) -> str:
             if held_out
             else "These say little if the policy was trained on the episodes."
         )
-        lines.append(f"Its fit: {loaded.policy.matching.report}.")
+        lines.append(f"Its fit: {loaded.policy.localizer.matching.report}.")
     return "\n".join([*lines, f"See {page}."])
 
 
@@ -174,13 +179,13 @@ def _dataset_episodes(
             ends = np.stack([_image(dataset, row, camera) for row in data.spans[partner]])
         scene = _image(dataset, data.spans[episode][0], camera)
         picture = picture_uri(draw_localization(scene, ends, localization, recorded))
-        sure = (
-            f"{100 * localization.confidence.item():.0f} % sure of the object. {describe_words(policy, task)}"
-        )
+        matching = policy.localizer.matching
+        words = describe_words(matching, task)
+        sure = f"{100 * localization.confidence.item():.0f} % sure of the object. {words}"
         is_right = all(rights) if rights else None
         crops = [
             picture_uri(crop)
-            for crop in compared_crops(policy, observation[camera].to(config.device), *given)
+            for crop in compared_crops(matching, localization, observation[camera].to(config.device), *given)
         ]
         lines = [f"{where}.", sure]
         yield EpisodeView(task, "", [], is_right, headline, lines, picture, None, crops), rights

@@ -144,7 +144,7 @@ class Player:
         picture, words = None, ""
         if recording.localization is not None:
             picture = picture_uri(draw_localization(recording.frames[0], ends, recording.localization))
-            words = describe_words(self._loaded.policy, sentence)
+            words = describe_words(self._loaded.policy.localizer.matching, sentence)
         verdict = judge(recording, sentence, get_task(choice.demo_task) if demonstrations else None, words)
         return EpisodeView(
             instruction=sentence,

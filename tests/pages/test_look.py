@@ -26,8 +26,8 @@ from lerobot_deltaco.pages.html import EpisodeView, render
 from lerobot_deltaco.pages.look import look
 from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.pages.videos import encode_video
-from lerobot_deltaco.policies.deltaco_match import findings
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
+from lerobot_deltaco.policies.deltaco_match import pictures
+from lerobot_deltaco.policies.deltaco_match.localization import PickPlace
 from lerobot_deltaco.policies.deltaco_match.pictures import (
     PICK_COLOR,
     PLACE_COLOR,
@@ -43,9 +43,8 @@ def found_at(pick, place, by_demonstration=(True, True), size=24):
         maps[0, n, row, column] = 20
     locations = (torch.tensor([[pick, place]]) + 0.5) / size * 2 - 1
     attention = maps.flatten(2).softmax(2).view_as(maps)
-    return PickPlace(
-        locations, torch.zeros(1), maps, attention, by_demonstration, torch.ones(1), locations[:, 0]
-    )
+    sure = (torch.ones(1), torch.ones(1))
+    return PickPlace(locations, torch.zeros(1), maps, attention, by_demonstration, *sure, locations[:, 0])
 
 
 def test_maps_are_drawn_at_the_scenes_own_resolution():
@@ -142,7 +141,7 @@ def test_the_page_of_a_dataset_counts_the_right_pick_locations(tmp_path, monkeyp
 def test_the_crops_on_the_page_are_those_that_were_compared(tmp_path, monkeypatch):
     write_robot_dataset(tmp_path / "data", [4, 4])
     loaded = load_tiny_policy(tmp_path)
-    matching = loaded.policy.matching
+    matching = loaded.policy.localizer.matching
     compared, chosen, drawn = [], [], []
     encoder, find = matching.encoder, matching.find
     # The gripper does not close at a crop's center.
@@ -150,7 +149,7 @@ def test_the_crops_on_the_page_are_those_that_were_compared(tmp_path, monkeypatc
     monkeypatch.setattr(look_module, "load_conditioned", lambda _: loaded)
     monkeypatch.setattr(matching, "encoder", lambda *crops: compared.append(crops) or encoder(*crops))
     monkeypatch.setattr(matching, "find", lambda *args: chosen.append(find(*args)) or chosen[-1])
-    monkeypatch.setattr(findings, "draw_crop", lambda *crop: drawn.append(crop) or draw_crop(*crop))
+    monkeypatch.setattr(pictures, "draw_crop", lambda *crop: drawn.append(crop) or draw_crop(*crop))
     look(LookArguments("policy", str(tmp_path / "data"), 2, tmp_path / "out"))
     assert len(compared) == len(drawn) == 2 * len(chosen) == 4
     for shown, own in zip(compared[::2], drawn[::2], strict=True):

@@ -19,7 +19,7 @@ from lerobot_deltaco.evaluation.video import Recording
 from lerobot_deltaco.pages.player import BOTH, DEMONSTRATION, INSTRUCTION, Choice, Player
 from lerobot_deltaco.pages.verdict import describe_outcome, judge
 from lerobot_deltaco.policies.deltaco_match.findings import describe_words
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import PickPlace
+from lerobot_deltaco.policies.deltaco_match.localization import PickPlace
 
 # The verdict
 
@@ -49,6 +49,7 @@ def recording(name, bin_, pick=None, place="green", end=POSITIONS):
             torch.zeros(1, 2, 4, 4),
             None,
             (False, False),
+            torch.ones(1),
             torch.ones(1),
             locations[:, 0],
         )
@@ -137,11 +138,10 @@ def test_the_outcome_says_what_was_moved_and_what_left_the_tray():
 
 
 def test_words_are_shown_as_the_policy_reads_them():
-    policy = SimpleNamespace(
-        matching=SimpleNamespace(understood=lambda _: [("blue", "blue"), ("goblett", "goblet")]),
-        config=SimpleNamespace(known_words=["blue", "goblet", "bin"]),
+    matching = SimpleNamespace(
+        understood=lambda _: [("blue", "blue"), ("goblett", "goblet")], vocabulary=["blue", "goblet", "bin"]
     )
-    assert describe_words(policy, "Blue goblett, shiny bin!") == (
+    assert describe_words(matching, "Blue goblett, shiny bin!") == (
         "Words for the object: “blue”, “goblett”. Read “goblett” as “goblet”. Unknown words: “shiny”."
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
+from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching
 from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion, estimate_motion
 
 

@@ -15,12 +15,12 @@ from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
 from lerobot_deltaco.policies.deltaco_match import fit
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder, cut_crops
-from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching, fit_matching_head
-from lerobot_deltaco.policies.deltaco_match.localization import (
+from lerobot_deltaco.policies.deltaco_match.feature_matching import (
     Candidates,
     FeatureMatching,
     GraspHeightEstimator,
 )
+from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching, fit_matching_head
 from lerobot_deltaco.policies.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
 from lerobot_deltaco.policies.deltaco_match.proposals import N_OBJECTS, Background
 from lerobot_deltaco.policies.deltaco_match.words import encode_words, understand, vocabulary_of

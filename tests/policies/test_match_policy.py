@@ -27,7 +27,8 @@ from small_policies import (
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.normalization import StateLimits
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy, PickPlace
+from lerobot_deltaco.policies.deltaco_match.localization import PickPlace
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 
 pytestmark = pytest.mark.usefixtures("short_fit")
 
@@ -68,7 +69,8 @@ def trained(table):
     with pytest.MonkeyPatch.context() as patch:
         use_short_fit(patch, 40, matching_batch=32)
         patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._PLACE_FRACTION", 1.0)
-        patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._SHIFT_PADDING", 1)
+        patch.setattr("lerobot_deltaco.policies.deltaco_match.localization._SHIFT_PADDING", 1)
+        torch.manual_seed(0)
         policy, before, _ = small_policy(table, "deltaco_match")
         optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
         rng = np.random.default_rng(0)
@@ -209,11 +211,11 @@ def test_validation_loss_of_held_out_episodes_is_that_at_their_recorded_location
 def test_fitted_feature_matching_is_not_fitted_again(make, table, tmp_path):
     policy = make()
     policy.save_pretrained(tmp_path)
-    before = copy.deepcopy(policy.matching.state_dict())
+    before = copy.deepcopy(policy.localizer.matching.state_dict())
     resumed = DeltacoMatchPolicy.from_pretrained(tmp_path, dataset_meta=table.meta).train()
     resumed.seed = 5
     resumed(batch_of(table, [0]))
-    after = resumed.matching.state_dict()
+    after = resumed.localizer.matching.state_dict()
     assert all(torch.equal(before[name], value) for name, value in after.items())
     assert resumed.config.known_words == ["blue", "left", "move", "object", "red", "right", "the"]
 
@@ -232,7 +234,8 @@ def test_words_of_tasks_that_are_not_trained_on_are_unknown(table):
     dataset = LeRobotDataset(table.repo_id, root=table.root, episodes=of_red)
     policy.fit(TrainingData.read(DatasetEpisodes(dataset, of_red), policy.config.demonstration_format))
     assert policy.config.known_words == ["", "left", "move", "object", "red", "", "the"]
-    blue, unheard = policy.matching.novelty(["move the blue object left", "move the mauve object left"])
+    sentences = ["move the blue object left", "move the mauve object left"]
+    blue, unheard = policy.localizer.matching.novelty(sentences)
     assert blue == unheard
 
 
@@ -426,6 +429,7 @@ def test_replay_repeats_the_demonstration_in_its_own_scene(table):
         None,
         None,
         (True, False),
+        torch.ones(1),
         torch.ones(1),
         located.locations[:1, 0],
     )

@@ -85,7 +85,7 @@ def test_an_episode_of_the_training_is_replayed(table, trained, tmp_path):
 
 def test_a_photo_has_the_descriptor_of_the_object_in_it(table, trained):
     policy, before = trained
-    matching = policy.matching
+    matching = policy.localizer.matching
     photo = (255 * table[0]["observation.image"]).round().byte()
     other = first_images(table, before, [7])
     seen = []

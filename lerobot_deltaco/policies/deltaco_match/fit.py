@@ -15,8 +15,8 @@ from tqdm import tqdm
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.augmentation import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
-from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
-from lerobot_deltaco.policies.deltaco_match.matching import Crops, MatchingHead, word_scores
+from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching
+from lerobot_deltaco.policies.deltaco_match.matching_head import Crops, MatchingHead, word_scores
 from lerobot_deltaco.policies.deltaco_match.proposals import (
     MAX_MEASURED,
     MAX_REMEMBERED,

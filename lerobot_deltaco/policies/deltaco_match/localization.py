@@ -1,433 +1,239 @@
-r"""Finds the object that a task asks for among the objects that could be grasped.
+"""Finds where to pick and where to place, once, at the start of an episode.
 
-    scene                          demonstration's first image          instruction
-      |                                    |                                |
-    proposals                       where it grasped                  weighted words
-      |                                    |                                |
-    crops -> EfficientNet-Lite0       crop -> EfficientNet-Lite0            |
-      |      (frozen), colors              |                                |
-    descriptors -------- cosines ------ descriptors                         |
-      |                    |                                                |
-    log probability of each word of the vocabulary ------- words of the instruction
-                           |                                                |
-                           +------------ sum: score of a proposal ----------+
-
-There are two descriptors. The instance descriptor tells whether a proposal is the demonstrated object. The
-category descriptor measures similarity of color and shape, which tasks by color or shape need, and is used to
-the extent that the first finds no match.
-
-Called once at the start of an episode. What is learned is fitted before the policy is trained, to the first
-images of the training episodes: see `fit`.
+Feature matching chooses what to pick among proposals, by the demonstration and by the instruction's words.
+The place network finds where to place it, by the instruction, or by the demonstration if there is none.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
-from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
-from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder
-from lerobot_deltaco.policies.deltaco_match.matching import (
-    HIDDEN_DIM,
-    Crops,
-    MatchingHead,
-    uniform,
-    word_scores,
+from lerobot_deltaco.data.object_prompts import ObjectPrompt
+from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.policies.base.augmentation import change_colors, random_shifts, shift_images
+from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers
+from lerobot_deltaco.policies.base.losses import location_loss
+from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching
+from lerobot_deltaco.policies.deltaco_match.place import (
+    TARGET_DIM,
+    DemonstrationAttention,
+    PlaceNetwork,
+    peak_locations,
 )
-from lerobot_deltaco.policies.deltaco_match.proposals import (
-    Background,
-    changed_areas,
-    demonstrated_centers,
-)
-from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner, correlations, cut_templates
-from lerobot_deltaco.policies.deltaco_match.words import (
-    UNKNOWN_WORD,
-    WordWeights,
-    encode_words,
-    understand,
-    words_of,
-)
+from lerobot_deltaco.policies.deltaco_match.prompts import choose_prompted, describe_prompts
+from lerobot_deltaco.policies.deltaco_match.words import INSTRUCTION_DIM, InstructionEncoder, encode_words
 from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
 
-logger = logging.getLogger(__name__)
-
-_MIN_PROBABILITY = 1e-9
-_MIN_NOVELTY = 0.01  # of an object, below which templates are not compared with proposals
-_NOVEL = 0.5  # novelty of an object above which its grasp is taken to look like the demonstrated one
-_MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
-# Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
-_APPEARANCE_STD = 0.7
+_SHIFT_PADDING = 4  # px, of the random shifts of images in training
+_P_PLACE_BY_DEMONSTRATION = 0.25  # of samples in training; in the others, the instruction says where
+_MIN_ATTENTION = 1e-9
 
 
-class Candidates(NamedTuple):
-    """What could be picked.
+class PickPlace(NamedTuple):
+    """Where to pick and place in the scenes of a batch, and why.
 
     Attributes:
-        locations: The proposals, (batch, n, 2) in -1..1; anywhere where there is none.
-        log_probabilities: How likely each is what the task asks for, (batch, n). What they lack to 1 is the
-            probability that it is none of them.
-        heights: Height offset of a grasp of each, (batch, n).
-        radius: Distance from a candidate within which others are of the same object.
-        map_std: Standard deviation of a candidate in a map, in cells.
+        locations: Pick and place, (batch, 2, 2) in -1..1.
+        heights: Height offset of each grasp, (batch,).
+        maps: Pick and place maps over the scenes, as logits (batch, 2, h, w).
+        attention: Maps of what the (first) demonstration moved and where it was put, (batch, 2, h, w); None
+            without demonstrations.
+        by_demonstration: Whether the demonstration decided on the pick and on the place location. Otherwise,
+            the attention is meaningless.
+        confidence: Probability of the object at the pick location among what is proposed, (batch,).
+        place_confidence: Probability of the place map within an object's radius of the place location,
+            (batch,).
+        proposal: The proposal that was chosen, (batch, 2) in -1..1.
+        demonstrated: Center of what the (first) demonstration grasped, in its first image, (batch, 2); None
+            without demonstrations.
+        demonstrated_grasp: Where it grasped, (batch, 2); NaN where that is not known.
+        camera_motion: How far the camera has moved since the training, by the first scene; None if it is not
+            known.
     """
 
     locations: Tensor
-    log_probabilities: Tensor
     heights: Tensor
-    radius: float
-    map_std: float = MatchingSettings.map_std
-
-    @property
-    def best(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Location (batch, 2) and height offset (batch,) of the likeliest, and its object's probability."""
-        best = self.log_probabilities.argmax(dim=1)
-        rows = torch.arange(len(best), device=best.device)
-        chosen = self.locations[rows, best]
-        of_object = (self.locations - chosen[:, None]).norm(dim=2) < self.radius
-        probability = (self.log_probabilities.exp() * of_object).sum(dim=1)
-        return chosen, probability, self.heights[rows, best]
-
-    def map(self, shape: Sequence[int]) -> Tensor:
-        """Returns the candidates as maps of a shape (h, w), as logits (batch, h, w)."""
-        height, width = shape
-        std = 2 * self.map_std / torch.tensor([width, height], device=self.locations.device)
-        each = gaussian_maps(self.locations, height, width, std)
-        return (self.log_probabilities.exp()[..., None, None] * each).sum(dim=1).clamp_min(1e-9).log()
+    maps: Tensor
+    attention: Tensor | None
+    by_demonstration: tuple[bool, bool]
+    confidence: Tensor
+    place_confidence: Tensor
+    proposal: Tensor
+    demonstrated: Tensor | None = None
+    demonstrated_grasp: Tensor | None = None
+    camera_motion: CameraMotion | None = None
 
 
-class Described(NamedTuple):
-    """What demonstrations grasped.
+class DemonstrationBatch(NamedTuple):
+    """Demonstrations of a batch of tasks, as many of each.
 
     Attributes:
-        centers: Centers of the objects, (batch, 2) in -1..1.
-        descriptors: Descriptors of the objects, (batch, descriptor).
-        templates: Surroundings of the grasps, (batch, 3, h, w); NaN where the grasp is not known, or where
-            templates are not used.
+        ends: First and last images, (batch, demonstrations, 2, 3, H, W) in 0..1.
+        first_images: First images at the camera's own resolution, (batch, demonstrations, 3, H', W') uint8.
+        picks: Locations of the grasps, (batch, demonstrations, 2) in -1..1; NaN where they are not known.
+        heights: Height offsets of the grasps, (batch, demonstrations); NaN where they are not known.
     """
 
-    centers: Tensor
-    descriptors: Tensor
-    templates: Tensor
+    ends: Tensor
+    first_images: Tensor
+    picks: Tensor
+    heights: Tensor
 
 
-class FeatureMatching(nn.Module):
-    """Finds what demonstrations moved, and what words describe, in scenes.
-
-    It stays in evaluation mode, and receives no gradient while a policy is trained.
+class Localizer(nn.Module):
+    """Finds where to pick and place in the first images of episodes.
 
     Args:
         vocabulary: Known words.
-        settings: Constants of the method; by default, those of `MatchingSettings`.
 
     Attributes:
-        encoder: Describes crops of images.
-        fitted: Whether it has been fitted, () bool.
-        sharpness: Factor of the scores, (), and
-        error_rate: the rate of errors that no score excludes, (), by held-out episodes.
-        held_out: Number of held-out episodes in which the object was found, and of all, (2,) int64.
-        n_episodes: Number of training episodes, () int64.
+        matching: Finds what to pick. It is fitted before the others are trained.
+        attention: Finds what demonstrations moved, and where to.
+        place: Finds where to place it.
+        instruction_encoder: Embeds instructions for `place`.
     """
 
-    fitted: Tensor
-    sharpness: Tensor
-    error_rate: Tensor
-    held_out: Tensor
-    n_episodes: Tensor
-
-    def __init__(self, vocabulary: Sequence[str], settings: MatchingSettings | None = None) -> None:
+    def __init__(self, vocabulary: Sequence[str]) -> None:
         super().__init__()
-        self.vocabulary = list(vocabulary)
-        self.settings = settings or MatchingSettings()
-        self.background = Background()
-        self.refine = GraspRefiner()
-        self.encoder = CropEncoder()
-        self.compare = MatchingHead(len(vocabulary), self.encoder.feature_dim, self.encoder.color_dim)
-        self.word_weights = WordWeights(len(vocabulary))
-        self.grasp_height = GraspHeightEstimator(HIDDEN_DIM)
-        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("sharpness", torch.ones(()))
-        self.register_buffer("error_rate", torch.zeros(()))
-        self.register_buffer("held_out", torch.zeros(2, dtype=torch.int64))
-        self.register_buffer("n_episodes", torch.zeros((), dtype=torch.int64))
-        self.requires_grad_(False)
-        self.eval()
-
-    def train(self, mode: bool = True) -> FeatureMatching:
-        """Stays in evaluation mode."""
-        return super().train(False)
+        self.matching = FeatureMatching(vocabulary)
+        self.attention = DemonstrationAttention()
+        self.place = PlaceNetwork(INSTRUCTION_DIM)
+        self.instruction_encoder = InstructionEncoder(len(vocabulary))
 
     @torch.no_grad()
-    def find(
+    def forward(
         self,
         scenes: Tensor,
-        instructions: Sequence[str],
-        described: Tensor | None,
-        demonstrated: Tensor | None,
-        templates: Tensor | None = None,
-        novelty: Tensor | None = None,
-    ) -> Candidates:
-        """Finds what tasks ask for.
-
-        Args:
-            scenes: First images of episodes at full resolution, (batch, 3, H, W) in 0..1.
-            instructions: Instruction of each sample, "" for none.
-            described: Descriptors of the demonstrated objects, (batch, descriptor); None without
-                demonstrations.
-            demonstrated: Height offsets of the demonstrated grasps, (batch,), NaN where they are not known;
-                None without demonstrations.
-            templates: Surroundings of the demonstrated grasps, (batch, demonstrations, 3, h, w). See
-                `Described`.
-            novelty: How likely each demonstrated object is new to the training, (batch,). See `novelty`.
-        """
-        with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
-            locations = self.background(scenes)
-            crops = self.compare(self.features(scenes, locations))
-            words = encode_words(instructions, self.vocabulary).to(scenes.device)
-            scores, similarity = self.scores(crops, words, described)
-            if templates is not None and novelty is not None and bool((novelty > _MIN_NOVELTY).any()):
-                alike = self._correlations(scenes, locations, templates)
-                scores = scores + self.settings.template_weight * novelty[:, None] * alike
-            if demonstrated is None:
-                demonstrated = torch.full_like(scores[:, 0], torch.nan)
-            heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
-            log_p = (self.sharpness * scores).masked_fill(~crops.exists, -torch.inf).log_softmax(dim=1)
-            # The object may be none of these, however few they are.
-            p = torch.lerp(log_p.exp(), crops.exists / crops.exists.shape[1], self.error_rate)
-            return Candidates(
-                locations.nan_to_num(), p.log(), heights, self.grasp_radius, self.settings.map_std
-            )
-
-    def scores(self, crops: Crops, words: Tensor, described: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Scores the crops of proposals by demonstrations and words.
-
-        Args:
-            crops: The crops.
-            words: Indices of the words of the instructions, (batch, length).
-            described: Descriptors of the demonstrated objects, (batch, descriptor); None without
-                demonstrations.
-
-        Returns:
-            Log probabilities, up to a constant, and similarities to the demonstrated objects, (batch, n).
-        """
-        settings, weights = self.settings, self.word_weights(words)
-        scores = word_scores(crops.words, words, weights)
-        matches = similarity = torch.zeros_like(scores)
-        if described is not None:
-            # How well known words describe the object. A new noun leaves the demonstration in charge.
-            p_unknown = self._p_unknown(words)
-            p_described = (1 - p_unknown) * (weights * (words > UNKNOWN_WORD)).amax(dim=1)
-            matches, similarity = self.compare.match(
-                crops, described, settings.sharpness, settings.p_other_object * p_described
-            )
-            scores = (1 - p_unknown)[:, None] * scores
-        by_words = (scores + crops.objectness).masked_fill(~crops.exists, -torch.inf).softmax(dim=1)
-        by_words = torch.lerp(by_words, uniform(crops.exists), settings.p_misdescribed)
-        return matches + by_words.clamp_min(_MIN_PROBABILITY).log(), similarity
-
-    def _p_unknown(self, words: Tensor) -> Tensor:
-        """Returns how likely an unknown word describes the object, (batch,)."""
-        return (self.word_weights(words) * (words == UNKNOWN_WORD)).amax(dim=1)
-
-    def _correlations(self, scenes: Tensor, locations: Tensor, templates: Tensor) -> Tensor:
-        """Returns how well the surroundings of proposals agree with templates, (batch, n); 0 for none."""
-        n_each, flat = locations.shape[1], locations.nan_to_num().flatten(0, 1)
-        images, repeated = (part.repeat_interleave(n_each, 0) for part in (scenes, templates))
-        reach = self.settings.template_reach
-        found = correlations(images, flat, self.object_sizes(flat), repeated, reach)
-        return found.flatten(1).amax(dim=1).view(-1, n_each)
-
-    def camera_motion(self, scene: Tensor) -> CameraMotion | None:
-        """Returns how far the camera has moved since the training, and warns if it has.
-
-        Args:
-            scene: First image of an episode, (3, H, W) in 0..1, at full resolution.
-
-        Returns:
-            The motion; None if it is not known.
-        """
-        motion = self.background.camera_motion(scene)
-        if motion is not None and motion.is_significant:
-            height, width = scene.shape[-2:]
-            logger.warning(
-                "The camera seems to have moved since the training: the picture is off by %s. Locations are "
-                "those of the training's camera. Move it back, or train on episodes of where it is now.",
-                motion.describe(width, height),
-            )
-        return motion
-
-    def grasps(
-        self,
         full_resolution: Tensor,
-        proposals: Tensor,
-        templates: Tensor | None = None,
-        novelty: Tensor | None = None,
+        instructions: Sequence[str],
+        given: DemonstrationBatch | None,
+        prompts: Sequence[ObjectPrompt] = (),
+    ) -> PickPlace:
+        """Finds where to pick and place.
+
+        Args:
+            scenes: First images of episodes, (batch, 3, H, W) in 0..1, as small as the policy's.
+            full_resolution: The same at the camera's own resolution, (batch, 3, H', W') in 0..1.
+            instructions: Instruction of each sample; an empty string leaves it out.
+            given: Demonstrations; None without.
+            prompts: What shows the object of each sample instead; empty for nothing.
+
+        Raises:
+            ValueError: A sample has neither an instruction nor a demonstration.
+        """
+        matching = self.matching
+        camera_motion = matching.camera_motion(full_resolution[0])  # warns
+        by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
+        attention = last = centers = descriptors = heights = templates = None
+        if prompts:
+            descriptors = describe_prompts(matching, prompts, full_resolution)
+        elif given is None:
+            if not bool(by_instruction.all()):
+                raise UserError("Neither a demonstration nor an instruction is given. Pass one of them.")
+        else:
+            n_each, ends = given.ends.shape[1], given.ends.flatten(0, 1)
+            attentions = self.attention(ends)
+            attended = peak_locations(attentions.clamp_min(_MIN_ATTENTION).log())[:, 0]
+            described = matching.describe(
+                ends, given.first_images.flatten(0, 1), given.picks.flatten(0, 1), attended
+            )
+            descriptors = described.descriptors.unflatten(0, (-1, n_each)).mean(dim=1)
+            templates = described.templates.unflatten(0, (-1, n_each))
+            heights = given.heights.nanmean(dim=1)
+            # Of several demonstrations, the first says where.
+            centers, attention, last = described.centers[::n_each], attentions[::n_each], ends[::n_each, 1]
+        novelty = matching.novelty(instructions)
+        candidates = matching.find(full_resolution, instructions, descriptors, heights, templates, novelty)
+        if prompts:
+            candidates = choose_prompted(candidates, prompts)
+        proposal, confidence, height = candidates.best
+        pick = matching.grasps(full_resolution, proposal, templates, novelty)
+        target = None if attention is None or last is None else self.place.target(last, attention[:, 1])
+        place_maps = self._place_maps(scenes, by_instruction, instructions, target)
+        place = peak_locations(place_maps[:, None])[:, 0]
+        grid = grid_of_centers(place_maps.shape[1], place_maps.shape[2], place_maps.device)
+        at_place = torch.cdist(place[:, None], grid)[:, 0] < matching.grasp_radius
+        return PickPlace(
+            locations=torch.stack([pick, place], dim=1),
+            heights=height,
+            maps=torch.stack([candidates.map(place_maps.shape[1:]), place_maps], dim=1),
+            attention=attention,
+            by_demonstration=(given is not None, given is not None and not bool(by_instruction.all())),
+            confidence=confidence,
+            place_confidence=(place_maps.flatten(1).softmax(dim=1) * at_place).sum(dim=1),
+            proposal=proposal,
+            demonstrated=centers,
+            demonstrated_grasp=None if given is None else given.picks[:, 0],
+            camera_motion=camera_motion,
+        )
+
+    def _place_maps(
+        self,
+        scenes: Tensor,
+        by_instruction: Tensor,
+        instructions: Sequence[str],
+        target: Tensor | None,
+        generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Returns where the gripper closes on proposed objects, (batch, 2) in -1..1.
+        """Returns maps of where to place the object, as logits (batch, h, w).
 
         Args:
-            full_resolution: First images of episodes, (batch, 3, H, W), uint8 or in 0..1.
-            proposals: A proposal in each, (batch, 2) in -1..1.
-            templates: Surroundings of demonstrated grasps, (batch, demonstrations, 3, h, w); None without
-                demonstrations. See `Described`.
-            novelty: How likely each object is new, (batch,). See `novelty`.
+            scenes: First images of episodes, (batch, 3, H, W) in 0..1.
+            by_instruction: Whether the instruction says where, and not the demonstration, (batch,) bool.
+            instructions: Instruction of each sample.
+            target: What `PlaceNetwork.target` says of demonstrations, (batch, TARGET_DIM); None without.
+            generator: In training, source of the draws of words that are left out, on the CPU.
         """
-        sizes = self.object_sizes(proposals)
-        expected = self.refine(full_resolution, proposals, sizes)
-        if templates is None or novelty is None or not bool((novelty > _NOVEL).any()):
-            return expected
-        alike = self.refine(full_resolution, proposals, sizes, templates)
-        return torch.where((novelty > _NOVEL)[:, None], alike, expected)
+        words = encode_words(instructions, self.matching.vocabulary).to(scenes.device)
+        instruction = torch.where(by_instruction[:, None], self.instruction_encoder(words, generator), 0.0)
+        if target is None:
+            target = torch.zeros(len(scenes), TARGET_DIM, device=scenes.device)
+        return self.place(scenes, instruction, torch.where(by_instruction[:, None], 0.0, target))
 
-    def novelty(self, instructions: Sequence[str]) -> Tensor:
-        """Returns how likely demonstrated objects are new to the training, (batch,) in 0..1.
-
-        They are if an unknown word describes them; and without an instruction, after few training episodes.
-        """
-        words = encode_words(instructions, self.vocabulary).to(self.fitted.device)
-        of_few = (self.n_episodes <= self.settings.few_episodes).to(self.sharpness)
-        is_empty = torch.tensor([not text for text in instructions], device=self.fitted.device)
-        return torch.where(is_empty, of_few, self._p_unknown(words))
-
-    @property
-    def report(self) -> str:
-        """How often the object was found where that was not learned."""
-        n_right, n_all = self.held_out.tolist()
-        if not n_all:
-            return "too few episodes to hold some out"
-        found = f"object found in {n_right} of {n_all} held-out episodes"
-        if not bool(self.refine.is_used):
-            return found
-        before, after = (50 * self.refine.errors).tolist()
-        return f"grasps located to {after:.1f} % of the image's side (proposals: {before:.1f} %), {found}"
-
-    @property
-    def grasp_radius(self) -> float:
-        """Distance from a grasp within which a proposal stands for the grasped object, in -1..1."""
-        return self.settings.grasp_error + self.settings.grasp_size * float(self.background.object_size)
-
-    @torch.no_grad()
-    def describe(self, ends: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor) -> Described:
-        """Describes what was grasped in demonstrations.
-
-        An object that was pushed before it was grasped, as by an attempt that failed, is no longer where it
-        was in the first image: no proposal is near the grasp. The attention then tells where it was.
+    def losses(
+        self,
+        scenes: Tensor,
+        places: Tensor,
+        instructions: Sequence[str],
+        ends: Tensor,
+        demonstrated: Tensor,
+        changes: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """Computes the losses of the place maps, and of the attention to demonstrations.
 
         Args:
-            ends: First and last images, (batch, 2, 3, H, W) in 0..1, as small as the policy's.
-            full_resolution: The first images at full resolution, (batch, 3, H', W').
-            grasps: Locations of the grasps, (batch, 2) in -1..1; NaN where they are not known.
-            attended: Locations of what moved, by the attention, (batch, 2) in -1..1.
-        """
-        with torch.autocast(ends.device.type, enabled=False):
-            centers, is_near = self.demonstrated(ends, full_resolution, grasps, attended)
-            features = self.features(full_resolution, centers[:, None])
-            shown = torch.where(is_near[:, None], grasps, torch.nan)
-            templates = cut_templates(full_resolution, shown, self.object_sizes(grasps))
-            if not bool(self.refine.uses_templates):
-                templates = torch.full_like(templates, torch.nan)
-            return Described(centers, self.compare(features).descriptors[:, 0], templates)
-
-    def demonstrated(
-        self, ends: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Finds what was grasped in demonstrations. See `describe` for the arguments.
+            scenes: First images of episodes, (batch, 3, H, W) uint8.
+            places: Their place locations, (batch, 2) in -1..1.
+            instructions: Their instructions.
+            ends: First and last images of other episodes of the tasks, (batch, 2, 3, H, W) uint8.
+            demonstrated: Their pick and place locations, (batch, 2, 2) in -1..1.
+            changes: Changes of the colors that the attention sees, (batch, 3, 3), on the CPU.
+            generator: Source of the draws, on the CPU.
 
         Returns:
-            The centers of the objects, (batch, 2) in -1..1, and whether the grasp was there, (batch,) bool.
+            Losses of the place and of the attention, (batch, 2).
         """
-        masks = self.background.masks(full_resolution)
-        proposed = self.background.objects(masks, full_resolution)
-        changed = self.background.objects(masks * changed_areas(ends), full_resolution)
-        usual_error = float(self.refine.errors[0])
-        return demonstrated_centers(proposed, changed, grasps, attended, self.grasp_radius, usual_error)
-
-    @torch.no_grad()
-    def understood(self, instruction: str) -> list[tuple[str, str]]:
-        """Returns the words of an instruction that describe the object, and what each is understood as."""
-        words = encode_words([instruction], self.vocabulary).to(self.fitted.device)
-        meanings = zip(words_of(instruction), understand(instruction, self.vocabulary), strict=True)
-        weights = self.word_weights(words)[0].tolist()
-        return [
-            (word, meant)
-            for (word, meant), weight in zip(meanings, weights, strict=False)
-            if meant is not None and weight > self.settings.shown_word_weight
-        ]
-
-    def features(self, images: Tensor, locations: Tensor, sizes: Tensor | None = None) -> Tensor:
-        """Returns features of crops, (batch, n, features).
-
-        Args:
-            images: Images at full resolution, (batch, 3, H, W), uint8 or in 0..1.
-            locations: Centers of the crops, (batch, n, 2) in -1..1.
-            sizes: Sides of the crops as fractions of the image's, (batch, n); by default, `crop_sizes`.
-        """
-        return self.encoder(images, locations, self.crop_sizes(locations) if sizes is None else sizes)
-
-    def crop_sizes(self, locations: Tensor) -> Tensor:
-        """Returns the sides of crops at locations (..., 2), as fractions of the image's, (...)."""
-        return self.settings.crop_factor * self.object_sizes(locations)
-
-    def object_sizes(self, locations: Tensor) -> Tensor:
-        """Returns the diameters of objects at locations (..., 2), as fractions of the image's side."""
-        # Not as a product of matrices, which autocast would round.
-        return self.background.object_size * (locations * self.background.perspective).sum(dim=-1).exp()
+        scenes, places = _augment(scenes.float() / 255, places[:, None], generator)
+        ends, demonstrated = _augment(ends.float() / 255, demonstrated, generator)
+        attention = self.attention(change_colors(ends, changes))
+        draws = torch.rand(len(scenes), generator=generator)
+        by_instruction = (draws >= _P_PLACE_BY_DEMONSTRATION).to(scenes.device)
+        target = self.place.target(ends[:, 1], attention[:, 1])
+        maps = self._place_maps(scenes, by_instruction, instructions, target, generator)
+        # Without a loss of its own, the attention would take thousands of steps.
+        log_attention = attention.clamp_min(_MIN_ATTENTION).log()
+        attention_losses = location_loss(log_attention, demonstrated).sum(dim=1, keepdim=True)
+        return torch.cat([location_loss(maps[:, None], places), attention_losses], dim=1)
 
 
-class GraspHeightEstimator(nn.Module):
-    """Estimates the height offset of a grasp, from the demonstration and from the object's appearance.
-
-    If the demonstration moved the same object, its height is the right one. If it moved another object of
-    that color or shape, the appearance of the object in the scene is a better guide. So two estimates are
-    averaged, weighted by the inverse of their variances. The variance of the estimate from the demonstration
-    is learned, from the similarity of the two objects. The variance of the other is fixed: training objects
-    have hardly any error to learn it from.
-
-    Args:
-        feature_dim: Size of the features of an object's appearance.
-    """
-
-    def __init__(self, feature_dim: int) -> None:
-        super().__init__()
-        self.by_appearance = nn.Linear(feature_dim, 1)
-        self.demonstration_error = nn.Sequential(nn.Linear(1, 16), nn.ReLU(inplace=True), nn.Linear(16, 1))
-
-    def losses(self, features: Tensor, similarity: Tensor, demonstrated: Tensor, heights: Tensor) -> Tensor:
-        """Returns the loss of each sample, (batch,).
-
-        Args:
-            features: Features of the objects to grasp, (batch, feature_dim).
-            similarity: Cosine of their descriptors with those of the demonstrated objects, (batch,).
-            demonstrated: Height offsets of the demonstrations, (batch,).
-            heights: Height offsets of the grasps, (batch,).
-        """
-        by_appearance = 0.5 * (self.by_appearance(features)[:, 0] - heights).square()
-        log_std = self._log_std(similarity)
-        error = (demonstrated - heights) * torch.exp(-log_std)
-        return by_appearance + 0.5 * error.square() + log_std
-
-    def forward(self, features: Tensor, similarity: Tensor, demonstrated: Tensor) -> Tensor:
-        """Estimates height offsets, (...).
-
-        Args:
-            features: Features of the objects to grasp, (..., feature_dim).
-            similarity: Cosine of their descriptors with those of the demonstrated objects, (...).
-            demonstrated: Height offsets of the demonstrations, (...); NaN where they are not known.
-        """
-        by_appearance = self.by_appearance(features)[..., 0]
-        variance = torch.exp(2 * self._log_std(similarity))
-        # Where they contradict each other, the object looks like none of the training, whose heights misled.
-        surprise = (demonstrated - by_appearance).square() / (_APPEARANCE_STD**2 + variance)
-        of_appearance = _APPEARANCE_STD**2 * surprise.clamp_min(1)
-        weight = of_appearance / (of_appearance + variance)
-        weight = torch.where(demonstrated.isnan(), 0.0, weight)
-        return weight * demonstrated.nan_to_num() + (1 - weight) * by_appearance
-
-    def _log_std(self, similarity: Tensor) -> Tensor:
-        """Returns the log standard deviation of the error of the demonstrations' estimate, (...)."""
-        log_std = self.demonstration_error(similarity[..., None])[..., 0]
-        return _MIN_LOG_STD + (_MAX_LOG_STD - _MIN_LOG_STD) * torch.sigmoid(log_std)
+def _augment(images: Tensor, locations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Shifts images (batch, ..., H, W) and locations in them (batch, n, 2) at random."""
+    shifts = random_shifts(len(images), _SHIFT_PADDING, generator)
+    height, width = images.shape[-2:]
+    moved = (shifts * 2 / torch.tensor([width, height])).to(locations.device)  # (batch, 2)
+    return shift_images(images, shifts, _SHIFT_PADDING), locations + moved[:, None]

@@ -24,6 +24,7 @@ have to wait for the place network, which learns beside it.
 import logging
 from collections.abc import Iterable, Sequence
 from itertools import chain, starmap
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -44,31 +45,20 @@ from lerobot_deltaco.lerobot_versions import PREDICTION
 from lerobot_deltaco.policies.base.augmentation import (
     change_colors,
     random_color_changes,
-    random_shifts,
-    shift_images,
 )
-from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.findings import predicted_boxes, report_findings
+from lerobot_deltaco.policies.deltaco_match.findings import describe_findings, predicted_boxes
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
-from lerobot_deltaco.policies.deltaco_match.localization import FeatureMatching
-from lerobot_deltaco.policies.deltaco_match.place import (
-    TARGET_DIM,
-    DemonstrationAttention,
-    PlaceNetwork,
-    peak_locations,
-)
-from lerobot_deltaco.policies.deltaco_match.prompts import choose_prompted, describe_prompts, prompts_of
+from lerobot_deltaco.policies.deltaco_match.localization import DemonstrationBatch, Localizer, PickPlace
+from lerobot_deltaco.policies.deltaco_match.pictures import write_picture
+from lerobot_deltaco.policies.deltaco_match.prompts import prompts_of
 from lerobot_deltaco.policies.deltaco_match.words import (
-    INSTRUCTION_DIM,
-    InstructionEncoder,
     encode_words,
     vocabulary_of,
 )
 from lerobot_deltaco.policies.geometry.calibration import MIN_EPISODES
-from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
 from lerobot_deltaco.policies.geometry.replay import Reference, Trajectory, TrajectoryReplay
 from lerobot_deltaco.policies.geometry.states import N_LOCATIONS, StateRegressor, TrainingLocations
 
@@ -79,39 +69,6 @@ _PLACE_FRACTION = 0.25  # of a batch's samples, which train the place network an
 # Training episodes up to which demonstrations are replayed, unless `acting` says otherwise.
 _MAX_REPLAYED = 200
 _HEIGHT_NOISE = 0.1  # of the policy network's heights, in standard deviations over the training episodes
-_SHIFT_PADDING = 4  # px, of the random shifts of the place network's images
-_P_PLACE_BY_DEMONSTRATION = 0.25  # of the place network's samples; in the others, the instruction says where
-_MIN_ATTENTION = 1e-9
-
-
-class PickPlace(NamedTuple):
-    """Where to pick and place in the scenes of a batch, and why.
-
-    Attributes:
-        locations: Pick and place, (batch, 2, 2) in -1..1.
-        heights: Height offset of each grasp, (batch,).
-        maps: Pick and place maps over the scenes, as logits (batch, 2, h, w).
-        attention: Maps of what the (first) demonstration moved and where it was put, (batch, 2, h, w); None
-            without demonstrations.
-        by_demonstration: Whether the demonstration decided on the pick and on the place location. Otherwise,
-            the attention is meaningless.
-        confidence: Probability of the object at the pick location among what is proposed, (batch,).
-        proposal: The proposal that was chosen, (batch, 2) in -1..1.
-        demonstrated: Center of what the (first) demonstration grasped, in its first image, (batch, 2); None
-            without demonstrations.
-        camera_motion: How far the camera has moved since the training, by the first scene; None if it is not
-            known.
-    """
-
-    locations: Tensor
-    heights: Tensor
-    maps: Tensor
-    attention: Tensor | None
-    by_demonstration: tuple[bool, bool]
-    confidence: Tensor
-    proposal: Tensor
-    demonstrated: Tensor | None = None
-    camera_motion: CameraMotion | None = None
 
 
 class RunningEpisode(NamedTuple):
@@ -122,21 +79,6 @@ class RunningEpisode(NamedTuple):
     network: PolicyNetwork
     reference: Reference | None
     replayed: Tensor
-
-
-class DemonstrationBatch(NamedTuple):
-    """Demonstrations of a batch of tasks.
-
-    Attributes:
-        ends: First and last images, (batch, demonstrations, 2, 3, H, W) in 0..1.
-        first_images: First images at the camera's own resolution, (batch, demonstrations, 3, H', W') uint8.
-        pick_states: The robot's states at the grasps, as in the dataset, (batch, demonstrations, state); NaN
-            where they are not known.
-    """
-
-    ends: Tensor
-    first_images: Tensor
-    pick_states: Tensor
 
 
 class DeltacoMatchPolicy(TaskConditionedPolicy):
@@ -186,10 +128,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         )
         self.state_regressor = StateRegressor(config.state_dim)
         self.replay = TrajectoryReplay(config.state_dim, config.action_feature.shape[0])
-        self.matching = FeatureMatching(config.known_words)
-        self.attention = DemonstrationAttention()
-        self.place = PlaceNetwork(INSTRUCTION_DIM)
-        self.instruction_encoder = InstructionEncoder(len(config.known_words))
+        self.localizer = Localizer(config.known_words)
         self.training_locations: TrainingLocations | None = None
         self._held_out: dict[int, TrainingLocations] = {}
         self._given_states: Tensor | None = None  # by `set_pick_and_place`
@@ -289,7 +228,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         changes: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """Computes the losses of the place maps, and of the attention to demonstrations.
+        """Returns the losses of the localizer, with another episode of each task as its demonstration.
 
         Args:
             episodes: Episodes of the samples, (batch,), as indices of the dataset.
@@ -304,22 +243,18 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert self.training_data is not None
         assert self.training_locations is not None
         bank, located = self.training_data.demonstrations, self.training_locations
-        rows, device = bank.episode_rows(episodes), episodes.device
+        rows = bank.episode_rows(episodes)
         others = bank.draw_other_episodes(episodes, tasks, generator)
+        losses = self.localizer.losses(
+            bank.frames[rows, 0],
+            located.locations[rows, 1],
+            instructions,
+            bank.frames[others][:, [0, -1]],
+            located.locations[others],
+            changes,
+            generator,
+        )
         both_grasp = located.has_grasp[rows] & located.has_grasp[others]
-        scenes, locations = _augment(
-            bank.frames[rows, 0].float() / 255, located.locations[rows, 1:], generator
-        )  # (batch, 3, H, W)
-        ends, demonstrated = _augment(
-            bank.frames[others][:, [0, -1]].float() / 255, located.locations[others], generator
-        )  # (batch, 2, 3, H, W)
-        attention = self.attention(change_colors(ends, changes))
-        by_instruction = (torch.rand(len(rows), generator=generator) >= _P_PLACE_BY_DEMONSTRATION).to(device)
-        maps = self._place_maps(scenes, by_instruction, instructions, ends[:, 1], attention[:, 1], generator)
-        # Without a loss of its own, the attention would take thousands of steps.
-        log_attention = attention.clamp_min(_MIN_ATTENTION).log()
-        attention_losses = location_loss(log_attention, demonstrated).sum(dim=1, keepdim=True)
-        losses = torch.cat([location_loss(maps[:, None], locations), attention_losses], dim=1)
         return torch.where(both_grasp[:, None], losses, 0.0)
 
     # Acting
@@ -329,7 +264,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         action = super().select_action(batch, **options)
         if PREDICTION is None or self.localization is None:
             return action
-        return {ACTION: action, PREDICTION: predicted_boxes(self, self.localization)}
+        camera = self.config.cameras[0]
+        boxes = predicted_boxes(self.localizer.matching, self.localization, camera)
+        return {ACTION: action, PREDICTION: boxes}
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
@@ -352,7 +289,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             self._start(RunningEpisode(instructions, localization, network, reference, replayed))
             if len(instructions) == 1:
                 shown = demonstrations[0][0] if demonstrations[0] else None
-                report_findings(self, batch[self.config.cameras[0]][0], instructions[0], shown)
+                self._report_findings(batch[self.config.cameras[0]][0], instructions[0], shown)
         episode: RunningEpisode = self._episode
         replay = None
         if episode.reference is not None:
@@ -366,6 +303,26 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if replay is not None:
             actions = torch.where(episode.replayed[:, None, None], replay[:, None], actions[:, :1])
         return actions
+
+    def _report_findings(
+        self, image: Tensor, instruction: str, shown: Demonstration | ObjectPrompt | None
+    ) -> None:
+        """Logs what was found in the running episode, and draws it if `picture_folder` says where."""
+        episode, config, matching = self._episode, self.config, self.localizer.matching
+        if logger.isEnabledFor(logging.INFO):
+            given = (config.cameras[0], image.shape[-2:], instruction, shown)
+            lines = describe_findings(matching, episode.localization, *given)
+            is_own = isinstance(shown, Demonstration) and shown.states is not None
+            replay = f"replays {'the demonstration' if is_own else 'a training episode'}"
+            acting = replay if bool(episode.replayed.all()) else "the policy network acts"
+            residual = self.state_regressor.to_image.residual.item()
+            lines.append(f"  acting: {acting}")
+            if residual >= 0:
+                lines.append(f"  states to image: off by {residual:.1%} of its side in training")
+            logger.info("%s", "\n".join(lines))
+        if config.picture_folder is not None:
+            path = write_picture(Path(config.picture_folder), image, shown, episode.localization)
+            logger.info("Where the policy looked: %s.", path)
 
     def reset(self) -> None:
         """Ends the episode. The next action begins a new one."""
@@ -420,82 +377,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             ValueError: Neither is given, or samples have different numbers of demonstrations.
         """
         camera = self.config.cameras[0]
-        scenes = self._camera_image(batch, camera)  # (batch, 3, H, W)
-        camera_motion = self.matching.camera_motion(batch[camera][0])  # warns
-        by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
+        scenes = self._camera_image(batch, camera)
         prompts = prompts_of(instructions, demonstrations)
-        given = None if prompts else self._batch_demonstrations(demonstrations, scenes.device)
-        attention = last = centers = descriptors = heights = templates = None
-        if prompts:
-            descriptors = describe_prompts(self.matching, prompts, batch[camera])
-        elif given is None:
-            if not bool(by_instruction.all()):
-                raise UserError("Neither a demonstration nor an instruction is given. Pass one of them.")
-        else:
-            n_each = given.ends.shape[1]
-            ends, states = given.ends.flatten(0, 1), given.pick_states.flatten(0, 1)
-            attentions = self.attention(ends)
-            attended = peak_locations(attentions.clamp_min(_MIN_ATTENTION).log())[:, 0]
-            picks, first_images = (
-                self.state_regressor.pick_locations(states),
-                given.first_images.flatten(0, 1),
-            )
-            described = self.matching.describe(ends, first_images, picks, attended)
-            descriptors = described.descriptors.unflatten(0, (-1, n_each)).mean(dim=1)
-            templates = described.templates.unflatten(0, (-1, n_each))
-            centers = described.centers[::n_each]
-            heights = self.state_regressor.heights(states).unflatten(0, (-1, n_each)).nanmean(dim=1)
-            attention, last = attentions[::n_each], ends[::n_each, 1]
-        novelty = self.matching.novelty(instructions)
-        candidates = self.matching.find(
-            *(batch[camera], instructions, descriptors, heights, templates, novelty)
-        )
-        if prompts:
-            candidates = choose_prompted(candidates, prompts)
-        proposal, confidence, height = candidates.best
-        pick = self.matching.grasps(batch[camera], proposal, templates, novelty)
-        place_maps = self._place_maps(
-            scenes, by_instruction, instructions, last, None if attention is None else attention[:, 1]
-        )
-        return PickPlace(
-            locations=torch.stack([pick, peak_locations(place_maps[:, None])[:, 0]], dim=1),
-            heights=height + self.config.grasp_height_bias,
-            maps=torch.stack([candidates.map(place_maps.shape[1:]), place_maps], dim=1),
-            attention=attention,
-            by_demonstration=(given is not None, given is not None and not bool(by_instruction.all())),
-            confidence=confidence,
-            proposal=proposal,
-            demonstrated=centers,
-            camera_motion=camera_motion,
-        )
+        given = None if prompts else self.batch_demonstrations(demonstrations, scenes.device)
+        found = self.localizer(scenes, batch[camera], instructions, given, prompts)
+        return found._replace(heights=found.heights + self.config.grasp_height_bias)
 
-    def _place_maps(
-        self,
-        scenes: Tensor,
-        by_instruction: Tensor,
-        instructions: Sequence[str],
-        last: Tensor | None,
-        attention: Tensor | None,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Returns maps of where to place the object, as logits (batch, h, w).
-
-        Args:
-            scenes: First images of episodes, (batch, 3, H, W) in 0..1.
-            by_instruction: Whether the instruction says where, and not the demonstration, (batch,) bool.
-            instructions: Instruction of each sample.
-            last: Last images of the demonstrations, (batch, 3, H, W); None without demonstrations.
-            attention: Maps of where the demonstrations put the object, (batch, h, w).
-            generator: In training, source of the draws of words that are left out, on the CPU.
-        """
-        words = encode_words(instructions, self.config.known_words).to(scenes.device)
-        instruction = torch.where(by_instruction[:, None], self.instruction_encoder(words, generator), 0.0)
-        target = torch.zeros(len(scenes), TARGET_DIM, device=scenes.device)
-        if last is not None and attention is not None:
-            target = torch.where(by_instruction[:, None], target, self.place.target(last, attention))
-        return self.place(scenes, instruction, target)
-
-    def _batch_demonstrations(
+    def batch_demonstrations(
         self, demonstrations: DemonstrationsOfTasks, device: torch.device
     ) -> DemonstrationBatch | None:
         """Batches the demonstrations of several tasks; None if they are left out."""
@@ -509,10 +397,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             return None
         flat = [each for given in demonstrations for each in given if isinstance(each, Demonstration)]
         unknown = torch.full((self.config.state_dim,), torch.nan)
+        states = torch.stack([unknown if s.pick_state is None else s.pick_state.cpu() for s in flat])
+        states = states.to(device)
         parts = (
             torch.stack([shown.frames[[0, -1]] for shown in flat]).to(device).float() / 255,
             torch.stack([s.frames[0] if s.first_image is None else s.first_image for s in flat]).to(device),
-            torch.stack([unknown if s.pick_state is None else s.pick_state.cpu() for s in flat]).to(device),
+            self.state_regressor.pick_locations(states),
+            self.state_regressor.heights(states),
         )
         return DemonstrationBatch(*(part.unflatten(0, (-1, n_each)) for part in parts))
 
@@ -592,7 +483,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             PretrainedWeightsError: The weights that feature matching needs are missing.
         """
         self.fit_locations(data)
-        if not bool(self.matching.fitted):
+        if not bool(self.localizer.matching.fitted):
             self.fit_matching()
 
     def fit_locations(self, data: TrainingData) -> None:
@@ -678,7 +569,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         sentences = self._sentences(bank.tasks)
         self._forget_words(chain.from_iterable(sentences.values()))
         held_out = fit_feature_matching(
-            self.matching,
+            self.localizer.matching,
             bank.frames[:, 0],
             bank.frames[:, -1],
             bank.frames[:, 0] if bank.first_images is None else bank.first_images,
@@ -696,7 +587,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         """Forgets words that no sentence has: those of tasks that are not trained on are unknown."""
         known = set(vocabulary_of(sentences))
         words = [word if word in known else "" for word in self.config.known_words]
-        self.config.known_words[:] = self.matching.vocabulary[:] = words
+        self.config.known_words[:] = self.localizer.matching.vocabulary[:] = words
 
     def _recorded_locations(self, episodes: Sequence[int], rows: Sequence[int]) -> TrainingLocations:
         """Returns the locations of episodes, (batch, ...); reads those that are held out."""
@@ -755,11 +646,3 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                     f"and actions have {sizes[0]} and {sizes[1]} numbers, those of the policy "
                     f"{expected[0]} and {expected[1]}. Name a dataset of the policy's robot."
                 )
-
-
-def _augment(images: Tensor, locations: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Shifts images (batch, ..., H, W) and locations in them (batch, n, 2) at random."""
-    shifts = random_shifts(len(images), _SHIFT_PADDING, generator)
-    height, width = images.shape[-2:]
-    moved = (shifts * 2 / torch.tensor([width, height])).to(locations.device)  # (batch, 2)
-    return shift_images(images, shifts, _SHIFT_PADDING), locations + moved[:, None]

@@ -11,7 +11,7 @@ from torch import Tensor
 from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.errors import UserError
-from lerobot_deltaco.policies.deltaco_match.localization import Candidates, FeatureMatching
+from lerobot_deltaco.policies.deltaco_match.feature_matching import Candidates, FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.proposals import nearest_proposals
 
 _MIN_CROP = 8  # px

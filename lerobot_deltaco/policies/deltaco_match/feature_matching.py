@@ -1,0 +1,433 @@
+r"""Finds the object that a task asks for among the objects that could be grasped.
+
+    scene                          demonstration's first image          instruction
+      |                                    |                                |
+    proposals                       where it grasped                  weighted words
+      |                                    |                                |
+    crops -> EfficientNet-Lite0       crop -> EfficientNet-Lite0            |
+      |      (frozen), colors              |                                |
+    descriptors -------- cosines ------ descriptors                         |
+      |                    |                                                |
+    log probability of each word of the vocabulary ------- words of the instruction
+                           |                                                |
+                           +------------ sum: score of a proposal ----------+
+
+There are two descriptors. The instance descriptor tells whether a proposal is the demonstrated object. The
+category descriptor measures similarity of color and shape, which tasks by color or shape need, and is used to
+the extent that the first finds no match.
+
+Called once at the start of an episode. What is learned is fitted before the policy is trained, to the first
+images of the training episodes: see `fit`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
+from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder
+from lerobot_deltaco.policies.deltaco_match.matching_head import (
+    HIDDEN_DIM,
+    Crops,
+    MatchingHead,
+    uniform,
+    word_scores,
+)
+from lerobot_deltaco.policies.deltaco_match.proposals import (
+    Background,
+    changed_areas,
+    demonstrated_centers,
+)
+from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner, correlations, cut_templates
+from lerobot_deltaco.policies.deltaco_match.words import (
+    UNKNOWN_WORD,
+    WordWeights,
+    encode_words,
+    understand,
+    words_of,
+)
+from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
+
+logger = logging.getLogger(__name__)
+
+_MIN_PROBABILITY = 1e-9
+_MIN_NOVELTY = 0.01  # of an object, below which templates are not compared with proposals
+_NOVEL = 0.5  # novelty of an object above which its grasp is taken to look like the demonstrated one
+_MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
+# Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
+_APPEARANCE_STD = 0.7
+
+
+class Candidates(NamedTuple):
+    """What could be picked.
+
+    Attributes:
+        locations: The proposals, (batch, n, 2) in -1..1; anywhere where there is none.
+        log_probabilities: How likely each is what the task asks for, (batch, n). What they lack to 1 is the
+            probability that it is none of them.
+        heights: Height offset of a grasp of each, (batch, n).
+        radius: Distance from a candidate within which others are of the same object.
+        map_std: Standard deviation of a candidate in a map, in cells.
+    """
+
+    locations: Tensor
+    log_probabilities: Tensor
+    heights: Tensor
+    radius: float
+    map_std: float = MatchingSettings.map_std
+
+    @property
+    def best(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Location (batch, 2) and height offset (batch,) of the likeliest, and its object's probability."""
+        best = self.log_probabilities.argmax(dim=1)
+        rows = torch.arange(len(best), device=best.device)
+        chosen = self.locations[rows, best]
+        of_object = (self.locations - chosen[:, None]).norm(dim=2) < self.radius
+        probability = (self.log_probabilities.exp() * of_object).sum(dim=1)
+        return chosen, probability, self.heights[rows, best]
+
+    def map(self, shape: Sequence[int]) -> Tensor:
+        """Returns the candidates as maps of a shape (h, w), as logits (batch, h, w)."""
+        height, width = shape
+        std = 2 * self.map_std / torch.tensor([width, height], device=self.locations.device)
+        each = gaussian_maps(self.locations, height, width, std)
+        return (self.log_probabilities.exp()[..., None, None] * each).sum(dim=1).clamp_min(1e-9).log()
+
+
+class Described(NamedTuple):
+    """What demonstrations grasped.
+
+    Attributes:
+        centers: Centers of the objects, (batch, 2) in -1..1.
+        descriptors: Descriptors of the objects, (batch, descriptor).
+        templates: Surroundings of the grasps, (batch, 3, h, w); NaN where the grasp is not known, or where
+            templates are not used.
+    """
+
+    centers: Tensor
+    descriptors: Tensor
+    templates: Tensor
+
+
+class FeatureMatching(nn.Module):
+    """Finds what demonstrations moved, and what words describe, in scenes.
+
+    It stays in evaluation mode, and receives no gradient while a policy is trained.
+
+    Args:
+        vocabulary: Known words.
+        settings: Constants of the method; by default, those of `MatchingSettings`.
+
+    Attributes:
+        encoder: Describes crops of images.
+        fitted: Whether it has been fitted, () bool.
+        sharpness: Factor of the scores, (), and
+        error_rate: the rate of errors that no score excludes, (), by held-out episodes.
+        held_out: Number of held-out episodes in which the object was found, and of all, (2,) int64.
+        n_episodes: Number of training episodes, () int64.
+    """
+
+    fitted: Tensor
+    sharpness: Tensor
+    error_rate: Tensor
+    held_out: Tensor
+    n_episodes: Tensor
+
+    def __init__(self, vocabulary: Sequence[str], settings: MatchingSettings | None = None) -> None:
+        super().__init__()
+        self.vocabulary = list(vocabulary)
+        self.settings = settings or MatchingSettings()
+        self.background = Background()
+        self.refine = GraspRefiner()
+        self.encoder = CropEncoder()
+        self.compare = MatchingHead(len(vocabulary), self.encoder.feature_dim, self.encoder.color_dim)
+        self.word_weights = WordWeights(len(vocabulary))
+        self.grasp_height = GraspHeightEstimator(HIDDEN_DIM)
+        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("sharpness", torch.ones(()))
+        self.register_buffer("error_rate", torch.zeros(()))
+        self.register_buffer("held_out", torch.zeros(2, dtype=torch.int64))
+        self.register_buffer("n_episodes", torch.zeros((), dtype=torch.int64))
+        self.requires_grad_(False)
+        self.eval()
+
+    def train(self, mode: bool = True) -> FeatureMatching:
+        """Stays in evaluation mode."""
+        return super().train(False)
+
+    @torch.no_grad()
+    def find(
+        self,
+        scenes: Tensor,
+        instructions: Sequence[str],
+        described: Tensor | None,
+        demonstrated: Tensor | None,
+        templates: Tensor | None = None,
+        novelty: Tensor | None = None,
+    ) -> Candidates:
+        """Finds what tasks ask for.
+
+        Args:
+            scenes: First images of episodes at full resolution, (batch, 3, H, W) in 0..1.
+            instructions: Instruction of each sample, "" for none.
+            described: Descriptors of the demonstrated objects, (batch, descriptor); None without
+                demonstrations.
+            demonstrated: Height offsets of the demonstrated grasps, (batch,), NaN where they are not known;
+                None without demonstrations.
+            templates: Surroundings of the demonstrated grasps, (batch, demonstrations, 3, h, w). See
+                `Described`.
+            novelty: How likely each demonstrated object is new to the training, (batch,). See `novelty`.
+        """
+        with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
+            locations = self.background(scenes)
+            crops = self.compare(self.features(scenes, locations))
+            words = encode_words(instructions, self.vocabulary).to(scenes.device)
+            scores, similarity = self.scores(crops, words, described)
+            if templates is not None and novelty is not None and bool((novelty > _MIN_NOVELTY).any()):
+                alike = self._correlations(scenes, locations, templates)
+                scores = scores + self.settings.template_weight * novelty[:, None] * alike
+            if demonstrated is None:
+                demonstrated = torch.full_like(scores[:, 0], torch.nan)
+            heights = self.grasp_height(crops.hidden, similarity, demonstrated[:, None])
+            log_p = (self.sharpness * scores).masked_fill(~crops.exists, -torch.inf).log_softmax(dim=1)
+            # The object may be none of these, however few they are.
+            p = torch.lerp(log_p.exp(), crops.exists / crops.exists.shape[1], self.error_rate)
+            return Candidates(
+                locations.nan_to_num(), p.log(), heights, self.grasp_radius, self.settings.map_std
+            )
+
+    def scores(self, crops: Crops, words: Tensor, described: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Scores the crops of proposals by demonstrations and words.
+
+        Args:
+            crops: The crops.
+            words: Indices of the words of the instructions, (batch, length).
+            described: Descriptors of the demonstrated objects, (batch, descriptor); None without
+                demonstrations.
+
+        Returns:
+            Log probabilities, up to a constant, and similarities to the demonstrated objects, (batch, n).
+        """
+        settings, weights = self.settings, self.word_weights(words)
+        scores = word_scores(crops.words, words, weights)
+        matches = similarity = torch.zeros_like(scores)
+        if described is not None:
+            # How well known words describe the object. A new noun leaves the demonstration in charge.
+            p_unknown = self._p_unknown(words)
+            p_described = (1 - p_unknown) * (weights * (words > UNKNOWN_WORD)).amax(dim=1)
+            matches, similarity = self.compare.match(
+                crops, described, settings.sharpness, settings.p_other_object * p_described
+            )
+            scores = (1 - p_unknown)[:, None] * scores
+        by_words = (scores + crops.objectness).masked_fill(~crops.exists, -torch.inf).softmax(dim=1)
+        by_words = torch.lerp(by_words, uniform(crops.exists), settings.p_misdescribed)
+        return matches + by_words.clamp_min(_MIN_PROBABILITY).log(), similarity
+
+    def _p_unknown(self, words: Tensor) -> Tensor:
+        """Returns how likely an unknown word describes the object, (batch,)."""
+        return (self.word_weights(words) * (words == UNKNOWN_WORD)).amax(dim=1)
+
+    def _correlations(self, scenes: Tensor, locations: Tensor, templates: Tensor) -> Tensor:
+        """Returns how well the surroundings of proposals agree with templates, (batch, n); 0 for none."""
+        n_each, flat = locations.shape[1], locations.nan_to_num().flatten(0, 1)
+        images, repeated = (part.repeat_interleave(n_each, 0) for part in (scenes, templates))
+        reach = self.settings.template_reach
+        found = correlations(images, flat, self.object_sizes(flat), repeated, reach)
+        return found.flatten(1).amax(dim=1).view(-1, n_each)
+
+    def camera_motion(self, scene: Tensor) -> CameraMotion | None:
+        """Returns how far the camera has moved since the training, and warns if it has.
+
+        Args:
+            scene: First image of an episode, (3, H, W) in 0..1, at full resolution.
+
+        Returns:
+            The motion; None if it is not known.
+        """
+        motion = self.background.camera_motion(scene)
+        if motion is not None and motion.is_significant:
+            height, width = scene.shape[-2:]
+            logger.warning(
+                "The camera seems to have moved since the training: the picture is off by %s. Locations are "
+                "those of the training's camera. Move it back, or train on episodes of where it is now.",
+                motion.describe(width, height),
+            )
+        return motion
+
+    def grasps(
+        self,
+        full_resolution: Tensor,
+        proposals: Tensor,
+        templates: Tensor | None = None,
+        novelty: Tensor | None = None,
+    ) -> Tensor:
+        """Returns where the gripper closes on proposed objects, (batch, 2) in -1..1.
+
+        Args:
+            full_resolution: First images of episodes, (batch, 3, H, W), uint8 or in 0..1.
+            proposals: A proposal in each, (batch, 2) in -1..1.
+            templates: Surroundings of demonstrated grasps, (batch, demonstrations, 3, h, w); None without
+                demonstrations. See `Described`.
+            novelty: How likely each object is new, (batch,). See `novelty`.
+        """
+        sizes = self.object_sizes(proposals)
+        expected = self.refine(full_resolution, proposals, sizes)
+        if templates is None or novelty is None or not bool((novelty > _NOVEL).any()):
+            return expected
+        alike = self.refine(full_resolution, proposals, sizes, templates)
+        return torch.where((novelty > _NOVEL)[:, None], alike, expected)
+
+    def novelty(self, instructions: Sequence[str]) -> Tensor:
+        """Returns how likely demonstrated objects are new to the training, (batch,) in 0..1.
+
+        They are if an unknown word describes them; and without an instruction, after few training episodes.
+        """
+        words = encode_words(instructions, self.vocabulary).to(self.fitted.device)
+        of_few = (self.n_episodes <= self.settings.few_episodes).to(self.sharpness)
+        is_empty = torch.tensor([not text for text in instructions], device=self.fitted.device)
+        return torch.where(is_empty, of_few, self._p_unknown(words))
+
+    @property
+    def report(self) -> str:
+        """How often the object was found where that was not learned."""
+        n_right, n_all = self.held_out.tolist()
+        if not n_all:
+            return "too few episodes to hold some out"
+        found = f"object found in {n_right} of {n_all} held-out episodes"
+        if not bool(self.refine.is_used):
+            return found
+        before, after = (50 * self.refine.errors).tolist()
+        return f"grasps located to {after:.1f} % of the image's side (proposals: {before:.1f} %), {found}"
+
+    @property
+    def grasp_radius(self) -> float:
+        """Distance from a grasp within which a proposal stands for the grasped object, in -1..1."""
+        return self.settings.grasp_error + self.settings.grasp_size * float(self.background.object_size)
+
+    @torch.no_grad()
+    def describe(self, ends: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor) -> Described:
+        """Describes what was grasped in demonstrations.
+
+        An object that was pushed before it was grasped, as by an attempt that failed, is no longer where it
+        was in the first image: no proposal is near the grasp. The attention then tells where it was.
+
+        Args:
+            ends: First and last images, (batch, 2, 3, H, W) in 0..1, as small as the policy's.
+            full_resolution: The first images at full resolution, (batch, 3, H', W').
+            grasps: Locations of the grasps, (batch, 2) in -1..1; NaN where they are not known.
+            attended: Locations of what moved, by the attention, (batch, 2) in -1..1.
+        """
+        with torch.autocast(ends.device.type, enabled=False):
+            centers, is_near = self.demonstrated(ends, full_resolution, grasps, attended)
+            features = self.features(full_resolution, centers[:, None])
+            shown = torch.where(is_near[:, None], grasps, torch.nan)
+            templates = cut_templates(full_resolution, shown, self.object_sizes(grasps))
+            if not bool(self.refine.uses_templates):
+                templates = torch.full_like(templates, torch.nan)
+            return Described(centers, self.compare(features).descriptors[:, 0], templates)
+
+    def demonstrated(
+        self, ends: Tensor, full_resolution: Tensor, grasps: Tensor, attended: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Finds what was grasped in demonstrations. See `describe` for the arguments.
+
+        Returns:
+            The centers of the objects, (batch, 2) in -1..1, and whether the grasp was there, (batch,) bool.
+        """
+        masks = self.background.masks(full_resolution)
+        proposed = self.background.objects(masks, full_resolution)
+        changed = self.background.objects(masks * changed_areas(ends), full_resolution)
+        usual_error = float(self.refine.errors[0])
+        return demonstrated_centers(proposed, changed, grasps, attended, self.grasp_radius, usual_error)
+
+    @torch.no_grad()
+    def understood(self, instruction: str) -> list[tuple[str, str]]:
+        """Returns the words of an instruction that describe the object, and what each is understood as."""
+        words = encode_words([instruction], self.vocabulary).to(self.fitted.device)
+        meanings = zip(words_of(instruction), understand(instruction, self.vocabulary), strict=True)
+        weights = self.word_weights(words)[0].tolist()
+        return [
+            (word, meant)
+            for (word, meant), weight in zip(meanings, weights, strict=False)
+            if meant is not None and weight > self.settings.shown_word_weight
+        ]
+
+    def features(self, images: Tensor, locations: Tensor, sizes: Tensor | None = None) -> Tensor:
+        """Returns features of crops, (batch, n, features).
+
+        Args:
+            images: Images at full resolution, (batch, 3, H, W), uint8 or in 0..1.
+            locations: Centers of the crops, (batch, n, 2) in -1..1.
+            sizes: Sides of the crops as fractions of the image's, (batch, n); by default, `crop_sizes`.
+        """
+        return self.encoder(images, locations, self.crop_sizes(locations) if sizes is None else sizes)
+
+    def crop_sizes(self, locations: Tensor) -> Tensor:
+        """Returns the sides of crops at locations (..., 2), as fractions of the image's, (...)."""
+        return self.settings.crop_factor * self.object_sizes(locations)
+
+    def object_sizes(self, locations: Tensor) -> Tensor:
+        """Returns the diameters of objects at locations (..., 2), as fractions of the image's side."""
+        # Not as a product of matrices, which autocast would round.
+        return self.background.object_size * (locations * self.background.perspective).sum(dim=-1).exp()
+
+
+class GraspHeightEstimator(nn.Module):
+    """Estimates the height offset of a grasp, from the demonstration and from the object's appearance.
+
+    If the demonstration moved the same object, its height is the right one. If it moved another object of
+    that color or shape, the appearance of the object in the scene is a better guide. So two estimates are
+    averaged, weighted by the inverse of their variances. The variance of the estimate from the demonstration
+    is learned, from the similarity of the two objects. The variance of the other is fixed: training objects
+    have hardly any error to learn it from.
+
+    Args:
+        feature_dim: Size of the features of an object's appearance.
+    """
+
+    def __init__(self, feature_dim: int) -> None:
+        super().__init__()
+        self.by_appearance = nn.Linear(feature_dim, 1)
+        self.demonstration_error = nn.Sequential(nn.Linear(1, 16), nn.ReLU(inplace=True), nn.Linear(16, 1))
+
+    def losses(self, features: Tensor, similarity: Tensor, demonstrated: Tensor, heights: Tensor) -> Tensor:
+        """Returns the loss of each sample, (batch,).
+
+        Args:
+            features: Features of the objects to grasp, (batch, feature_dim).
+            similarity: Cosine of their descriptors with those of the demonstrated objects, (batch,).
+            demonstrated: Height offsets of the demonstrations, (batch,).
+            heights: Height offsets of the grasps, (batch,).
+        """
+        by_appearance = 0.5 * (self.by_appearance(features)[:, 0] - heights).square()
+        log_std = self._log_std(similarity)
+        error = (demonstrated - heights) * torch.exp(-log_std)
+        return by_appearance + 0.5 * error.square() + log_std
+
+    def forward(self, features: Tensor, similarity: Tensor, demonstrated: Tensor) -> Tensor:
+        """Estimates height offsets, (...).
+
+        Args:
+            features: Features of the objects to grasp, (..., feature_dim).
+            similarity: Cosine of their descriptors with those of the demonstrated objects, (...).
+            demonstrated: Height offsets of the demonstrations, (...); NaN where they are not known.
+        """
+        by_appearance = self.by_appearance(features)[..., 0]
+        variance = torch.exp(2 * self._log_std(similarity))
+        # Where they contradict each other, the object looks like none of the training, whose heights misled.
+        surprise = (demonstrated - by_appearance).square() / (_APPEARANCE_STD**2 + variance)
+        of_appearance = _APPEARANCE_STD**2 * surprise.clamp_min(1)
+        weight = of_appearance / (of_appearance + variance)
+        weight = torch.where(demonstrated.isnan(), 0.0, weight)
+        return weight * demonstrated.nan_to_num() + (1 - weight) * by_appearance
+
+    def _log_std(self, similarity: Tensor) -> Tensor:
+        """Returns the log standard deviation of the error of the demonstrations' estimate, (...)."""
+        log_std = self.demonstration_error(similarity[..., None])[..., 0]
+        return _MIN_LOG_STD + (_MAX_LOG_STD - _MIN_LOG_STD) * torch.sigmoid(log_std)
