@@ -367,6 +367,27 @@ def test_words_that_describe_the_container_do_not_count():
     assert matching.understood("") == []
 
 
+def test_held_out_episodes_without_another_of_their_task_say_that_nothing_is_known():
+    generator = torch.Generator().manual_seed(0)
+    matching = FeatureMatching(["a", "b"])
+    matching.held_out[1] = 1
+    matching.requires_grad_(True)
+    fit_matching_head(
+        matching,
+        torch.randn(1, 3, 4, matching.encoder.feature_dim, generator=generator),
+        torch.tensor([[0.0, 2, 2]] * 3),
+        torch.zeros(3),
+        ["a", "b", "b"],
+        {"a": ["a"], "b": ["b"]},
+        generator,
+        2,
+        torch.autocast("cpu", enabled=False),
+        held_out=torch.tensor([True, False, False]),
+    )
+    assert matching.held_out.tolist() == [0, 1]
+    assert matching.error_rate == 0.75  # Jeffreys' prior
+
+
 def test_fit_needs_a_task_with_two_grasps(shapes):
     images, locations, tasks = (part[:6] for part in shapes)
     locations = torch.where(torch.arange(6)[:, None] < 2, locations, torch.nan)
@@ -374,6 +395,8 @@ def test_fit_needs_a_task_with_two_grasps(shapes):
         fit_feature_matching(
             FeatureMatching([]), images, images, images, locations, torch.zeros(6), tasks, {}, 0
         )
+    with pytest.raises(ValueError, match="The 2 such episodes are of 2 different tasks"):
+        fit.EpisodePairs(["a", "a", "b", "b"], [0, 2])  # the others are held out
 
 
 def draw_objects(side, locations, shape=(96, 96), seed=0):

@@ -419,6 +419,14 @@ def test_few_episodes_are_replayed(make, monkeypatch):
     assert make().config.acting == "network"
 
 
+def test_a_robot_that_cannot_be_replayed_acts_by_the_network(make, monkeypatch, caplog):
+    monkeypatch.setattr("lerobot_deltaco.policies.geometry.replay._LEAST_EXPLAINED", 1.1)
+    assert make().config.acting == "network"
+    assert "No dimension of the robot's state follows its actions" in caplog.text
+    with pytest.raises(UserError, match="--policy.acting=network"):
+        make(acting="replay")
+
+
 def test_replay_repeats_the_demonstration_in_its_own_scene(table):
     policy, before, _ = small_policy(table, "deltaco_match", acting="replay")
     policy.eval()

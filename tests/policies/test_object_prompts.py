@@ -15,8 +15,9 @@ from small_policies import (
 
 from lerobot_deltaco.data.object_prompts import ObjectPrompt, read_prompt
 from lerobot_deltaco.errors import UserError
+from lerobot_deltaco.policies.deltaco_match.feature_matching import Candidates
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
-from lerobot_deltaco.policies.deltaco_match.prompts import cut_box
+from lerobot_deltaco.policies.deltaco_match.prompts import choose_prompted, cut_box
 
 MOVES = random_moves(48)  # of `table`
 PIXEL = 2 / TABLE_SIZE
@@ -62,6 +63,21 @@ def test_what_is_pointed_at_is_picked_whatever_the_sentence(table, trained):
             assert np.abs(distances).max() < 3.5
             assert (found.confidence == 1).all()
             assert not any(found.by_demonstration)
+
+
+def test_a_point_in_the_middle_of_the_picture_picks_an_object_and_not_the_middle(trained):
+    """Where there is no proposal, there is none in the middle either."""
+    candidates = Candidates(
+        torch.tensor([[[0.1, 0.1], [torch.nan, torch.nan]]]),
+        torch.tensor([[0.0, -torch.inf]]),
+        torch.tensor([[2.0, 0.0]]),
+        radius=0.2,
+    )
+    chosen = choose_prompted(candidates, [point_at((0.06, 0.02))])
+    location, probability, height = chosen.best
+    torch.testing.assert_close(location, torch.tensor([[0.1, 0.1]]))
+    assert (probability, height) == (1, 2)
+    assert chosen.map((4, 4)).isfinite().all()
 
 
 def test_an_episode_of_the_training_is_replayed(table, trained, tmp_path):

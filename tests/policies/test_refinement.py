@@ -64,6 +64,8 @@ def test_without_held_out_episodes_it_is_not_used(refined):
     nothing = torch.zeros_like(held_out)
     refiner.fit(images, grasps, middles, sizes, nothing, 1, torch.Generator(), contextlib.nullcontext())
     assert torch.equal(refiner(images, middles, sizes), middles)
+    # How far proposals are from grasps is known all the same.
+    assert refiner.errors.tolist() == pytest.approx([2 * RADIUS / SIZE] * 2, rel=1e-3)
 
 
 def test_a_demonstration_shows_where_another_kind_of_object_is_grasped(refined):

@@ -162,3 +162,16 @@ def test_pauses_are_not_repeated_but_the_gripper_gets_its_time(fitted):
     assert set(range(closing)) - set(original) <= {0, 1}
     assert kept[0] == 0
     assert kept[-1] == len(states) - 1
+
+
+def test_a_robot_whose_state_does_not_follow_its_actions_cannot_be_replayed():
+    generator = torch.Generator().manual_seed(0)
+    trajectories = [
+        (torch.randn(50, 10, generator=generator), torch.randn(50, 4, generator=generator)) for _ in range(20)
+    ]
+    replay = TrajectoryReplay(10, 4)
+    assert not replay.is_blind
+    replay.fit(trajectories, torch.arange(10) < 9, GRIPPER)
+    assert replay.is_blind
+    replay.action_scale.fill_(1)
+    assert replay.trajectory(None, None) == "no dimension of the robot's state follows its actions"

@@ -68,7 +68,7 @@ class Candidates(NamedTuple):
     """What could be picked.
 
     Attributes:
-        locations: The proposals, (batch, n, 2) in -1..1; anywhere where there is none.
+        locations: The proposals, (batch, n, 2) in -1..1; NaN where there is none.
         log_probabilities: How likely each is what the task asks for, (batch, n). What they lack to 1 is the
             probability that it is none of them.
         heights: Height offset of a grasp of each, (batch, n).
@@ -84,19 +84,19 @@ class Candidates(NamedTuple):
 
     @property
     def best(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Location (batch, 2) and height offset (batch,) of the likeliest, and its object's probability."""
+        """Location (batch, 2) of the likeliest, its object's probability, and its height offset, (batch,)."""
         best = self.log_probabilities.argmax(dim=1)
         rows = torch.arange(len(best), device=best.device)
         chosen = self.locations[rows, best]
         of_object = (self.locations - chosen[:, None]).norm(dim=2) < self.radius
         probability = (self.log_probabilities.exp() * of_object).sum(dim=1)
-        return chosen, probability, self.heights[rows, best]
+        return chosen.nan_to_num(), probability, self.heights[rows, best]
 
     def map(self, shape: Sequence[int]) -> Tensor:
         """Returns the candidates as maps of a shape (h, w), as logits (batch, h, w)."""
         height, width = shape
         std = 2 * self.map_std / torch.tensor([width, height], device=self.locations.device)
-        each = gaussian_maps(self.locations, height, width, std)
+        each = gaussian_maps(self.locations, height, width, std).nan_to_num()
         return (self.log_probabilities.exp()[..., None, None] * each).sum(dim=1).clamp_min(1e-9).log()
 
 
@@ -198,9 +198,7 @@ class FeatureMatching(nn.Module):
             log_p = (self.sharpness * scores).masked_fill(~crops.exists, -torch.inf).log_softmax(dim=1)
             # The object may be none of these, however few they are.
             p = torch.lerp(log_p.exp(), crops.exists / crops.exists.shape[1], self.error_rate)
-            return Candidates(
-                locations.nan_to_num(), p.log(), heights, self.grasp_radius, self.settings.map_std
-            )
+            return Candidates(locations, p.log(), heights, self.grasp_radius, self.settings.map_std)
 
     def scores(self, crops: Crops, words: Tensor, described: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scores the crops of proposals by demonstrations and words.

@@ -489,9 +489,12 @@ class HeldOut:
         scenes = [row for row in held_out.nonzero().flatten().tolist() if tasks[row] in of_task]
         # Each with two demonstrations and two sentences, for scores that depend less on chance
         pairs = [(row, n, of_task[tasks[row]]) for row in scenes for n in range(_LOOKS)]
-        self._scenes = torch.tensor([row for row, _, _ in pairs])
-        shown = torch.tensor([own[(n * len(own)) // _LOOKS] for _, n, own in pairs])
-        texts = torch.tensor([int(spans[row, 0]) + (n * int(spans[row, 1])) // _LOOKS for row, n, _ in pairs])
+        first, numbers = spans.T.tolist()
+        looks = [
+            (row, own[n * len(own) // _LOOKS], first[row] + n * numbers[row] // _LOOKS)
+            for row, n, own in pairs
+        ]
+        self._scenes, shown, texts = torch.tensor(looks, dtype=torch.int64).view(-1, 3).T
         self._matching, self._is_grasped = matching, is_grasped[self._scenes]
         self._inputs = features[self._scenes, :-1]
         self._shown = features[shown, -1:]
@@ -512,7 +515,7 @@ class HeldOut:
     def look(self) -> None:
         """Keeps the weights if they are the best so far."""
         loss = float(object_loss(self._scores().log_softmax(dim=2), self._is_grasped).mean())
-        if loss < self._best:
+        if loss < self._best:  # False without a look
             self._best = loss
             self._state = {name: value.clone() for name, value in self._matching.state_dict().items()}
 
@@ -524,10 +527,10 @@ class HeldOut:
             matching.load_state_dict(self._state)
         scores = self._scores()
         chosen = scores.argmax(dim=2, keepdim=True)
-        is_right = self._is_grasped.expand(3, -1, -1).gather(2, chosen).float().mean(dim=(1, 2))
-        n_seen, n_all = len(self._is_grasped) / _LOOKS, int(matching.held_out[1])  # a proposal is near; all
-        matching.held_out[0] = round(float(is_right[2]) * n_seen)
-        n_wrong = n_all - float(is_right[0] + is_right[2]) / 2 * n_seen
+        n_right = self._is_grasped.expand(3, -1, -1).gather(2, chosen).float().sum(dim=(1, 2)) / _LOOKS
+        n_all = int(matching.held_out[1])  # those without a proposal at the grasp, too
+        matching.held_out[0] = round(float(n_right[2]))
+        n_wrong = n_all - float(n_right[0] + n_right[2]) / 2
         error_rate = torch.tensor((n_wrong + 0.5) / (n_all + 1))  # with Jeffreys' prior
         losses = {}
         for sharpness in matching.settings.sharpnesses:
@@ -552,9 +555,10 @@ class EpisodePairs:
             rows.setdefault(tasks[row], []).append(row)
         self._rows = [torch.tensor(own) for own in rows.values() if len(own) > 1]
         if not self._rows:
+            n_episodes = sum(map(len, rows.values()))
             raise UserError(
                 "Feature matching needs tasks with at least two episodes in which the gripper closes on "
-                f"an object. The {len(tasks)} such episodes are of {len(rows)} different tasks. Add episodes."
+                f"an object. The {n_episodes} such episodes are of {len(rows)} different tasks. Add episodes."
             )
 
     def draw(self, n_pairs: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

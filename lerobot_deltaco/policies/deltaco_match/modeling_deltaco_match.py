@@ -506,9 +506,6 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         gripper_states = find_gripper_states(robot.states, opening, robot.spans, robot.state_names)
         gripper_states.warn()
         n_grasps = int(grasps.has_grasp.sum())
-        if self.config.acting is None:
-            self.config.acting = "replay" if n_grasps <= _MAX_REPLAYED else "network"
-            logger.info("From %d episodes with a grasp, `acting` is %r.", n_grasps, self.config.acting)
         if n_grasps < MIN_EPISODES:
             raise UserError(
                 f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} "
@@ -532,6 +529,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             find_positions(robot.state_names),
         )
         self._fit_replay(robot, ~gripper_states.is_gripper)
+        if self.config.acting is None:
+            is_replayed = n_grasps <= _MAX_REPLAYED and not self.replay.is_blind
+            self.config.acting = "replay" if is_replayed else "network"
+            logger.info("From %d episodes with a grasp, `acting` is %r.", n_grasps, self.config.acting)
+        if self.config.acting == "replay":
+            command, spans = self.config.gripper_command, [slice(a, b + 1) for a, b in robot.spans]
+            self.replay.store([(robot.states[span], robot.actions[span]) for span in spans], command)
 
     def _fit_replay(self, robot: RobotData, is_arm: Tensor) -> None:
         """Fits how actions move the robot, in a second."""
@@ -550,11 +554,18 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             is_arm,
             self.config.gripper_index,
         )
+        if not replay.is_blind:
+            return
+        problem = (
+            "No dimension of the robot's state follows its actions, so that demonstrations cannot be "
+            "replayed elsewhere."
+        )
         if self.config.acting == "replay":
-            command = self.config.gripper_command
-            assert command is not None
-            spans = [slice(first, last + 1) for first, last in robot.spans]
-            replay.store([(robot.states[span], robot.actions[span]) for span in spans], command)
+            raise UserError(
+                f"{problem} Record the state that the actions move, such as the end effector's position, or "
+                "let the policy network act with --policy.acting=network."
+            )
+        logger.warning("%s The policy network acts.", problem)
 
     def fit_matching(self) -> None:
         """Fits feature matching to the first images of the training episodes, in minutes.

@@ -47,8 +47,8 @@ class GraspRefiner(nn.Module):
         is_used: Whether it comes nearer to the grasps of held-out episodes than the proposals do, () bool.
         uses_templates: Whether templates of other episodes of a task come nearer to its grasps than the
             proposals do, () bool.
-        errors: Median distance from the grasps of held-out episodes, of proposals and of refined locations,
-            where an image's edges are at -1 and 1, (2,).
+        errors: Median distance from the grasps of held-out episodes (of all, if none are), of proposals and
+            of refined locations, where an image's edges are at -1 and 1, (2,).
     """
 
     is_used: Tensor
@@ -164,6 +164,8 @@ class GraspRefiner(nn.Module):
             schedule.step()
         self.layers.eval()
         self.is_used.zero_()
+        # Proposals learn nothing from grasps: without held-out episodes, all tell how far they are.
+        self.errors.fill_((proposals - grasps).norm(dim=1).median())
         rows = held_out.nonzero().flatten().to(images.device)
         if len(rows):
             refined = self._refine(images[rows], proposals[rows], sizes[rows])

@@ -178,6 +178,11 @@ class TrajectoryReplay(nn.Module):
         steps = torch.cat([self._distance(s[1:] - s[:-1]) for s, _ in trajectories])
         self.usual_step.copy_(steps.quantile(0.9))
 
+    @property
+    def is_blind(self) -> bool:
+        """Whether no dimension of the robot's state follows its actions: trajectories cannot be moved."""
+        return not bool(self.is_arm.any())
+
     def store(self, episodes: Sequence[tuple[Tensor, Tensor]], command: Gripper) -> None:
         """Stores trajectories of some training episodes, for tasks without a demonstrated one.
 
@@ -227,6 +232,8 @@ class TrajectoryReplay(nn.Module):
                 "The checkpoint was trained by a version that could not replay demonstrations. Train it "
                 "again, or act with --policy.acting=network."
             )
+        if self.is_blind:
+            return "no dimension of the robot's state follows its actions"
         if not isinstance(demonstration, Demonstration):
             return "no demonstration is given"
         if demonstration.states is None or demonstration.actions is None:
