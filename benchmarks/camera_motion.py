@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lerobot_deltaco.policies.geometry.camera_motion import (
+from lerobot_deltaco.policies.scene.camera_motion import (
     CameraMotion,
     estimate_motion,
     static_reference,

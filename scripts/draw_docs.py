@@ -38,7 +38,7 @@ from lerobot_deltaco.evaluation.video import (
     record_episode,
 )
 from lerobot_deltaco.pages.player import SHOWCASE
-from lerobot_deltaco.policies.deltaco_match.pictures import demonstration_ends, draw_localization
+from lerobot_deltaco.policies.deltaco_match.findings import demonstration_ends, draw_localization
 from lerobot_deltaco.reports.leaderboard import collect_results
 from lerobot_deltaco.reports.report import calibration_rows, draw_calibration, make_table
 

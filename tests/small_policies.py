@@ -28,9 +28,9 @@ from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import (
     DeltacoMatchConfig,
     MatchingSettings,
 )
-from lerobot_deltaco.policies.deltaco_match.crop_encoder import cut_crops
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 from lerobot_deltaco.policies.deltaco_match.words import vocabulary_of
+from lerobot_deltaco.policies.scene.crops import CropEncoder
 from lerobot_deltaco.training.train import train
 
 # Most of a small training is spent on making parsers of options and on opening datasets: do both once.
@@ -86,7 +86,7 @@ _fits = {}
 def fit_once(matching, *data, **options):
     """Fits feature matching, or takes the result of an earlier fit to the same data."""
     digest = hashlib.sha256()
-    arguments = [matching.vocabulary, matching.settings, options]
+    arguments = [matching.vocabulary, matching.settings, type(matching.encoder), options]
     for part in data:
         if isinstance(part, torch.Tensor):
             digest.update(part.cpu().contiguous().numpy())
@@ -100,14 +100,13 @@ def fit_once(matching, *data, **options):
     return _fits[key][1]
 
 
-class ColorEncoder:
+class ColorEncoder(CropEncoder):
     """Describes crops by colors alone."""
 
-    feature_dim, color_dim = 192, 0
+    feature_dim, color_dim, resolution = 192, 0, 8
 
-    def __call__(self, images, locations, sizes):
-        crops = cut_crops(images, locations.nan_to_num(), sizes.nan_to_num(nan=1.0), resolution=8)
-        return torch.where(locations.isnan().any(dim=2, keepdim=True), torch.nan, crops.flatten(2))
+    def encode(self, crops):
+        return crops.flatten(1)
 
 
 def use_short_fit(monkeypatch, steps=2, **settings):
@@ -120,7 +119,7 @@ def use_short_fit(monkeypatch, steps=2, **settings):
         **settings,
     }
     monkeypatch.setattr(modeling_deltaco_match, "fit_feature_matching", fit_once)
-    monkeypatch.setattr(feature_matching, "CropEncoder", ColorEncoder)
+    monkeypatch.setattr(feature_matching, "EfficientNetCropEncoder", ColorEncoder)
     monkeypatch.setattr(feature_matching, "MatchingSettings", functools.partial(MatchingSettings, **short))
 
 

@@ -40,6 +40,7 @@ def files_of(folder):
 def test_imports_go_one_way():
     above = {f"lerobot_deltaco.{name}" for name in ("collection", "training", "evaluation", "reports")}
     above |= {"lerobot_deltaco.experiments", "lerobot_deltaco.pages"}
+    both = {"lerobot_deltaco.policies.deltaco", "lerobot_deltaco.policies.deltaco_match"}
     plain = [ROOT / "lerobot_deltaco" / "policies" / "base" / name for name in ("networks.py", "losses.py")]
     for files, forbidden in (
         (GYM_FILES, {"torch", "lerobot", "lerobot_deltaco", "lerobot_policy_deltaco"}),
@@ -50,7 +51,8 @@ def test_imports_go_one_way():
         (files_of("data"), {"gym_deltaco", "lerobot_deltaco.policies", *above}),
         (files_of("policies/deltaco"), {"lerobot_deltaco.policies.deltaco_match"}),
         (files_of("policies/deltaco_match"), {"lerobot_deltaco.policies.deltaco"}),
-        (files_of("policies/geometry"), {f"lerobot_deltaco.policies.deltaco{s}" for s in ("", "_match")}),
+        (files_of("policies/geometry"), {*both, "lerobot_deltaco.policies.scene"}),
+        (files_of("policies/scene"), both),
         (files_of("collection"), {"torch", "lerobot_deltaco.evaluation", "lerobot_deltaco.pages"}),
         # Networks and losses take plain numbers.
         (plain, {"lerobot", f"{BASE}.configuration", f"{BASE}.modeling"}),

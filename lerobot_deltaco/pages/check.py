@@ -36,17 +36,17 @@ from lerobot_deltaco.data.reading import dimension_names, episode_spans, open_fo
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData, read_robot_data
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.pages.arguments import CheckArguments, list_of_numbers
+from lerobot_deltaco.pages.crops import demonstrated_crop
 from lerobot_deltaco.pages.html import picture_uri, write_page
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
-from lerobot_deltaco.policies.deltaco_match.pictures import (
+from lerobot_deltaco.policies.deltaco_match.findings import (
     PICK_COLOR,
     PLACE_COLOR,
-    demonstrated_crop,
     draw_mark,
 )
-from lerobot_deltaco.policies.deltaco_match.proposals import N_OBJECTS
+from lerobot_deltaco.policies.deltaco_match.fit import EpisodePairs
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.policies.scene.proposals import N_OBJECTS
 from lerobot_deltaco.training.train import image_size_in_memory
 
 _PICTURE_HEIGHT = 180  # px

@@ -22,19 +22,19 @@ from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions, list_of_numbers
+from lerobot_deltaco.pages.crops import compared_crops
 from lerobot_deltaco.pages.html import EpisodeView, picture_uri, write_page
 from lerobot_deltaco.pages.player import Player
 from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.policies.base.configuration import TaskConditionedConfig
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.findings import describe_words
-from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
-from lerobot_deltaco.policies.deltaco_match.pictures import (
+from lerobot_deltaco.policies.deltaco_match.findings import (
     PICK_COLOR,
     PLACE_COLOR,
-    compared_crops,
+    describe_words,
     draw_localization,
 )
+from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset

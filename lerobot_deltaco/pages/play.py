@@ -17,7 +17,7 @@ from lerobot_deltaco.pages.arguments import PlayArguments
 from lerobot_deltaco.pages.html import TEMPLATES, picture_uri, render
 from lerobot_deltaco.pages.player import MAX_SEED, Choice, Player
 from lerobot_deltaco.pages.verdict import object_name
-from lerobot_deltaco.policies.deltaco_match.pictures import demonstration_ends
+from lerobot_deltaco.policies.deltaco_match.findings import demonstration_ends
 
 # Before Gradio is imported: the page loads nothing from other servers and reports to none.
 os.environ.setdefault("GRADIO_ANALYTICS_ENABLED", "False")

@@ -20,8 +20,11 @@ from lerobot_deltaco.evaluation.video import benchmark_env, find_demonstration, 
 from lerobot_deltaco.pages.html import EpisodeView, picture_uri
 from lerobot_deltaco.pages.verdict import judge, object_name
 from lerobot_deltaco.pages.videos import video_uri
-from lerobot_deltaco.policies.deltaco_match.findings import describe_words
-from lerobot_deltaco.policies.deltaco_match.pictures import demonstration_ends, draw_localization
+from lerobot_deltaco.policies.deltaco_match.findings import (
+    demonstration_ends,
+    describe_words,
+    draw_localization,
+)
 
 BOTH, DEMONSTRATION, INSTRUCTION = "Both", "Demonstration only", "Instruction only"
 MAX_SEED = 9999

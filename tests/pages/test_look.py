@@ -20,20 +20,20 @@ from lerobot_deltaco.evaluation.video import (
     load_conditioned,
     record_episode,
 )
+from lerobot_deltaco.pages import crops
 from lerobot_deltaco.pages import look as look_module
 from lerobot_deltaco.pages.arguments import LookArguments, PromptOptions
+from lerobot_deltaco.pages.crops import draw_crop
 from lerobot_deltaco.pages.html import EpisodeView, render
 from lerobot_deltaco.pages.look import look
 from lerobot_deltaco.pages.verdict import TOLERANCE
 from lerobot_deltaco.pages.videos import encode_video
-from lerobot_deltaco.policies.deltaco_match import pictures
-from lerobot_deltaco.policies.deltaco_match.localization import PickPlace
-from lerobot_deltaco.policies.deltaco_match.pictures import (
+from lerobot_deltaco.policies.deltaco_match.findings import (
     PICK_COLOR,
     PLACE_COLOR,
-    draw_crop,
     draw_localization,
 )
+from lerobot_deltaco.policies.deltaco_match.localization import PickPlace
 
 
 def found_at(pick, place, by_demonstration=(True, True), size=24):
@@ -149,7 +149,7 @@ def test_the_crops_on_the_page_are_those_that_were_compared(tmp_path, monkeypatc
     monkeypatch.setattr(look_module, "load_conditioned", lambda _: loaded)
     monkeypatch.setattr(matching, "encoder", lambda *crops: compared.append(crops) or encoder(*crops))
     monkeypatch.setattr(matching, "find", lambda *args: chosen.append(find(*args)) or chosen[-1])
-    monkeypatch.setattr(pictures, "draw_crop", lambda *crop: drawn.append(crop) or draw_crop(*crop))
+    monkeypatch.setattr(crops, "draw_crop", lambda *crop: drawn.append(crop) or draw_crop(*crop))
     look(LookArguments("policy", str(tmp_path / "data"), 2, tmp_path / "out"))
     assert len(compared) == len(drawn) == 2 * len(chosen) == 4
     for shown, own in zip(compared[::2], drawn[::2], strict=True):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching
-from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion, estimate_motion
+from lerobot_deltaco.policies.scene.camera_motion import CameraMotion, estimate_motion
 
 
 @pytest.mark.parametrize("case", ["toy", "gym-24-100"])

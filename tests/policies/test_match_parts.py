@@ -14,16 +14,16 @@ from lerobot_deltaco.policies.base.configuration import has_bfloat16
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
 from lerobot_deltaco.policies.deltaco_match import fit
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
-from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder, cut_crops
 from lerobot_deltaco.policies.deltaco_match.feature_matching import (
     Candidates,
     FeatureMatching,
     GraspHeightEstimator,
 )
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching, fit_matching_head
-from lerobot_deltaco.policies.deltaco_match.place import TARGET_DIM, PlaceNetwork, peak_locations
-from lerobot_deltaco.policies.deltaco_match.proposals import N_OBJECTS, Background
+from lerobot_deltaco.policies.deltaco_match.localization import TARGET_DIM, PlaceNetwork, peak_locations
 from lerobot_deltaco.policies.deltaco_match.words import encode_words, understand, vocabulary_of
+from lerobot_deltaco.policies.scene.crops import CropEncoder, cut_crops
+from lerobot_deltaco.policies.scene.proposals import N_OBJECTS, Background
 
 
 def test_height_of_a_demonstration_counts_as_far_as_it_can_be_trusted():
@@ -89,7 +89,7 @@ def test_peak_of_a_map_is_its_location():
     torch.testing.assert_close(peak_locations(20 * maps), locations, atol=0.03, rtol=0)
     found, logits = torch.tensor([[[-0.5, 0.2], [0.6, -0.4]]]), torch.tensor([[0.2, 0.8]]).log()
     candidates = Candidates(found, logits, torch.zeros(1, 2), 0.1)
-    maps = candidates.map((24, 30))
+    maps = candidates.map((24, 30), MatchingSettings.map_std)
     assert maps.shape == (1, 24, 30)
     torch.testing.assert_close(peak_locations(maps[:, None])[0, 0], candidates.best[0][0], atol=0.05, rtol=0)
 

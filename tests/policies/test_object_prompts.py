@@ -77,7 +77,7 @@ def test_a_point_in_the_middle_of_the_picture_picks_an_object_and_not_the_middle
     location, probability, height = chosen.best
     torch.testing.assert_close(location, torch.tensor([[0.1, 0.1]]))
     assert (probability, height) == (1, 2)
-    assert chosen.map((4, 4)).isfinite().all()
+    assert chosen.map((4, 4), 1.0).isfinite().all()
 
 
 def test_an_episode_of_the_training_is_replayed(table, trained, tmp_path):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_deltaco.policies.deltaco_match.segmentation import segment
+from lerobot_deltaco.policies.scene.segmentation import segment
 
 SIDE = 128
 FLAT = torch.zeros(2)

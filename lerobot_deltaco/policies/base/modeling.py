@@ -109,7 +109,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         # The tasks of the next episode, if `set_tasks` gave them, and the state of the running one.
         self._tasks: tuple[tuple[str, ...], DemonstrationsOfTasks] | None = None
         self._episode: Any = None
-        self._component_index = 0  # number of the next action in the running episode
+        self._episode_step = 0  # number of actions taken in the running episode
         # The actions of the running chunks that are still to be carried out, and the average of all chunks.
         self._actions = ActionQueues(config.n_action_steps, config.gripper_index)
         self._ensemble: ACTTemporalEnsembler | None = None
@@ -173,7 +173,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
         # In bfloat16, in which LeRobot's training evaluates, an action would depend on the rest of the batch.
         with torch.autocast(self.step.device.type, enabled=False):
             action = self._next_action(batch)
-        self._component_index += 1
+        self._episode_step += 1
         return action
 
     def _next_action(self, batch: dict[str, Any]) -> Tensor:
@@ -203,7 +203,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
 
     def _start(self, episode: Any) -> None:
         """Sets the running episode; None for none."""
-        self._episode, self._ensemble, self._component_index = episode, None, 0
+        self._episode, self._ensemble, self._episode_step = episode, None, 0
         self._actions.clear()
 
     def _tasks_of(self, batch: dict[str, Any]) -> tuple[tuple[str, ...], DemonstrationsOfTasks | None]:
@@ -307,7 +307,7 @@ class TaskConditionedPolicy(PreTrainedPolicy):
     ) -> Tensor:
         """Returns the actions of a chunk, (batch, steps, action)."""
         opening = None if gripper is None else torch.sigmoid(gripper.float())
-        mean = predicted.likely_mean(self._component_index).float()
+        mean = predicted.likely_mean(self._episode_step).float()
         return self._checked_action(batch, join_action(mean, opening, self.config.gripper_index))
 
     def _checked_action(self, batch: dict[str, Any], action: Tensor) -> Tensor:

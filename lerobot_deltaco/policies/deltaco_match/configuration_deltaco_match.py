@@ -156,7 +156,6 @@ class MatchingSettings:
             and shapes in it.
         shown_word_weight: Pages mark words above this weight as describing the object.
         map_std: Standard deviation of a candidate in a map, in cells.
-        crop_factor: Side of a crop in diameters of a typical object.
         min_coverage: Fraction of the grasps of training episodes at something that stands out from the
             background, below which a warning says so.
         feature_weight: Weight of the cosine of the encoder's features beside that of learned descriptors.
@@ -200,7 +199,6 @@ class MatchingSettings:
     p_misdescribed: float = 0.1
     shown_word_weight: float = 0.5
     map_std: float = 0.8
-    crop_factor: float = 1.0
     min_coverage: float = 0.75
     feature_weight: float = 0.8
     max_variants: int = 5

@@ -31,18 +31,13 @@ from torch import Tensor, nn
 
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
-from lerobot_deltaco.policies.deltaco_match.crop_encoder import CropEncoder
 from lerobot_deltaco.policies.deltaco_match.matching_head import (
     HIDDEN_DIM,
     Crops,
+    GraspHeightEstimator,
     MatchingHead,
     uniform,
     word_scores,
-)
-from lerobot_deltaco.policies.deltaco_match.proposals import (
-    Background,
-    changed_areas,
-    demonstrated_centers,
 )
 from lerobot_deltaco.policies.deltaco_match.refinement import GraspRefiner, correlations, cut_templates
 from lerobot_deltaco.policies.deltaco_match.words import (
@@ -52,16 +47,19 @@ from lerobot_deltaco.policies.deltaco_match.words import (
     understand,
     words_of,
 )
-from lerobot_deltaco.policies.geometry.camera_motion import CameraMotion
+from lerobot_deltaco.policies.scene.camera_motion import CameraMotion
+from lerobot_deltaco.policies.scene.crops import EfficientNetCropEncoder
+from lerobot_deltaco.policies.scene.proposals import (
+    Background,
+    changed_areas,
+    demonstrated_centers,
+)
 
 logger = logging.getLogger(__name__)
 
 _MIN_PROBABILITY = 1e-9
 _MIN_NOVELTY = 0.01  # of an object, below which templates are not compared with proposals
 _NOVEL = 0.5  # novelty of an object above which its grasp is taken to look like the demonstrated one
-_MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
-# Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
-_APPEARANCE_STD = 0.7
 
 
 class Candidates(NamedTuple):
@@ -73,14 +71,12 @@ class Candidates(NamedTuple):
             probability that it is none of them.
         heights: Height offset of a grasp of each, (batch, n).
         radius: Distance from a candidate within which others are of the same object.
-        map_std: Standard deviation of a candidate in a map, in cells.
     """
 
     locations: Tensor
     log_probabilities: Tensor
     heights: Tensor
     radius: float
-    map_std: float = MatchingSettings.map_std
 
     @property
     def best(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -92,10 +88,10 @@ class Candidates(NamedTuple):
         probability = (self.log_probabilities.exp() * of_object).sum(dim=1)
         return chosen.nan_to_num(), probability, self.heights[rows, best]
 
-    def map(self, shape: Sequence[int]) -> Tensor:
-        """Returns the candidates as maps of a shape (h, w), as logits (batch, h, w)."""
+    def map(self, shape: Sequence[int], cells: float) -> Tensor:
+        """Returns the candidates as maps of a shape (h, w), blurred by some cells: logits (batch, h, w)."""
         height, width = shape
-        std = 2 * self.map_std / torch.tensor([width, height], device=self.locations.device)
+        std = 2 * cells / torch.tensor([width, height], device=self.locations.device)
         each = gaussian_maps(self.locations, height, width, std).nan_to_num()
         return (self.log_probabilities.exp()[..., None, None] * each).sum(dim=1).clamp_min(1e-9).log()
 
@@ -145,7 +141,7 @@ class FeatureMatching(nn.Module):
         self.settings = settings or MatchingSettings()
         self.background = Background()
         self.refine = GraspRefiner()
-        self.encoder = CropEncoder()
+        self.encoder = EfficientNetCropEncoder()
         self.compare = MatchingHead(len(vocabulary), self.encoder.feature_dim, self.encoder.color_dim)
         self.word_weights = WordWeights(len(vocabulary))
         self.grasp_height = GraspHeightEstimator(HIDDEN_DIM)
@@ -198,7 +194,7 @@ class FeatureMatching(nn.Module):
             log_p = (self.sharpness * scores).masked_fill(~crops.exists, -torch.inf).log_softmax(dim=1)
             # The object may be none of these, however few they are.
             p = torch.lerp(log_p.exp(), crops.exists / crops.exists.shape[1], self.error_rate)
-            return Candidates(locations, p.log(), heights, self.grasp_radius, self.settings.map_std)
+            return Candidates(locations, p.log(), heights, self.grasp_radius)
 
     def scores(self, crops: Crops, words: Tensor, described: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scores the crops of proposals by demonstrations and words.
@@ -362,70 +358,12 @@ class FeatureMatching(nn.Module):
         Args:
             images: Images at full resolution, (batch, 3, H, W), uint8 or in 0..1.
             locations: Centers of the crops, (batch, n, 2) in -1..1.
-            sizes: Sides of the crops as fractions of the image's, (batch, n); by default, `crop_sizes`.
+            sizes: Sides of the crops as fractions of the image's, (batch, n); by default, diameters of
+                objects there.
         """
-        return self.encoder(images, locations, self.crop_sizes(locations) if sizes is None else sizes)
-
-    def crop_sizes(self, locations: Tensor) -> Tensor:
-        """Returns the sides of crops at locations (..., 2), as fractions of the image's, (...)."""
-        return self.settings.crop_factor * self.object_sizes(locations)
+        return self.encoder(images, locations, self.object_sizes(locations) if sizes is None else sizes)
 
     def object_sizes(self, locations: Tensor) -> Tensor:
         """Returns the diameters of objects at locations (..., 2), as fractions of the image's side."""
         # Not as a product of matrices, which autocast would round.
         return self.background.object_size * (locations * self.background.perspective).sum(dim=-1).exp()
-
-
-class GraspHeightEstimator(nn.Module):
-    """Estimates the height offset of a grasp, from the demonstration and from the object's appearance.
-
-    If the demonstration moved the same object, its height is the right one. If it moved another object of
-    that color or shape, the appearance of the object in the scene is a better guide. So two estimates are
-    averaged, weighted by the inverse of their variances. The variance of the estimate from the demonstration
-    is learned, from the similarity of the two objects. The variance of the other is fixed: training objects
-    have hardly any error to learn it from.
-
-    Args:
-        feature_dim: Size of the features of an object's appearance.
-    """
-
-    def __init__(self, feature_dim: int) -> None:
-        super().__init__()
-        self.by_appearance = nn.Linear(feature_dim, 1)
-        self.demonstration_error = nn.Sequential(nn.Linear(1, 16), nn.ReLU(inplace=True), nn.Linear(16, 1))
-
-    def losses(self, features: Tensor, similarity: Tensor, demonstrated: Tensor, heights: Tensor) -> Tensor:
-        """Returns the loss of each sample, (batch,).
-
-        Args:
-            features: Features of the objects to grasp, (batch, feature_dim).
-            similarity: Cosine of their descriptors with those of the demonstrated objects, (batch,).
-            demonstrated: Height offsets of the demonstrations, (batch,).
-            heights: Height offsets of the grasps, (batch,).
-        """
-        by_appearance = 0.5 * (self.by_appearance(features)[:, 0] - heights).square()
-        log_std = self._log_std(similarity)
-        error = (demonstrated - heights) * torch.exp(-log_std)
-        return by_appearance + 0.5 * error.square() + log_std
-
-    def forward(self, features: Tensor, similarity: Tensor, demonstrated: Tensor) -> Tensor:
-        """Estimates height offsets, (...).
-
-        Args:
-            features: Features of the objects to grasp, (..., feature_dim).
-            similarity: Cosine of their descriptors with those of the demonstrated objects, (...).
-            demonstrated: Height offsets of the demonstrations, (...); NaN where they are not known.
-        """
-        by_appearance = self.by_appearance(features)[..., 0]
-        variance = torch.exp(2 * self._log_std(similarity))
-        # Where they contradict each other, the object looks like none of the training, whose heights misled.
-        surprise = (demonstrated - by_appearance).square() / (_APPEARANCE_STD**2 + variance)
-        of_appearance = _APPEARANCE_STD**2 * surprise.clamp_min(1)
-        weight = of_appearance / (of_appearance + variance)
-        weight = torch.where(demonstrated.isnan(), 0.0, weight)
-        return weight * demonstrated.nan_to_num() + (1 - weight) * by_appearance
-
-    def _log_std(self, similarity: Tensor) -> Tensor:
-        """Returns the log standard deviation of the error of the demonstrations' estimate, (...)."""
-        log_std = self.demonstration_error(similarity[..., None])[..., 0]
-        return _MIN_LOG_STD + (_MAX_LOG_STD - _MIN_LOG_STD) * torch.sigmoid(log_std)

@@ -17,14 +17,14 @@ from lerobot_deltaco.policies.base.augmentation import change_colors, random_col
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.matching_head import Crops, MatchingHead, word_scores
-from lerobot_deltaco.policies.deltaco_match.proposals import (
+from lerobot_deltaco.policies.deltaco_match.words import UNKNOWN_WORD, encode_words
+from lerobot_deltaco.policies.scene.proposals import (
     MAX_MEASURED,
     MAX_REMEMBERED,
     changed_areas,
     demonstrated_centers,
     nearest_proposals,
 )
-from lerobot_deltaco.policies.deltaco_match.words import UNKNOWN_WORD, encode_words
 
 logger = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ def fit_feature_matching(
             *(matching, full_resolution, locations, drawn, proposed, shown, generator, autocast)
         )
         held_out = _held_out([tasks[row] for row in drawn.tolist()], settings)
-        is_kept = torch.isin(drawn, kept)
+        is_kept, kept_tasks = torch.isin(drawn, kept), [tasks[row] for row in kept.tolist()]
         matching.held_out.copy_(torch.tensor([0, int(held_out.sum())]))
         matching.n_episodes.fill_(len(grasps))
         matching.sharpness.fill_(1.0)
@@ -103,32 +103,23 @@ def fit_feature_matching(
             features,
             distances,
             heights[kept.to(heights.device)],
-            [tasks[row] for row in kept.tolist()],
+            kept_tasks,
             sentences,
             generator,
             steps,
             autocast,
             held_out=held_out[is_kept],
         )
-        rows, kept_tasks = kept.to(device), [tasks[row] for row in kept.tolist()]
         nearest = proposed[is_kept.to(device)][torch.arange(len(kept)), distances.argmin(dim=1)]
-        matching.refine.fit(
+        grasped = (
             full_resolution[kept.to(full_resolution.device)],
-            locations[rows],
+            locations[kept.to(device)],
             nearest,
             matching.object_sizes(nearest),
-            held_out[is_kept],
-            settings.refinement_steps,
-            generator,
-            autocast,
         )
-        matching.refine.measure_templates(
-            full_resolution[kept.to(full_resolution.device)],
-            locations[rows],
-            nearest,
-            matching.object_sizes(nearest),
-            _other_episodes(kept_tasks).to(device),
-        )
+        steps = settings.refinement_steps
+        matching.refine.fit(*grasped, held_out[is_kept], steps, generator, autocast)
+        matching.refine.measure_templates(*grasped, _other_episodes(kept_tasks).to(device))
     matching.requires_grad_(False)
     for weights in matching.parameters():
         weights.grad = None
@@ -244,7 +235,7 @@ def _crops_of_proposals(
                 variants = []
                 for n in range(n_variants):
                     images, at = scenes, of_some[near]
-                    sizes = matching.crop_sizes(at)
+                    sizes = matching.object_sizes(at)
                     if n > 0:
                         noise = torch.randn((*at.shape[:2], 3), generator=generator).to(at.device)
                         sizes = sizes * (settings.variant_log_scale * noise[..., 2]).exp()

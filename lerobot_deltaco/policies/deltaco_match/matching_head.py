@@ -1,4 +1,4 @@
-"""The network that compares crops around proposals: descriptors, and log probabilities of words."""
+"""The networks that compare crops around proposals: descriptors, words, and heights of grasps."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ _MIN_STD, _MAX_FEATURE, _MIN_PROBABILITY = 1e-3, 6.0, 1e-9
 _COLOR_WEIGHT = 2.0  # of colors among the features
 _INITIAL_SCALE = 10.0  # of cosines, as logits
 _INITIAL_GATE = (8.0, -5.0)  # slope and offset of the logit that a proposal matches, by its cosine
+_MIN_LOG_STD, _MAX_LOG_STD = -3.0, 1.0  # of the error of a demonstration's height
+# Standard deviation of the error of the estimate from appearance on novel objects; heights have one of 1.
+_APPEARANCE_STD = 0.7
 
 
 class Crops(NamedTuple):
     """Descriptions of crops.
 
     Attributes:
-        descriptors: Instance and category descriptor, two unit vectors, and behind them the normalized
-            features as a third, unless these do not count, (batch, n, descriptor).
+        descriptors: Unit vectors, joined: instance descriptor, category descriptor, normalized features,
+            (batch, n, descriptor).
         words: Log probabilities of the words of the vocabulary, (batch, n, words).
         objectness: Log odds that a crop shows something to grasp, up to a constant, (batch, n).
         hidden: Features of a crop's appearance, (batch, n, hidden).
@@ -103,8 +106,7 @@ class MatchingHead(nn.Module):
         inputs = _dropout(features, generator)
         hidden = _dropout(F.relu(self.hidden(inputs)), generator)
         descriptors = self.linear(inputs) + self.from_hidden(hidden)
-        if bool(self.feature_weight > 0):
-            descriptors = torch.cat([descriptors.float(), features.float()], dim=-1)
+        descriptors = torch.cat([descriptors.float(), features.float()], dim=-1)
         words = self.words(hidden).float().log_softmax(dim=-1)
         objectness = self.objectness(hidden)[..., 0]
         descriptors, words, objectness, hidden = (
@@ -133,11 +135,8 @@ class MatchingHead(nn.Module):
         wanted, n_learned = _unit(described), 2 * _DESCRIPTOR_DIM
         learned = (part[..., :n_learned].unflatten(-1, (2, -1)) for part in (crops.descriptors, wanted))
         cosines = torch.einsum("bnkd,bkd->kbn", *learned)
-        if bool(self.feature_weight > 0):
-            of_features = torch.einsum(
-                "bnd,bd->bn", crops.descriptors[..., n_learned:], wanted[..., n_learned:]
-            )
-            cosines = torch.lerp(cosines, of_features.expand_as(cosines), self.feature_weight)
+        of_features = torch.einsum("bnd,bd->bn", crops.descriptors[..., n_learned:], wanted[..., n_learned:])
+        cosines = torch.lerp(cosines, of_features.expand_as(cosines), self.feature_weight)
         is_instance, is_category = (
             (sharpness * self.log_scale.exp()[:, None, None] * cosines)
             .masked_fill(~crops.exists, -torch.inf)
@@ -151,6 +150,61 @@ class MatchingHead(nn.Module):
         p_instance = torch.sigmoid(self.gate[0] * cosines[0].amax(dim=1, keepdim=True) + self.gate[1])
         probabilities = p_instance * is_instance + (1 - p_instance) * is_category
         return probabilities.clamp_min(_MIN_PROBABILITY).log(), cosines[0]
+
+
+class GraspHeightEstimator(nn.Module):
+    """Estimates the height offset of a grasp, from the demonstration and from the object's appearance.
+
+    If the demonstration moved the same object, its height is the right one. If it moved another object of
+    that color or shape, the appearance of the object in the scene is a better guide. So two estimates are
+    averaged, weighted by the inverse of their variances. The variance of the estimate from the demonstration
+    is learned, from the similarity of the two objects. The variance of the other is fixed: training objects
+    have hardly any error to learn it from.
+
+    Args:
+        feature_dim: Size of the features of an object's appearance.
+    """
+
+    def __init__(self, feature_dim: int) -> None:
+        super().__init__()
+        self.by_appearance = nn.Linear(feature_dim, 1)
+        self.demonstration_error = nn.Sequential(nn.Linear(1, 16), nn.ReLU(inplace=True), nn.Linear(16, 1))
+
+    def losses(self, features: Tensor, similarity: Tensor, demonstrated: Tensor, heights: Tensor) -> Tensor:
+        """Returns the loss of each sample, (batch,).
+
+        Args:
+            features: Features of the objects to grasp, (batch, feature_dim).
+            similarity: Cosine of their descriptors with those of the demonstrated objects, (batch,).
+            demonstrated: Height offsets of the demonstrations, (batch,).
+            heights: Height offsets of the grasps, (batch,).
+        """
+        by_appearance = 0.5 * (self.by_appearance(features)[:, 0] - heights).square()
+        log_std = self._log_std(similarity)
+        error = (demonstrated - heights) * torch.exp(-log_std)
+        return by_appearance + 0.5 * error.square() + log_std
+
+    def forward(self, features: Tensor, similarity: Tensor, demonstrated: Tensor) -> Tensor:
+        """Estimates height offsets, (...).
+
+        Args:
+            features: Features of the objects to grasp, (..., feature_dim).
+            similarity: Cosine of their descriptors with those of the demonstrated objects, (...).
+            demonstrated: Height offsets of the demonstrations, (...); NaN where they are not known.
+        """
+        by_appearance = self.by_appearance(features)[..., 0]
+        variance = torch.exp(2 * self._log_std(similarity))
+        # Where they contradict each other, the object looks like none of the training, whose heights misled.
+        surprise = (demonstrated - by_appearance).square() / (_APPEARANCE_STD**2 + variance)
+        of_appearance = _APPEARANCE_STD**2 * surprise.clamp_min(1)
+        weight = of_appearance / (of_appearance + variance)
+        weight = torch.where(demonstrated.isnan(), 0.0, weight)
+        return weight * demonstrated.nan_to_num() + (1 - weight) * by_appearance
+
+    def _log_std(self, similarity: Tensor) -> Tensor:
+        """Returns the log standard deviation of the error of the demonstrations' estimate, (...)."""
+        log_std = self.demonstration_error(similarity[..., None])[..., 0]
+        return _MIN_LOG_STD + (_MAX_LOG_STD - _MIN_LOG_STD) * torch.sigmoid(log_std)
 
 
 def uniform(exists: Tensor) -> Tensor:

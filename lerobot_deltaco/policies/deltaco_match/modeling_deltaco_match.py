@@ -49,10 +49,9 @@ from lerobot_deltaco.policies.base.augmentation import (
 from lerobot_deltaco.policies.base.modeling import DemonstrationsOfTasks, TaskConditionedPolicy
 from lerobot_deltaco.policies.base.networks import BACKBONES, PolicyNetwork
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import DeltacoMatchConfig
-from lerobot_deltaco.policies.deltaco_match.findings import describe_findings, predicted_boxes
+from lerobot_deltaco.policies.deltaco_match.findings import describe_findings, predicted_boxes, write_picture
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
 from lerobot_deltaco.policies.deltaco_match.localization import DemonstrationBatch, Localizer, PickPlace
-from lerobot_deltaco.policies.deltaco_match.pictures import write_picture
 from lerobot_deltaco.policies.deltaco_match.prompts import prompts_of
 from lerobot_deltaco.policies.deltaco_match.words import (
     encode_words,
@@ -272,24 +271,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
         """Returns the actions of a chunk, (batch, steps, action). See `select_action`."""
         if self._begins_episode(batch):
-            instructions, demonstrations = self._tasks_of(batch)
-            if demonstrations is None and self._prompt is not None:
-                demonstrations = [[self._prompt]] * len(instructions)
-            elif demonstrations is None:
-                demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
-            localization = self.localize(batch, instructions, demonstrations)
-            if (states := self._given_states) is not None:
-                locations = self.state_regressor.to_image(states).clamp(-1, 1)
-                heights = self.state_regressor.heights(states[:, 0])
-                localization = localization._replace(locations=locations, heights=heights)
-            reference, replayed = None, torch.zeros(len(instructions), dtype=torch.bool)
-            if self.config.acting == "replay":
-                reference, replayed = self._move_demonstrations(demonstrations, localization, batch)
-            network = self._inference_network()
-            self._start(RunningEpisode(instructions, localization, network, reference, replayed))
-            if len(instructions) == 1:
-                shown = demonstrations[0][0] if demonstrations[0] else None
-                self._report_findings(batch[self.config.cameras[0]][0], instructions[0], shown)
+            self._begin_episode(batch)
         episode: RunningEpisode = self._episode
         replay = None
         if episode.reference is not None:
@@ -303,6 +285,27 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if replay is not None:
             actions = torch.where(episode.replayed[:, None, None], replay[:, None], actions[:, :1])
         return actions
+
+    def _begin_episode(self, batch: dict[str, Any]) -> None:
+        """Finds where to pick and place, and what trajectory to follow."""
+        instructions, demonstrations = self._tasks_of(batch)
+        if demonstrations is None and self._prompt is not None:
+            demonstrations = [[self._prompt]] * len(instructions)
+        elif demonstrations is None:
+            demonstrations = self.banked_demonstrations(instructions, self.config.n_demonstrations)
+        localization = self.localize(batch, instructions, demonstrations)
+        if (states := self._given_states) is not None:
+            locations = self.state_regressor.to_image(states).clamp(-1, 1)
+            heights = self.state_regressor.heights(states[:, 0])
+            localization = localization._replace(locations=locations, heights=heights)
+        reference, replayed = None, torch.zeros(len(instructions), dtype=torch.bool)
+        if self.config.acting == "replay":
+            reference, replayed = self._move_demonstrations(demonstrations, localization, batch)
+        network = self._inference_network()
+        self._start(RunningEpisode(instructions, localization, network, reference, replayed))
+        if len(instructions) == 1:
+            shown = demonstrations[0][0] if demonstrations[0] else None
+            self._report_findings(batch[self.config.cameras[0]][0], instructions[0], shown)
 
     def _report_findings(
         self, image: Tensor, instruction: str, shown: Demonstration | ObjectPrompt | None
@@ -514,15 +517,14 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 f"is dimension {self.config.gripper} of the action, whose {self.config.gripper_closed} "
                 "values close it; see --policy.gripper and --policy.gripper_closed."
             )
-        zero_and_one = torch.stack([torch.zeros(self.config.state_dim), torch.ones(self.config.state_dim)])
-        shift, end = self._normalize_states(zero_and_one).to(robot.states.device)
+        scale, shift = (each.to(robot.states.device) for each in self._scaling(OBS_STATE))
         carried = robot.images_at(grasps.carried.tolist()).to(bank.frames.device)
         self.training_locations = self.state_regressor.fit(
             grasps,
             bank.frames[:, 0],
             carried,
             bank.frames[:, -1],
-            end - shift,
+            scale,
             shift,
             ~gripper_states.is_gripper,
             bank.tasks,
@@ -540,10 +542,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     def _fit_replay(self, robot: RobotData, is_arm: Tensor) -> None:
         """Fits how actions move the robot, in a second."""
         assert self.config.gripper_index is not None
-        ends = torch.stack([torch.zeros(robot.actions.shape[1]), torch.ones(robot.actions.shape[1])])
-        shift, end = self._normalize(ends, ACTION)
         replay, regressor = self.replay, self.state_regressor
-        replay.action_scale.copy_(end - shift)
+        scale, shift = self._scaling(ACTION)
+        replay.action_scale.copy_(scale)
         replay.action_shift.copy_(shift)
         replay.state_scale.copy_(regressor.state_scale)
         replay.state_shift.copy_(regressor.state_shift)
@@ -629,18 +630,18 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             sentences[task] = [task] * n_templates + (others if p else [])
         return sentences
 
-    def _normalize_states(self, states: Tensor) -> Tensor:
-        """Normalizes robot states (n, state) as the network gets them, without clipping, on the CPU."""
-        return self._normalize(states, OBS_STATE) * self.state_limits.scale.cpu()
-
-    def _normalize(self, values: Tensor, feature: str) -> Tensor:
-        """Normalizes states or actions as the preprocessor does."""
+    def _scaling(self, feature: str) -> tuple[Tensor, Tensor]:
+        """Returns scale and shift of the preprocessor's normalization of states or actions, on the CPU."""
         is_state = feature == OBS_STATE
         features = {feature: self.config.robot_state_feature if is_state else self.config.action_feature}
         step = NormalizerProcessorStep(features, self.config.normalization_mapping, self._stats)
+        ends = torch.tensor([[0.0], [1.0]]).expand(-1, *features[feature].shape)
         if is_state:
-            return step(create_transition(observation={feature: values}))[TransitionKey.OBSERVATION][feature]
-        return step(create_transition(action=values))[TransitionKey.ACTION]
+            ends = step(create_transition(observation={feature: ends}))[TransitionKey.OBSERVATION][feature]
+            ends = ends * self.state_limits.scale.cpu()
+        else:
+            ends = step(create_transition(action=ends))[TransitionKey.ACTION]
+        return ends[1] - ends[0], ends[0]
 
     def _check_demonstrations(self, data: TrainingData) -> None:
         if data.grasps is not None:

@@ -12,7 +12,7 @@ from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.deltaco_match.feature_matching import Candidates, FeatureMatching
-from lerobot_deltaco.policies.deltaco_match.proposals import nearest_proposals
+from lerobot_deltaco.policies.scene.proposals import nearest_proposals
 
 _MIN_CROP = 8  # px
 
@@ -69,7 +69,7 @@ def prompted_crop(
     image = scene if prompt.image is None else prompt.image.to(scene.device).float() / 255
     if prompt.image is not None and not prompt.is_point:
         height, width = scene.shape[-2:]
-        side = float(matching.crop_sizes(torch.zeros(2, device=image.device)))
+        side = float(matching.object_sizes(torch.zeros(2, device=image.device)))
         extent = max(_MIN_CROP, round(side * height)), max(_MIN_CROP, round(side * width))
         crop = cut_box(image, prompt.box, extent)[None]
         return crop, crop.new_zeros(1, 1, 2), crop.new_ones(1, 1)
@@ -77,7 +77,7 @@ def prompted_crop(
     proposed = matching.background(image[None])
     nearest, is_near = nearest_proposals(proposed, point, matching.grasp_radius)
     location = torch.where(is_near[:, None], proposed[0, nearest], point)[:, None]
-    return image[None], location, matching.crop_sizes(location)
+    return image[None], location, matching.object_sizes(location)
 
 
 def cut_box(image: Tensor, box: Sequence[float], size: tuple[int, int]) -> Tensor:

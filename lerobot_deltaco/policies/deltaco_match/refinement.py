@@ -19,7 +19,7 @@ from lerobot_deltaco.policies.base.augmentation import change_colors, random_col
 from lerobot_deltaco.policies.base.image_coordinates import mean_near
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.networks import channels_last, conv_norm_relu
-from lerobot_deltaco.policies.deltaco_match.crop_encoder import cut_crops
+from lerobot_deltaco.policies.scene.crops import cut_crops
 
 _RESOLUTION = 64  # px, of the enlarged surroundings
 _EXTENT = 2.0  # side of the surroundings, in diameters of a typical object

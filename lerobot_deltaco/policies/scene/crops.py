@@ -6,6 +6,7 @@ trained on photographs tell shapes apart, too, if the object fills its view; but
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import cache
 from typing import ClassVar
 
@@ -26,21 +27,24 @@ _FINE_CHANNELS, _FINE_CELLS, _COARSE_CHANNELS = 112, 4, 320
 _COLOR_CELLS = 8  # of a row and of a column, whose mean colors are features
 
 
-class CropEncoder:
-    """Describes crops by EfficientNet-Lite0 and by the mean colors of their cells.
+class CropEncoder(ABC):
+    """Describes crops of images. A subclass is another frozen encoder.
 
-    It is no module, so that checkpoints do not contain the network's weights, and feature matching knows
-    nothing of it but this class: another frozen network is another class with these three members.
+    It is no module, so that checkpoints do not contain its weights.
 
     Attributes:
-        feature_dim: Number of features.
+        feature_dim: Number of features of a crop.
         color_dim: Number of those that are colors, the last ones.
+        resolution: Side of the crops as they are encoded, px.
     """
 
-    color_dim: ClassVar[int] = 3 * _COLOR_CELLS**2
-    feature_dim: ClassVar[int] = (
-        _FINE_CHANNELS * _FINE_CELLS**2 + _COARSE_CHANNELS + HEAD_CHANNELS + color_dim
-    )
+    feature_dim: ClassVar[int]
+    color_dim: ClassVar[int]
+    resolution: ClassVar[int] = CROP_RESOLUTION
+
+    @abstractmethod
+    def encode(self, crops: Tensor) -> Tensor:
+        """Returns the features of crops (n, 3, resolution, resolution) in 0..1, (n, feature_dim)."""
 
     def __call__(self, images: Tensor, locations: Tensor, sizes: Tensor) -> Tensor:
         """Returns features of crops, (batch, n, feature_dim) in float32.
@@ -51,11 +55,24 @@ class CropEncoder:
             sizes: Sides of the crops as fractions of the image's, (batch, n).
 
         Raises:
-            PretrainedWeightsError: The network's weights are missing.
+            PretrainedWeightsError: The encoder's weights are missing.
         """
         is_crop = ~locations.isnan().any(dim=2)
         rows, at = is_crop.nonzero()[:, 0], (locations[is_crop][:, None], sizes[is_crop][:, None])
-        crops = cut_crops(images[rows], *at, CROP_RESOLUTION)[:, 0]
+        features = self.encode(cut_crops(images[rows], *at, self.resolution)[:, 0]).float()
+        every = features.new_full((*is_crop.shape, self.feature_dim), torch.nan)
+        every[is_crop] = features
+        return every
+
+
+class EfficientNetCropEncoder(CropEncoder):
+    """Describes crops by EfficientNet-Lite0 and by the mean colors of their cells."""
+
+    color_dim = 3 * _COLOR_CELLS**2
+    feature_dim = _FINE_CHANNELS * _FINE_CELLS**2 + _COARSE_CHANNELS + HEAD_CHANNELS + color_dim
+
+    def encode(self, crops: Tensor) -> Tensor:
+        """Returns features of crops. See `CropEncoder.encode`."""
         mean, std = (
             torch.tensor(values, device=crops.device)[:, None, None]
             for values in (IMAGENET_MEAN, IMAGENET_STD)
@@ -67,10 +84,7 @@ class CropEncoder:
             last.mean(dim=(2, 3)),
             F.adaptive_avg_pool2d(crops, _COLOR_CELLS).flatten(1),
         ]
-        features = torch.cat([part.float() for part in parts], dim=1)
-        every = features.new_full((*is_crop.shape, self.feature_dim), torch.nan)
-        every[is_crop] = features
-        return every
+        return torch.cat([part.float() for part in parts], dim=1)
 
 
 @cache

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers
-from lerobot_deltaco.policies.deltaco_match.segmentation import segment
-from lerobot_deltaco.policies.geometry.camera_motion import (
+from lerobot_deltaco.policies.geometry.regression import robust_regression
+from lerobot_deltaco.policies.scene.camera_motion import (
     CameraMotion,
     estimate_motion,
     static_reference,
 )
-from lerobot_deltaco.policies.geometry.regression import robust_regression
+from lerobot_deltaco.policies.scene.segmentation import segment
 
 N_OBJECTS = 14  # proposed in a scene by `Background`, at most
 _SIDE = 128  # px, of the images as they are compared
@@ -86,25 +86,17 @@ class Background(nn.Module):
 
         Returns:
             Locations in -1..1, the most prominent first, (batch, N_OBJECTS, 2); NaN behind the last object.
+            Without any, that of the clearest pixel.
         """
         diameter, perspective = float(self.object_size), self.perspective.cpu()
-        found = [
-            segment(mask, image, diameter, perspective)
-            for mask, image in zip(masks.cpu(), _scaled(scenes).cpu(), strict=True)
-        ]
-        return self._padded(found, masks)
-
-    @staticmethod
-    def _padded(locations: Sequence[Tensor], masks: Tensor) -> Tensor:
-        """Stacks locations (objects, 2) as (batch, N_OBJECTS, 2); without any, with the clearest pixel."""
         centers = grid_of_centers(_SIDE, _SIDE, masks.device)
-        padded = masks.new_full((len(masks), N_OBJECTS, 2), torch.nan)
-        for row, mask, found in zip(padded, masks, locations, strict=True):
-            n_found = min(len(found), N_OBJECTS)
-            row[:n_found] = found[:N_OBJECTS].to(row)
-            if not n_found:
+        locations = masks.new_full((len(masks), N_OBJECTS, 2), torch.nan)
+        for row, mask, scene in zip(locations, masks, _scaled(scenes), strict=True):
+            found = segment(mask.cpu(), scene.cpu(), diameter, perspective)[:N_OBJECTS]
+            row[: len(found)] = found.to(row)
+            if not len(found):
                 row[0] = centers[mask.argmax()]
-        return padded
+        return locations
 
     def masks(self, scenes: Tensor, remembered: Tensor | None = None) -> Tensor:
         """Returns how clearly each pixel stands out, (batch, 128, 128) in 0..1.
