@@ -31,8 +31,8 @@ from gym_deltaco.objects.object_sets import FOLDS, OBJECT_SETS
 class ObjectSpec:
     """The object that a task asks for.
 
-    A kind with a rule of its own about one object overrides `describes`. A kind with a rule about a whole
-    scene, such as "the largest", overrides `meant`, too.
+    A kind with a rule of its own about one object overrides `describes`. A kind with a rule about all objects
+    of a scene, such as "the largest", overrides `meant`.
 
     Attributes:
         kind: Kind of the task, such as "color", by which reports group results.
@@ -51,7 +51,7 @@ class ObjectSpec:
     index: int | None = None
 
     def describes(self, label: ObjectLabel) -> bool:
-        """Returns whether an object fits the specification; with a rule about scenes, whether it can."""
+        """Returns whether an object fits the specification, whatever else is in the scene."""
         return (
             self.name in (None, label.name)
             and self.color in (None, label.color)

@@ -176,8 +176,8 @@ class DemonstrationBank(torch.nn.Module):
                 f"There is no demonstration of the task {task!r}"
                 f"{'' if target_object is None else f' with object {target_object}'}. There are some of "
                 f"{len(self.rows)} tasks, such as {next(iter(self.rows))!r}. Name a dataset that has the "
-                "task with --policy.demo_repo_id and --policy.demo_root. If its wording differs, choose an "
-                "episode with --policy.demo_episode."
+                "task (`demo_repo_id`, `demo_root`). If its wording differs, choose an episode "
+                "(`demo_episode`)."
             )
         return [self[row] for row in rows]
 

@@ -61,7 +61,7 @@ def compared_crops(
 @torch.no_grad()
 def demonstrated_crop(matching: FeatureMatching, given: DemonstrationBatch) -> Image.Image:
     """Draws the crop of what a demonstration grasped, the first of a batch."""
-    ends, full_resolution, picks, _ = (part[0] for part in given)
+    ends, full_resolution, picks = (part[0] for part in given[:3])
     center, _ = matching.demonstrated(ends, full_resolution, picks, picks)
     return _crop(matching, full_resolution, center)
 

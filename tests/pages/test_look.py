@@ -43,7 +43,7 @@ def found_at(pick, place, by_demonstration=(True, True), size=24):
         maps[0, n, row, column] = 20
     locations = (torch.tensor([[pick, place]]) + 0.5) / size * 2 - 1
     attention = maps.flatten(2).softmax(2).view_as(maps)
-    sure = (torch.ones(1), torch.ones(1))
+    sure = (torch.ones(1), torch.ones(1), torch.zeros(1, dtype=torch.bool))
     return PickPlace(locations, torch.zeros(1), maps, attention, by_demonstration, *sure, locations[:, 0])
 
 

@@ -51,6 +51,7 @@ def recording(name, bin_, pick=None, place="green", end=POSITIONS):
             (False, False),
             torch.ones(1),
             torch.ones(1),
+            torch.zeros(1, dtype=torch.bool),
             locations[:, 0],
         )
     return Recording([], localization, layout(), np.array([POSITIONS, end]), placements, number)

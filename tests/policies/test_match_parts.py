@@ -20,7 +20,12 @@ from lerobot_deltaco.policies.deltaco_match.feature_matching import (
     GraspHeightEstimator,
 )
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching, fit_matching_head
-from lerobot_deltaco.policies.deltaco_match.localization import TARGET_DIM, PlaceNetwork, peak_locations
+from lerobot_deltaco.policies.deltaco_match.localization import (
+    TARGET_DIM,
+    Localizer,
+    PlaceNetwork,
+    peak_locations,
+)
 from lerobot_deltaco.policies.deltaco_match.words import encode_words, understand, vocabulary_of
 from lerobot_deltaco.policies.scene.crops import CropEncoder, cut_crops
 from lerobot_deltaco.policies.scene.proposals import N_OBJECTS, Background
@@ -229,6 +234,34 @@ def test_fit_finds_shapes_of_one_color_by_demonstrations_and_by_words(matching, 
     # An object that was pushed before its grasp is found where it was.
     for grasp in (2.0, torch.nan):
         assert fraction_found(matching, shapes, True, grasp=grasp) >= 0.9
+
+
+def test_places_are_found_where_they_stand_now_and_where_nothing_moves(matching, shapes):
+    images, locations, _ = (part[24:] for part in shapes)
+    shown = [(n + 2) % 12 for n in range(12)]
+    unknown, beside = torch.full_like(locations, torch.nan), torch.tensor([0.05, -0.08])
+    found = matching.find_places(images, images[shown], unknown, locations[shown] + beside)
+    assert ((found - locations - beside).norm(dim=1) < 0.15).float().mean() >= 0.9
+    # The object that is grasped is not the place, however near it stands.
+    found = matching.find_places(images, images[shown], locations[shown], locations[shown] + beside)
+    assert not ((found - locations - beside).norm(dim=1) < 0.15).float().mean() >= 0.5
+    # The edges of the table are empty in all episodes.
+    corner = torch.full_like(locations, 0.95)
+    assert torch.equal(matching.find_places(images, images[shown], unknown, corner), corner)
+
+
+@pytest.mark.parametrize(
+    ("kind", "n_episodes", "expected"), [("objects", 24, 1), ("random", 24, 0), ("objects", 999, 0)]
+)
+def test_demonstrations_say_where_to_place_if_that_is_right(matching, shapes, kind, n_episodes, expected):
+    images, locations, tasks = (part[:24] for part in shapes)
+    localizer = Localizer(matching.vocabulary)
+    localizer.matching.load_state_dict(matching.state_dict())
+    localizer.matching.n_episodes.fill_(n_episodes)
+    places = locations if kind == "objects" else locations.roll(1, 0) * torch.tensor([-1.0, 1.0])
+    picks = torch.full_like(locations, torch.nan)
+    localizer.measure_places(images, torch.stack([picks, places], dim=1), tasks)
+    assert localizer.demonstrates_places == expected
 
 
 def test_certainty_is_limited_by_the_number_of_held_out_episodes(matching, shapes):

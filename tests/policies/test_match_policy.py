@@ -302,6 +302,7 @@ def test_a_joint_that_hardly_moves_does_not_decide_the_action(caplog):
 
 def test_what_is_left_out_does_not_matter(make, table):
     policy = make().eval()
+    policy.localizer.demonstrates_places.zero_()  # as after many episodes
     scene = batch_of(table, [0])
 
     def found(instruction, *episodes):
@@ -323,8 +324,23 @@ def test_what_is_left_out_does_not_matter(make, table):
         found_in(policy, batch_of(table, [0, 0]), ["", ""], [[0], []])
 
 
+def test_after_few_episodes_demonstrations_say_where_to_place(make, table):
+    policy = make().eval()
+    assert policy.localizer.demonstrates_places
+    shown, another, unseen = (
+        found_in(policy, batch_of(table, [0]), [RED], [episodes]) for episodes in ([0], [4], [])
+    )
+    recorded = policy.training_locations.locations[0, 1]
+    assert (shown.locations[0, 1] - recorded).norm() < 0.1  # in its own scene, where it was
+    assert shown.is_same_place.all()
+    assert another.is_same_place.all()
+    assert not torch.equal(shown.maps[:, 1], another.maps[:, 1])
+    assert not unseen.is_same_place.any()
+
+
 def test_several_demonstrations_are_combined(make, table):
     policy = make(n_demonstrations=2).eval()
+    policy.localizer.demonstrates_places.zero_()  # as after many episodes
     scene = batch_of(table, [0])
     one, other, both = (found_in(policy, scene, [RED], [episodes]) for episodes in ([0], [2], [0, 2]))
     for single in (one, other):
@@ -439,6 +455,7 @@ def test_replay_repeats_the_demonstration_in_its_own_scene(table):
         (True, False),
         torch.ones(1),
         torch.ones(1),
+        torch.zeros(1, dtype=torch.bool),
         located.locations[:1, 0],
     )
     policy.set_tasks([RED], [[policy.training_data.demonstrations[0]]])

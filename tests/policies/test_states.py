@@ -236,12 +236,18 @@ def test_a_release_keeps_the_height_and_the_rotation_that_were_demonstrated():
     # Turned by 2, and released 5 cm higher, as something tall
     shown = states[:1] + torch.where((dims >= 3) & (dims < 6), 2.0, 0.0)
     shown[:, 1, 2] += 0.05
-    moved = regressor.displacements(shown.expand(9, -1, -1), located.locations[1:10], located.heights[1:10])
+    new_place, same_place = torch.zeros(9, dtype=torch.bool), torch.ones(9, dtype=torch.bool)
+    given = (shown.expand(9, -1, -1), located.locations[1:10], located.heights[1:10])
+    moved = regressor.displacements(*given, new_place)
     release = shown[:, 1] + moved[:, 1] / scale
     wanted = torch.where(dims < 2, states[1:10, 1], shown[:, 1])
     assert ((release - wanted)[:, :2].abs() < 0.03).all()
     assert ((release - wanted)[:, 2].abs() < 0.01).all()
     torch.testing.assert_close(release[:, 3:6], wanted[:, 3:6])
+    # At a place that was found again, the camera sees the hand there, as high and as turned as it was.
+    release = shown[:, 1] + regressor.displacements(*given, same_place)[:, 1] / scale
+    torch.testing.assert_close(release[:, 2:6], shown[:, 1, 2:6].expand(9, -1))
+    torch.testing.assert_close(regressor.to_image(release), located.locations[1:10, 1], rtol=0, atol=1e-3)
     # Without names, whatever a place does not tell is kept.
     regressor.fit(recording.grasps, *recording.images, scale, shift, dims < 6)
     assert (regressor.follows_place[:2] > 0.8).all()

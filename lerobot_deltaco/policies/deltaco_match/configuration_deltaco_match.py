@@ -168,6 +168,9 @@ class MatchingSettings:
         min_held_out: Smallest number of episodes that are held out.
         n_checks: How often the held-out episodes are looked at.
         max_episodes: Number of episodes that are drawn for the fit, at most.
+        place_reach: How far from a release what stands at the place is looked for, in those of a grasp.
+        moved_place: How much more a place must look like the demonstrated one, as a cosine, than what is now
+            where that was.
         grasp_error: Distance from a grasp within which a proposal stands for the grasped object, where an
             image's edges are at -1 and 1, in addition to `grasp_size`.
         grasp_size: Part of that distance that grows with the objects, in their diameters.
@@ -209,6 +212,8 @@ class MatchingSettings:
     min_held_out: int = 4
     n_checks: int = 10
     max_episodes: int = 10_000
+    place_reach: float = 2.0
+    moved_place: float = 0.2
     grasp_error: float = 0.06
     grasp_size: float = 0.75
     template_weight: float = 20.0

@@ -27,6 +27,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_deltaco.policies.base.image_coordinates import gaussian_maps
@@ -53,6 +54,7 @@ from lerobot_deltaco.policies.scene.proposals import (
     Background,
     changed_areas,
     demonstrated_centers,
+    nearest_proposals,
 )
 
 logger = logging.getLogger(__name__)
@@ -277,6 +279,39 @@ class FeatureMatching(nn.Module):
         alike = self.refine(full_resolution, proposals, sizes, templates)
         return torch.where((novelty > _NOVEL)[:, None], alike, expected)
 
+    def find_places(self, scenes: Tensor, first_images: Tensor, grasps: Tensor, releases: Tensor) -> Tensor:
+        """Finds where demonstrated places are now, (batch, 2) in -1..1.
+
+        What stands where a demonstration released its object, in its first image, is looked for among the
+        proposals in the scene, and where it stood then: it may not stand out, as whatever never moves.
+
+        Args:
+            scenes: First images of episodes at full resolution, (batch, 3, H, W), uint8 or in 0..1.
+            first_images: Those of the demonstrations, (batch, 3, H', W').
+            grasps: Where they grasped, (batch, 2) in -1..1; NaN where that is not known.
+            releases: Where they released, (batch, 2).
+        """
+        rows = torch.arange(len(scenes), device=scenes.device)
+        proposed = self.background(first_images)
+        is_grasped = (proposed - grasps[:, None]).norm(dim=2) < self.grasp_radius
+        proposed = proposed.masked_fill(is_grasped[..., None], torch.nan)
+        nearest, is_near = nearest_proposals(
+            proposed, releases, self.settings.place_reach * self.grasp_radius
+        )
+        at = torch.where(is_near[:, None], proposed[rows, nearest], releases)
+        candidates = torch.cat([self.background(scenes), at[:, None]], dim=1)
+        features = self.compare.inputs(self.features(scenes, candidates))
+        demonstrated = self.compare.inputs(self.features(first_images, at[:, None]))
+        cosines = F.cosine_similarity(features, demonstrated, dim=2)
+        cosines = cosines.masked_fill(candidates[..., 0].isnan(), -1)
+        # Where nothing stands out, or where it looks as it did, the place has not moved.
+        best, chosen = cosines.max(dim=1)
+        has_moved = is_near & (cosines[:, -1] < best - self.settings.moved_place)
+        chosen = torch.where(has_moved, chosen, candidates.shape[1] - 1)
+        found = candidates[rows, chosen]
+        scale = self.object_sizes(found) / self.object_sizes(at)
+        return (found + scale[:, None] * (releases - at)).clamp(-1, 1)
+
     def novelty(self, instructions: Sequence[str]) -> Tensor:
         """Returns how likely demonstrated objects are new to the training, (batch,) in 0..1.
 
@@ -367,3 +402,14 @@ class FeatureMatching(nn.Module):
         """Returns the diameters of objects at locations (..., 2), as fractions of the image's side."""
         # Not as a product of matrices, which autocast would round.
         return self.background.object_size * (locations * self.background.perspective).sum(dim=-1).exp()
+
+
+def other_episodes(tasks: Sequence[str]) -> Tensor:
+    """Returns the row of the next episode of the same task, (episodes,); its own if there is none."""
+    of_task: dict[str, list[int]] = {}
+    for row, task in enumerate(tasks):
+        of_task.setdefault(task, []).append(row)
+    others = torch.arange(len(tasks))
+    for rows in of_task.values():
+        others[rows] = torch.tensor(rows).roll(-1)
+    return others

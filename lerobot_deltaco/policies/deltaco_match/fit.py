@@ -15,7 +15,7 @@ from tqdm import tqdm
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.augmentation import change_colors, random_color_changes
 from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
-from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching
+from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching, other_episodes
 from lerobot_deltaco.policies.deltaco_match.matching_head import Crops, MatchingHead, word_scores
 from lerobot_deltaco.policies.deltaco_match.words import UNKNOWN_WORD, encode_words
 from lerobot_deltaco.policies.scene.proposals import (
@@ -119,7 +119,7 @@ def fit_feature_matching(
         )
         steps = settings.refinement_steps
         matching.refine.fit(*grasped, held_out[is_kept], steps, generator, autocast)
-        matching.refine.measure_templates(*grasped, _other_episodes(kept_tasks).to(device))
+        matching.refine.measure_templates(*grasped, other_episodes(kept_tasks).to(device))
     matching.requires_grad_(False)
     for weights in matching.parameters():
         weights.grad = None
@@ -172,17 +172,6 @@ def _propose(
     usual_error = float(errors[stands_out].median()) if stands_out.any() else 0.0
     shown, _ = demonstrated_centers(proposed, changed, grasps, grasps, matching.grasp_radius, usual_error)
     return proposed, shown
-
-
-def _other_episodes(tasks: Sequence[str]) -> Tensor:
-    """Returns the row of the next episode of the same task, (episodes,); its own if there is none."""
-    of_task: dict[str, list[int]] = {}
-    for row, task in enumerate(tasks):
-        of_task.setdefault(task, []).append(row)
-    others = torch.arange(len(tasks))
-    for rows in of_task.values():
-        others[rows] = torch.tensor(rows).roll(-1)
-    return others
 
 
 def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:

@@ -29,6 +29,7 @@ from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.augmentation import change_colors, random_shifts, shift_images
 from lerobot_deltaco.policies.base.image_coordinates import (
+    gaussian_maps,
     grid_of_centers,
     mean_location,
     mean_near,
@@ -36,7 +37,7 @@ from lerobot_deltaco.policies.base.image_coordinates import (
 )
 from lerobot_deltaco.policies.base.losses import location_loss
 from lerobot_deltaco.policies.base.networks import Film, channels_last, conv_norm_relu
-from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching
+from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching, other_episodes
 from lerobot_deltaco.policies.deltaco_match.prompts import choose_prompted, describe_prompts
 from lerobot_deltaco.policies.deltaco_match.words import INSTRUCTION_DIM, InstructionEncoder, encode_words
 from lerobot_deltaco.policies.scene.camera_motion import CameraMotion
@@ -47,6 +48,7 @@ _PEAK_RADIUS = 1  # of the cells around the maximum whose mean is a location
 _SHIFT_PADDING = 4  # px, of the random shifts of images in training
 _P_PLACE_BY_DEMONSTRATION = 0.25  # of samples in training; in the others, the instruction says where
 _MIN_ATTENTION = 1e-9
+_MAX_MEASURED = 40  # episodes in which places are measured, at most
 
 
 class PickPlace(NamedTuple):
@@ -63,6 +65,7 @@ class PickPlace(NamedTuple):
         confidence: Probability of the object at the pick location among what is proposed, (batch,).
         place_confidence: Probability of the place map within an object's radius of the place location,
             (batch,).
+        is_same_place: Whether the place is the (first) demonstration's, found again, (batch,) bool.
         proposal: The proposal that was chosen, (batch, 2) in -1..1.
         demonstrated: Center of what the (first) demonstration grasped, in its first image, (batch, 2); None
             without demonstrations.
@@ -78,6 +81,7 @@ class PickPlace(NamedTuple):
     by_demonstration: tuple[bool, bool]
     confidence: Tensor
     place_confidence: Tensor
+    is_same_place: Tensor
     proposal: Tensor
     demonstrated: Tensor | None = None
     demonstrated_grasp: Tensor | None = None
@@ -91,12 +95,14 @@ class DemonstrationBatch(NamedTuple):
         ends: First and last images, (batch, demonstrations, 2, 3, H, W) in 0..1.
         first_images: First images at the camera's own resolution, (batch, demonstrations, 3, H', W') uint8.
         picks: Locations of the grasps, (batch, demonstrations, 2) in -1..1; NaN where they are not known.
+        places: Locations of the releases, (batch, demonstrations, 2) in -1..1; NaN where they are not known.
         heights: Height offsets of the grasps, (batch, demonstrations); NaN where they are not known.
     """
 
     ends: Tensor
     first_images: Tensor
     picks: Tensor
+    places: Tensor
     heights: Tensor
 
 
@@ -111,7 +117,10 @@ class Localizer(nn.Module):
         attention: Finds what demonstrations moved, and where to.
         place: Finds where to place it.
         instruction_encoder: Embeds instructions for `place`.
+        demonstrates_places: Whether demonstrations say where to place, () bool. See `measure_places`.
     """
+
+    demonstrates_places: Tensor
 
     def __init__(self, vocabulary: Sequence[str]) -> None:
         super().__init__()
@@ -119,6 +128,7 @@ class Localizer(nn.Module):
         self.attention = DemonstrationAttention()
         self.place = PlaceNetwork(INSTRUCTION_DIM)
         self.instruction_encoder = InstructionEncoder(len(vocabulary))
+        self.register_buffer("demonstrates_places", torch.zeros((), dtype=torch.bool))
 
     @torch.no_grad()
     def forward(
@@ -170,6 +180,16 @@ class Localizer(nn.Module):
         pick = matching.grasps(full_resolution, proposal, templates, novelty)
         target = None if attention is None or last is None else self.place.target(last, attention[:, 1])
         place_maps = self._place_maps(scenes, by_instruction, instructions, target)
+        is_same_place = torch.zeros_like(by_instruction)
+        if given is not None and bool(self.demonstrates_places):
+            is_same_place = ~given.places[:, 0].isnan().any(dim=1)
+            assert centers is not None
+            # An object that is held elsewhere than in the demonstration is released elsewhere.
+            held = (pick - proposal) - (given.picks[:, 0] - centers)
+            is_other = held.norm(dim=1) > matching.object_sizes(proposal) / 2
+            held = torch.where(is_other[:, None], held, 0.0)
+            demonstrated = self._demonstrated_place_maps(place_maps, full_resolution, given, held)
+            place_maps = torch.where(is_same_place[:, None, None], demonstrated, place_maps)
         place = peak_locations(place_maps[:, None])[:, 0]
         grid = grid_of_centers(place_maps.shape[1], place_maps.shape[2], place_maps.device)
         at_place = torch.cdist(place[:, None], grid)[:, 0] < matching.grasp_radius
@@ -182,6 +202,7 @@ class Localizer(nn.Module):
             by_demonstration=(given is not None, given is not None and not bool(by_instruction.all())),
             confidence=confidence,
             place_confidence=(place_maps.flatten(1).softmax(dim=1) * at_place).sum(dim=1),
+            is_same_place=is_same_place,
             proposal=proposal,
             demonstrated=centers,
             demonstrated_grasp=None if given is None else given.picks[:, 0],
@@ -210,6 +231,41 @@ class Localizer(nn.Module):
         if target is None:
             target = torch.zeros(len(scenes), TARGET_DIM, device=scenes.device)
         return self.place(scenes, instruction, torch.where(by_instruction[:, None], 0.0, target))
+
+    def _demonstrated_place_maps(
+        self, like: Tensor, scenes: Tensor, given: DemonstrationBatch, offsets: Tensor
+    ) -> Tensor:
+        """Returns maps that peak beside where demonstrated places are now, as logits like other maps."""
+        first_images, picks, places = (part[:, 0] for part in (given.first_images, given.picks, given.places))
+        found = self.matching.find_places(scenes, first_images, picks, places.nan_to_num()) + offsets
+        height, width = like.shape[1:]
+        std = 2 * self.matching.settings.map_std / torch.tensor([width, height], device=like.device)
+        return gaussian_maps(found[:, None], height, width, std)[:, 0].clamp_min(_MIN_ATTENTION).log()
+
+    @torch.no_grad()
+    def measure_places(self, images: Tensor, locations: Tensor, tasks: Sequence[str]) -> None:
+        """Decides whether demonstrations say where to place: after few episodes, if that is right.
+
+        After many, the place network is better. Where a container stands somewhere else in each episode and
+        does not stand out, the demonstration says nothing.
+
+        Args:
+            images: First images of training episodes at full resolution, (episodes, 3, H, W) uint8.
+            locations: Their pick and place locations, (episodes, 2, 2) in -1..1.
+            tasks: Task of each episode.
+        """
+        matching = self.matching
+        self.demonstrates_places.zero_()
+        others = other_episodes(tasks)
+        rows = (others != torch.arange(len(others))).nonzero().flatten()
+        rows = rows[:: max(1, -(-len(rows) // _MAX_MEASURED))]
+        if int(matching.n_episodes) > matching.settings.few_episodes or not len(rows):
+            return
+        shown = others[rows]
+        grasps, releases = locations[shown].unbind(dim=1)
+        found = matching.find_places(images[rows], images[shown], grasps, releases)
+        error = (found - locations[rows, 1]).norm(dim=1).median()
+        self.demonstrates_places.copy_(error < matching.grasp_radius)
 
     def losses(
         self,

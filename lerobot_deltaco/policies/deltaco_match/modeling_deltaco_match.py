@@ -406,9 +406,21 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             torch.stack([shown.frames[[0, -1]] for shown in flat]).to(device).float() / 255,
             torch.stack([s.frames[0] if s.first_image is None else s.first_image for s in flat]).to(device),
             self.state_regressor.pick_locations(states),
+            self._release_locations(flat).to(device),
             self.state_regressor.heights(states),
         )
         return DemonstrationBatch(*(part.unflatten(0, (-1, n_each)) for part in parts))
+
+    def _release_locations(self, demonstrations: Sequence[Demonstration]) -> Tensor:
+        """Returns where demonstrations released what they moved, (demonstrations, 2); NaN if unknown."""
+        locations = torch.full((len(demonstrations), 2), torch.nan)
+        command = self.config.gripper_command
+        if bool(self.localizer.demonstrates_places) and command is not None:
+            for row, demonstration in zip(locations, demonstrations, strict=True):
+                found = self.replay.trajectory(demonstration, command)
+                if isinstance(found, Trajectory):
+                    row.copy_(self.state_regressor.to_image(found.grasp_states[1:]).clamp(-1, 1)[0])
+        return locations
 
     def _fuse_inputs(
         self,
@@ -468,7 +480,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         trajectories = [each if isinstance(each, Trajectory) else trajectories[0] for each in read]
         states = torch.stack([each.grasp_states for each in trajectories])  # (batch, 2, state)
         displacements = self.state_regressor.displacements(
-            states, localization.locations, localization.heights
+            states, localization.locations, localization.heights, localization.is_same_place
         )
         return self.replay.start(trajectories, self._unlimited_state(batch), displacements), replayed
 
@@ -578,13 +590,14 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         assert self.training_data is not None
         assert self.training_locations is not None
         bank, located = self.training_data.demonstrations, self.training_locations
+        first_images = bank.frames[:, 0] if bank.first_images is None else bank.first_images
         sentences = self._sentences(bank.tasks)
         self._forget_words(chain.from_iterable(sentences.values()))
         held_out = fit_feature_matching(
             self.localizer.matching,
             bank.frames[:, 0],
             bank.frames[:, -1],
-            bank.frames[:, 0] if bank.first_images is None else bank.first_images,
+            first_images,
             torch.where(located.has_grasp[:, None], located.locations[:, 0], torch.nan),
             located.heights,
             bank.tasks,
@@ -592,6 +605,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             self.seed,
             in_bfloat16=self.config.precision == "bfloat16",
         )
+        rows = located.has_grasp.nonzero().flatten().cpu()
+        tasks = [bank.tasks[row] for row in rows.tolist()]
+        self.localizer.measure_places(first_images[rows], located.locations[rows], tasks)
         self.config.held_out_episodes = bank.episodes[held_out].tolist()
         self.config.n_dataset_frames = None if self._meta is None else self._meta.total_frames
 

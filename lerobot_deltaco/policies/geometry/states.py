@@ -276,7 +276,9 @@ class StateRegressor(nn.Module):
         ratio = ratio / torch.where(is_open, ratio, 1.0).min()
         self.rest_scale.copy_(torch.where(is_open, 1 / (spread * ratio), 0.0))
 
-    def displacements(self, demonstrated: Tensor, locations: Tensor, heights: Tensor) -> Tensor:
+    def displacements(
+        self, demonstrated: Tensor, locations: Tensor, heights: Tensor, is_same_place: Tensor
+    ) -> Tensor:
         """Returns how far the states at a demonstrated grasp and release are from those at other locations.
 
         Args:
@@ -284,17 +286,26 @@ class StateRegressor(nn.Module):
                 (batch, 2, state).
             locations: Where to pick and place instead, (batch, 2, 2) in -1..1.
             heights: Height offset of each grasp, (batch,).
+            is_same_place: Whether the place is the demonstrated one, wherever it stands now, (batch,) bool.
 
         Returns:
             As the policy gets states, (batch, 2, state).
         """
         moved = self(locations, heights)
         # Relative to what is expected of such a demonstration: how it grasped is kept, beside the middle or
-        # with the hand turned. Where it released is chance.
+        # with the hand turned. Where it released is chance, unless its place was found again.
         at = self.to_image(demonstrated).clamp(-1, 1)
-        pick = moved[:, 0] - self(at, self.heights(demonstrated[:, 0]))[:, 0]
+        expected = self(at, self.heights(demonstrated[:, 0]))
         release = demonstrated[:, 1] * self.state_scale + self.state_shift
-        return torch.stack([pick, self.follows_place * (moved[:, 1] - release)], dim=1)
+        by_chance = self.follows_place * (moved[:, 1] - release)
+        if self.to_image.has_camera:  # as high above the place as it was
+            same = (
+                self.to_image.positions_at(locations[:, 1], demonstrated[:, 1]) - demonstrated[:, 1]
+            ) * self.state_scale
+        else:
+            same = moved[:, 1] - expected[:, 1]
+        place = torch.where(is_same_place[:, None], same, by_chance)
+        return torch.stack([moved[:, 0] - expected[:, 0], place], dim=1)
 
     def heights(self, pick_states: Tensor) -> Tensor:
         """Returns the height offsets of grasps, (grasps,); NaN for a grasp that is not known.
