@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
 from collections.abc import Sequence
 from contextlib import closing
@@ -238,6 +239,39 @@ def draw_locations(out: Path) -> None:
     picture.quantize(256).save(out / "found.png", optimize=True)
 
 
+def draw_finding(path: Path, out: Path) -> None:
+    """Draws how often objects are found by the number of training episodes and objects.
+
+    Args:
+        path: What `benchmarks/finding.py --out` wrote.
+        out: Folder to write to.
+    """
+    rates: dict[tuple[str, int], dict[int, list[dict[str, float]]]] = {}
+    for line in path.read_text().splitlines():
+        row = json.loads(line)
+        kind, *numbers = row["case"].split("-")
+        if kind == "gym":
+            n_objects, n_episodes = map(int, numbers)
+            rates.setdefault((row["scenes"], n_objects), {})[n_episodes] = row["seeds"]
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.2), layout="constrained", sharey=True)
+    titles = {"same": "Trained objects in new scenes", "new": "New objects"}
+    for (scenes, n_objects), by_episodes in sorted(rates.items()):
+        ax, episodes = axes[[*titles].index(scenes)], sorted(by_episodes)
+        for name, style in (("both", "o-"), ("raw", ":")):
+            values = [100 * np.mean([seed[name] for seed in by_episodes[n]]) for n in episodes]
+            color, label = {4: ACCENT, 8: "#1f6fb2", 24: "#3a7d34"}[n_objects], f"{n_objects} objects"
+            ax.plot(episodes, values, style, color=color, label=label if name == "both" else None)
+    for ax, title in zip(axes, titles.values(), strict=True):
+        ax.set(title=title, xscale="log", xlabel="training episodes", xticks=[30, 100, 300], ylim=(70, 101))
+        ax.set_xticks([], minor=True)
+        ax.set_xticklabels(["30", "100", "300"])
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("right object, %")
+    axes[0].plot([], [], ":", color="gray", label="without a fit")
+    axes[0].legend(loc="lower right", fontsize=8)
+    figure.savefig(out / "finding.png")
+
+
 def main(out: Path = Path("docs/images")) -> None:
     """Draws all images.
 
@@ -253,6 +287,7 @@ def main(out: Path = Path("docs/images")) -> None:
         draw_scenes(out / f"{name}.png", TASK_SETS[name][:12], SceneConfig(objects=name))
         draw_ambiguity(out)
         draw_joint_control(out)
+        draw_finding(Path("results/finding_few_objects.jsonl"), out)
     draw_policy(out)
     draw_locations(out)
     shipped = collect_results(read_records(Path("results/shipped")))

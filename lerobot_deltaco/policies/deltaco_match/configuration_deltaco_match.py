@@ -151,13 +151,13 @@ class MatchingSettings:
     Args:
         p_other_object: Probability that a demonstration shows another object than the one that the words
             describe, if all of them are known and no proposal matches the demonstrated instance.
-        sharpness: How much more similarities count than in the fit, where dropout disturbs them.
+        sharpness: Factor of the cosines when the policy acts; 1 in the fit, where dropout makes them noisy.
         p_misdescribed: Probability that words describe another object than is meant: people see other colors
             and shapes in it.
         shown_word_weight: Pages mark words above this weight as describing the object.
         map_std: Standard deviation of a candidate in a map, in cells.
-        min_coverage: Fraction of the grasps of training episodes at something that stands out from the
-            background, below which a warning says so.
+        min_coverage: If fewer of the training grasps than this fraction are at something that stands out, a
+            warning says so.
         feature_weight: Weight of the cosine of the encoder's features beside that of learned descriptors.
         max_variants: Number of variants of each scene, of which some have other colors, at most.
         variant_scenes: Scenes and variants together are about this many, at most.
@@ -174,8 +174,8 @@ class MatchingSettings:
         grasp_error: Distance from a grasp within which a proposal stands for the grasped object, where an
             image's edges are at -1 and 1, in addition to `grasp_size`.
         grasp_size: Part of that distance that grows with the objects, in their diameters.
-        template_weight: Weight of the correlation of a proposal with the demonstrated grasp, where an unknown
-            word describes the object: the object is new, and the learned descriptors tell less of it.
+        template_weight: Weight of a proposal's correlation with the demonstrated grasp, for new objects: the
+            learned descriptors tell less of them.
         few_episodes: Number of training episodes up to which a demonstration without an instruction is taken
             to show a new object, whose grasp looks like the demonstrated one.
         template_reach: How far from a proposal the demonstrated grasp is looked for, in diameters.
@@ -184,7 +184,8 @@ class MatchingSettings:
         max_matching_steps: Largest number of steps.
         matching_draws: How often each scene is drawn in them, as far as these bounds allow.
         matching_batch: Pairs of scene and demonstration in a step.
-        initial_separation: Logit between the median right and the median wrong cosine before the fit.
+        initial_separation: Distance, as logits, to which the median right and wrong cosines are scaled before
+            the fit.
         sharpnesses: Factors of the scores, among which held-out episodes choose.
         learning_rate: Highest learning rate of the matching head.
         scale_learning_rate: Highest learning rate of the scales of the cosines and of the gate.
@@ -194,7 +195,7 @@ class MatchingSettings:
         p_drop_word: Probability that a word is left out in a step, so that none is indispensable.
         word_penalty: Loss of a word's weight: words that tell nothing would only add noise.
         common_word_penalty: How much more the weight of a word costs that is in every sentence.
-        common_fraction: Fraction of the sentences from which on a word costs more.
+        common_fraction: A word in more than this fraction of the sentences costs more.
     """
 
     p_other_object: float = 0.5

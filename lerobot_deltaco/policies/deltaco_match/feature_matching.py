@@ -69,8 +69,8 @@ class Candidates(NamedTuple):
 
     Attributes:
         locations: The proposals, (batch, n, 2) in -1..1; NaN where there is none.
-        log_probabilities: How likely each is what the task asks for, (batch, n). What they lack to 1 is the
-            probability that it is none of them.
+        log_probabilities: How likely each is what the task asks for, (batch, n). The probabilities sum to
+            less than 1; the rest is that of none of these.
         heights: Height offset of a grasp of each, (batch, n).
         radius: Distance from a candidate within which others are of the same object.
     """
@@ -126,7 +126,7 @@ class FeatureMatching(nn.Module):
         encoder: Describes crops of images.
         fitted: Whether it has been fitted, () bool.
         sharpness: Factor of the scores, (), and
-        error_rate: the rate of errors that no score excludes, (), by held-out episodes.
+        error_rate: how often even the surest choice is wrong, (), by held-out episodes.
         held_out: Number of held-out episodes in which the object was found, and of all, (2,) int64.
         n_episodes: Number of training episodes, () int64.
     """
@@ -182,7 +182,9 @@ class FeatureMatching(nn.Module):
                 `Described`.
             novelty: How likely each demonstrated object is new to the training, (batch,). See `novelty`.
         """
-        with torch.autocast(scenes.device.type, enabled=False):  # as exact for one scene as for many
+        with torch.autocast(
+            scenes.device.type, enabled=False
+        ):  # a scene's result must not depend on its batch
             locations = self.background(scenes)
             crops = self.compare(self.features(scenes, locations))
             words = encode_words(instructions, self.vocabulary).to(scenes.device)
@@ -214,7 +216,7 @@ class FeatureMatching(nn.Module):
         scores = word_scores(crops.words, words, weights)
         matches = similarity = torch.zeros_like(scores)
         if described is not None:
-            # How well known words describe the object. A new noun leaves the demonstration in charge.
+            # How surely known words describe the object. With a new noun, the demonstration decides.
             p_unknown = self._p_unknown(words)
             p_described = (1 - p_unknown) * (weights * (words > UNKNOWN_WORD)).amax(dim=1)
             matches, similarity = self.compare.match(
@@ -315,7 +317,8 @@ class FeatureMatching(nn.Module):
     def novelty(self, instructions: Sequence[str]) -> Tensor:
         """Returns how likely demonstrated objects are new to the training, (batch,) in 0..1.
 
-        They are if an unknown word describes them; and without an instruction, after few training episodes.
+        They are new if an unknown word describes them or, without an instruction, after few training
+        episodes.
         """
         words = encode_words(instructions, self.vocabulary).to(self.fitted.device)
         of_few = (self.n_episodes <= self.settings.few_episodes).to(self.sharpness)
@@ -324,7 +327,7 @@ class FeatureMatching(nn.Module):
 
     @property
     def report(self) -> str:
-        """How often the object was found where that was not learned."""
+        """How often the object was found in held-out episodes."""
         n_right, n_all = self.held_out.tolist()
         if not n_all:
             return "too few episodes to hold some out"

@@ -73,8 +73,8 @@ def fit_feature_matching(
     """
     settings = matching.settings
     generator, device = torch.Generator().manual_seed(seed), images.device
-    # Without its cache, which would keep the weights of the first step: it is only emptied at the end of the
-    # outermost context, here the one in which the policy is trained.
+    # No weight cache: it is emptied only when the outermost autocast ends, so that the weights of the first
+    # step would stay.
     autocast = torch.autocast(device.type, torch.bfloat16, enabled=in_bfloat16, cache_enabled=False)
     grasps = (~locations.isnan().any(dim=1)).nonzero().flatten().cpu()
     drawn = grasps[torch.randperm(len(grasps), generator=generator)[: settings.max_episodes]].sort().values
@@ -175,7 +175,7 @@ def _propose(
 
 
 def _held_out(tasks: Sequence[str], settings: MatchingSettings) -> Tensor:
-    """Chooses episodes that are held out, evenly spaced and no task's last but one, (episodes,) bool."""
+    """Chooses evenly spaced episodes to hold out; each task keeps at least two, (episodes,) bool."""
     held_out, left = torch.zeros(len(tasks), dtype=torch.bool), Counter(tasks)
     n_wanted = max(settings.min_held_out, len(tasks) // settings.held_out_every)
     if len(tasks) < settings.held_out_every * settings.min_held_out * 0.75:
@@ -202,8 +202,8 @@ def _crops_of_proposals(
 
     The last crop of each scene is of what was grasped, as a demonstration shows it.
 
-    A scene in which no proposal is near the grasp is left out. Few scenes have variants: crops that are a
-    little off, and of every second variant from the third on, of other colors, as of new objects.
+    A scene in which no proposal is near the grasp is left out. If there are few scenes, each has variants,
+    whose crops are a little off; variants 2, 4, ... have other colors, too, as of new objects.
 
     Returns:
         (variants, scenes, n + 1, features), (scenes, n) in radii within which a proposal stands for what was
@@ -372,7 +372,7 @@ def object_loss(log_probabilities: Tensor, is_object: Tensor) -> Tensor:
 def _begin_at_features(
     head: MatchingHead, features: Tensor, is_grasped: Tensor, pairs: tuple[Tensor, Tensor], separation: float
 ) -> None:
-    """Sets the scales and the gate to where the features' cosines separate objects from other proposals."""
+    """Sets scales and gate so that they separate right from wrong proposals before the first step."""
     scenes, others = (rows.to(features.device) for rows in pairs)
     crops = head.describe(features[scenes, :-1].float())
     shown = head.describe(features[others, -1:].float())

@@ -60,8 +60,8 @@ class PickPlace(NamedTuple):
         maps: Pick and place maps over the scenes, as logits (batch, 2, h, w).
         attention: Maps of what the (first) demonstration moved and where it was put, (batch, 2, h, w); None
             without demonstrations.
-        by_demonstration: Whether the demonstration decided on the pick and on the place location. Otherwise,
-            the attention is meaningless.
+        by_demonstration: Whether a demonstration was used for the pick, and its attention for the place;
+            where not, that map of `attention` means nothing.
         confidence: Probability of the object at the pick location among what is proposed, (batch,).
         place_confidence: Probability of the place map within an object's radius of the place location,
             (batch,).

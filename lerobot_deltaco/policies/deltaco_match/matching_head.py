@@ -127,7 +127,8 @@ class MatchingHead(nn.Module):
             crops: Crops of the proposals.
             described: Descriptors of the demonstrated objects, (batch, descriptor).
             sharpness: Factor of the similarities.
-            p_other: Probability that a demonstration shows another object, if no crop matches it, (batch,).
+            p_other: Probability, where no crop shows the demonstrated object, that the category descriptor
+                tells nothing either, (batch,).
 
         Returns:
             Log probabilities that the crops are meant, and cosines of the instance descriptors, (batch, n).

@@ -437,7 +437,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         return torch.cat([state, offsets.flatten(1)], dim=-1)
 
     def _unlimited_state(self, batch: dict[str, Any]) -> Tensor:
-        """Returns the robot's state as demonstrated states are scaled, (batch, state).
+        """Returns the robot's state, normalized but not clipped, (batch, state).
 
         A novel task may lead beyond the states of training, such as to another rotation of the hand.
         """
@@ -476,7 +476,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         trajectories = [each for each in read if isinstance(each, Trajectory)]
         if not trajectories:
             return None, replayed
-        # The others get any one, and do not follow it.
+        # Samples without one get a stand-in, whose actions are not used.
         trajectories = [each if isinstance(each, Trajectory) else trajectories[0] for each in read]
         states = torch.stack([each.grasp_states for each in trajectories])  # (batch, 2, state)
         displacements = self.state_regressor.displacements(

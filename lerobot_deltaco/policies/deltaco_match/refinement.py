@@ -4,8 +4,8 @@ A proposal is somewhere on an object. Two things tell where its grasp is. A smal
 surroundings, enlarged from the full resolution; it learns from the training episodes, whose grasps are known,
 at centers and sizes that are off at random. And the demonstration shows what the grasp looked like: its
 surroundings there are a template, which is correlated with those of the proposal. The network is more exact
-on objects of the training, and can be wrong on others. Each counts only where it comes nearer to the grasps
-than the proposals do: where a demonstrator grasps objects anywhere, a template does not.
+on objects of the training, and can be wrong on others. Each is used only if it comes nearer to other
+episodes' grasps than the proposals do; templates do not where the demonstrator grasps anywhere.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ def encode_words(sentences: Sequence[str], vocabulary: Sequence[str]) -> Tensor:
 class WordWeights(nn.Module):
     """Weighs words by whether they are about the object: "red" is in "red cup", and not in "red bin".
 
-    With other weights, by whether they are about the place. A weight depends on the word and on two words at
+    A second instance learns the same for the place. A weight depends on the word and on two words at
     either side.
 
     Args:

@@ -21,8 +21,8 @@ N_OBJECTS = 14  # proposed in a scene by `Background`, at most
 _SIDE = 128  # px, of the images as they are compared
 MAX_REMEMBERED, MAX_MEASURED = 48, 400  # images
 _MIN_IMAGES = 8
-# Fraction of the images that may show a pixel's color while it still stands out. It is more than an object
-# takes, and less than a container that stands in one of four places.
+# A pixel stands out if at most this fraction of the images has its color. Objects cover a pixel in fewer, a
+# container with four possible places in more (25 %).
 _COMMON = 0.17
 _MIN_CONTRAST = 0.03  # of colors in 0..1
 _NOISE_FACTOR = 4.0  # by which a contrast exceeds the median of a scene
@@ -174,8 +174,8 @@ class Background(nn.Module):
             return torch.ones(len(scenes), _SIDE, _SIDE, device=self.images.device)
         if self._bounds is None or self._bounds[0].device != self.images.device:
             images = self.images[: int(self.n_images)]
-            # A pixel may lie between two of the image: its neighbors count, as far as they usually differ
-            # there, and not as the colors of an object do that stood there in one image.
+            # Colors between a pixel's and its neighbors' are common, too, as far as neighbors differ in the
+            # median image: an object that stood there once must not widen the range.
             least, most = (_over_neighbors(images, extreme) for extreme in (torch.minimum, torch.maximum))
             usual = (most.short() - least).median(dim=0).values  # (3, 128, 128)
             self._bounds = (
