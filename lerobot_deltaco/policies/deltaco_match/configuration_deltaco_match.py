@@ -168,7 +168,8 @@ class MatchingSettings:
         min_held_out: Smallest number of episodes that are held out.
         n_checks: How often the held-out episodes are looked at.
         max_episodes: Number of episodes that are drawn for the fit, at most.
-        place_reach: How far from a release what stands at the place is looked for, in those of a grasp.
+        place_reaches: How far from a release what stands at the place is looked for, in distances within
+            which a proposal stands for a grasped object. The fit chooses one; with 0, places never move.
         moved_place: How much more a place must look like the demonstrated one, as a cosine, than what is now
             where that was.
         grasp_error: Distance from a grasp within which a proposal stands for the grasped object, where an
@@ -177,7 +178,8 @@ class MatchingSettings:
         template_weight: Weight of a proposal's correlation with the demonstrated grasp, for new objects: the
             learned descriptors tell less of them.
         few_episodes: Number of training episodes up to which a demonstration without an instruction is taken
-            to show a new object, whose grasp looks like the demonstrated one.
+            to show a new object, whose grasp looks like the demonstrated one, and demonstrations may say
+            where to place.
         template_reach: How far from a proposal the demonstrated grasp is looked for, in diameters.
         refinement_steps: Steps of the fit of where on an object the gripper closes.
         min_matching_steps: Smallest number of steps of the fit of the matching head.
@@ -213,7 +215,7 @@ class MatchingSettings:
     min_held_out: int = 4
     n_checks: int = 10
     max_episodes: int = 10_000
-    place_reach: float = 2.0
+    place_reaches: tuple[float, ...] = (0.0, 1.0, 2.0)
     moved_place: float = 0.2
     grasp_error: float = 0.06
     grasp_size: float = 0.75

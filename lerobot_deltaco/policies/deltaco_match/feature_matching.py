@@ -281,7 +281,9 @@ class FeatureMatching(nn.Module):
         alike = self.refine(full_resolution, proposals, sizes, templates)
         return torch.where((novelty > _NOVEL)[:, None], alike, expected)
 
-    def find_places(self, scenes: Tensor, first_images: Tensor, grasps: Tensor, releases: Tensor) -> Tensor:
+    def find_places(
+        self, scenes: Tensor, first_images: Tensor, grasps: Tensor, releases: Tensor, reach: float
+    ) -> Tensor:
         """Finds where demonstrated places are now, (batch, 2) in -1..1.
 
         What stands where a demonstration released its object, in its first image, is looked for among the
@@ -292,14 +294,15 @@ class FeatureMatching(nn.Module):
             first_images: Those of the demonstrations, (batch, 3, H', W').
             grasps: Where they grasped, (batch, 2) in -1..1; NaN where that is not known.
             releases: Where they released, (batch, 2).
+            reach: How far from a release what stands at the place may be, in `grasp_radius`.
         """
+        if not reach:
+            return releases
         rows = torch.arange(len(scenes), device=scenes.device)
         proposed = self.background(first_images)
         is_grasped = (proposed - grasps[:, None]).norm(dim=2) < self.grasp_radius
         proposed = proposed.masked_fill(is_grasped[..., None], torch.nan)
-        nearest, is_near = nearest_proposals(
-            proposed, releases, self.settings.place_reach * self.grasp_radius
-        )
+        nearest, is_near = nearest_proposals(proposed, releases, reach * self.grasp_radius)
         at = torch.where(is_near[:, None], proposed[rows, nearest], releases)
         candidates = torch.cat([self.background(scenes), at[:, None]], dim=1)
         features = self.compare.inputs(self.features(scenes, candidates))

@@ -1,7 +1,8 @@
 r"""Finds where to pick and where to place, once, at the start of an episode.
 
 Feature matching chooses what to pick among proposals, by the demonstration and by the instruction's words.
-The place network finds where to place it, by the instruction, or by the demonstration if there is none:
+The place network finds where to place it, by the instruction, or by the demonstration if there is none; after
+few training episodes, the demonstrated place itself is looked for (`FeatureMatching.find_places`):
 
     demonstration's first and last image                 instruction
                |              |                               |
@@ -48,7 +49,7 @@ _PEAK_RADIUS = 1  # of the cells around the maximum whose mean is a location
 _SHIFT_PADDING = 4  # px, of the random shifts of images in training
 _P_PLACE_BY_DEMONSTRATION = 0.25  # of samples in training; in the others, the instruction says where
 _MIN_ATTENTION = 1e-9
-_MAX_MEASURED = 40  # episodes in which places are measured, at most
+_MAX_MEASURED = 24  # episodes in which places are measured, at most
 
 
 class PickPlace(NamedTuple):
@@ -118,9 +119,11 @@ class Localizer(nn.Module):
         place: Finds where to place it.
         instruction_encoder: Embeds instructions for `place`.
         demonstrates_places: Whether demonstrations say where to place, () bool. See `measure_places`.
+        place_reach: How far from a release what stands at the place may be, (). See `find_places`.
     """
 
     demonstrates_places: Tensor
+    place_reach: Tensor
 
     def __init__(self, vocabulary: Sequence[str]) -> None:
         super().__init__()
@@ -129,6 +132,7 @@ class Localizer(nn.Module):
         self.place = PlaceNetwork(INSTRUCTION_DIM)
         self.instruction_encoder = InstructionEncoder(len(vocabulary))
         self.register_buffer("demonstrates_places", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("place_reach", torch.zeros(()))
 
     @torch.no_grad()
     def forward(
@@ -237,17 +241,18 @@ class Localizer(nn.Module):
     ) -> Tensor:
         """Returns maps that peak beside where demonstrated places are now, as logits like other maps."""
         first_images, picks, places = (part[:, 0] for part in (given.first_images, given.picks, given.places))
-        found = self.matching.find_places(scenes, first_images, picks, places.nan_to_num()) + offsets
+        given_places = (scenes, first_images, picks, places.nan_to_num())
+        found = self.matching.find_places(*given_places, float(self.place_reach)) + offsets
         height, width = like.shape[1:]
         std = 2 * self.matching.settings.map_std / torch.tensor([width, height], device=like.device)
         return gaussian_maps(found[:, None], height, width, std)[:, 0].clamp_min(_MIN_ATTENTION).log()
 
     @torch.no_grad()
     def measure_places(self, images: Tensor, locations: Tensor, tasks: Sequence[str]) -> None:
-        """Decides whether demonstrations say where to place: after few episodes, if that is right.
+        """Decides whether demonstrations say where to place, and whether places move.
 
-        After many, the place network is better. Where a container stands somewhere else in each episode and
-        does not stand out, the demonstration says nothing.
+        Demonstrations do after few episodes, if that is right; after many, the place network is better. Where
+        a container stands somewhere else in each episode and does not stand out, they say nothing.
 
         Args:
             images: First images of training episodes at full resolution, (episodes, 3, H, W) uint8.
@@ -263,9 +268,13 @@ class Localizer(nn.Module):
             return
         shown = others[rows]
         grasps, releases = locations[shown].unbind(dim=1)
-        found = matching.find_places(images[rows], images[shown], grasps, releases)
-        error = (found - locations[rows, 1]).norm(dim=1).median()
-        self.demonstrates_places.copy_(error < matching.grasp_radius)
+        errors = {}
+        for reach in matching.settings.place_reaches:
+            found = matching.find_places(images[rows], images[shown], grasps, releases, reach)
+            errors[reach] = (found - locations[rows, 1]).norm(dim=1).clamp(max=1.0)
+        best = min(errors, key=lambda reach: float(errors[reach].mean()))
+        self.place_reach.fill_(best)
+        self.demonstrates_places.copy_(errors[best].median() < matching.grasp_radius)
 
     def losses(
         self,

@@ -10,9 +10,9 @@ r"""`deltaco_match`: describes what a demonstration moved, finds it in the scene
 
 Localization happens once, at the start of an episode. Feature matching chooses what to pick among proposals,
 by the demonstration and by the instruction's words; the place network finds where to place it, by the
-instruction, or by the demonstration if there is none. The policy network is given both locations, and how far
-the robot's state is from the state that it would have at each of them. After training on few episodes, the
-demonstration's trajectory is replayed instead, moved to both locations.
+instruction, or by the demonstration if there is none or if training episodes were few. The policy network is
+given both locations, and how far the robot's state is from the state that it would have at each of them.
+After training on few episodes, the demonstration's trajectory is replayed instead, moved to both locations.
 
 In training, feature matching is fitted first. The policy network is given the locations of each sample's own
 episode, with noise; they follow from the robot's states when the gripper closed and opened. So it does not
@@ -86,10 +86,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     Attributes:
         state_regressor: The robot's states at locations.
         replay: Replays demonstrations, if `acting` is "replay".
-        matching: Finds what to pick, and how high.
-        attention: Finds what a demonstration moved, and where it was put.
-        place: Finds where to place it.
-        instruction_encoder: Embeds instructions for `place`.
+        localizer: Finds where to pick and place.
         training_locations: Locations of the training episodes; None before `fit`.
     """
 
