@@ -34,7 +34,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_deltaco.data.demonstrations import Demonstration, RobotData
-from lerobot_deltaco.data.grasps import warn_of_missing
+from lerobot_deltaco.data.grasps import Grasp, find_grasps, warn_of_missing
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
 from lerobot_deltaco.data.gripper_states import find_gripper_states, find_positions
 from lerobot_deltaco.data.object_prompts import ObjectPrompt, read_prompt
@@ -519,12 +519,21 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         gripper_states.warn()
         n_grasps = int(grasps.has_grasp.sum())
         if n_grasps < MIN_EPISODES:
+            other = "high" if self.config.gripper_closed == "low" else "low"
+            reverse = find_grasps(-opening, robot.spans, states=robot.states)
+            n_reverse = sum(isinstance(each, Grasp) for each in reverse)
+            advice = (
+                f" If {other} values close it, {n_reverse} episodes have a grasp: set "
+                f"--policy.gripper_closed={other}."
+                if n_reverse >= MIN_EPISODES
+                else ""
+            )
             raise UserError(
                 f"`deltaco_match` learns where grasps are in the image from at least {MIN_EPISODES} "
                 f"episodes in which the gripper closes and opens. Got {n_grasps}. Collect more, or train "
                 "--policy.type=deltaco with --policy.demo_encoder=attention, which needs none. The gripper "
                 f"is dimension {self.config.gripper} of the action, whose {self.config.gripper_closed} "
-                "values close it; see --policy.gripper and --policy.gripper_closed."
+                f"values close it; see --policy.gripper and --policy.gripper_closed.{advice}"
             )
         scale, shift = (each.to(robot.states.device) for each in self._scaling(OBS_STATE))
         carried = robot.images_at(grasps.carried.tolist()).to(bank.frames.device)
