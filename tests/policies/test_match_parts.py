@@ -201,14 +201,15 @@ def both_ends(images):
     return torch.stack([images, images], dim=1)
 
 
-def fraction_found(matching, shapes, by_demonstration=False, words=lambda task: "", grasp=None):
+def fraction_found(matching, shapes, by_demonstration=False, words=lambda task: "", grasp=None, further=2):
     """Fraction of the other 12 episodes in which the object is found, by other episodes or by words.
 
+    Tasks alternate: an odd number of episodes further, the demonstration shows the other object.
     With `grasp`, the gripper closes there, and only the attention tells where the object was.
     """
     images, locations, tasks = (part[24:] for part in shapes)
     scenes = images.float() / 255
-    shown = [(n + 2) % 12 for n in range(12)]
+    shown = [(n + further) % 12 for n in range(12)]
     described = demonstrated = None
     if by_demonstration:
         attended = locations[shown]
@@ -231,6 +232,9 @@ def test_fit_finds_shapes_of_one_color_by_demonstrations_and_by_words(matching, 
     # Unknown words leave the demonstration in charge, and known ones still count.
     assert fraction_found(matching, shapes, True, lambda task: "the gizmo") >= 0.9
     assert fraction_found(matching, shapes, words=lambda task: "a b c") < 0.8
+    # What words name decides, whatever is demonstrated; words that name nothing do not.
+    assert fraction_found(matching, shapes, True, lambda task: task, further=3) >= 0.8
+    assert fraction_found(matching, shapes, True, lambda task: "the gizmo", further=3) < 0.2
     # An object that was pushed before its grasp is found where it was.
     for grasp in (2.0, torch.nan):
         assert fraction_found(matching, shapes, True, grasp=grasp) >= 0.9

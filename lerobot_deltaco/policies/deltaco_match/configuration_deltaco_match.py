@@ -154,6 +154,9 @@ class MatchingSettings:
         sharpness: Factor of the cosines when the policy acts; 1 in the fit, where dropout makes them noisy.
         p_misdescribed: Probability that words describe another object than is meant: people see other colors
             and shapes in it.
+        p_misdemonstrated: Probability that a demonstration shows another object than is meant, where known
+            words describe it. With both floors, what words name unmistakably in the scene is picked, whatever
+            is demonstrated; where they name nothing or several, the demonstration decides.
         shown_word_weight: Pages mark words above this weight as describing the object.
         map_std: Standard deviation of a candidate in a map, in cells.
         min_coverage: If fewer of the training grasps than this fraction are at something that stands out, a
@@ -203,6 +206,7 @@ class MatchingSettings:
     p_other_object: float = 0.5
     sharpness: float = 1.5
     p_misdescribed: float = 0.1
+    p_misdemonstrated: float = 0.3
     shown_word_weight: float = 0.5
     map_std: float = 0.8
     min_coverage: float = 0.75

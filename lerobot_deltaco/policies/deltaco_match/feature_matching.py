@@ -222,6 +222,11 @@ class FeatureMatching(nn.Module):
             matches, similarity = self.compare.match(
                 crops, described, settings.sharpness, settings.p_other_object * p_described
             )
+            # Of an object that known words describe, the demonstration may show another.
+            p_other = settings.p_misdemonstrated * p_described[:, None]
+            matches = (
+                torch.lerp(matches.exp(), uniform(crops.exists), p_other).clamp_min(_MIN_PROBABILITY).log()
+            )
             scores = (1 - p_unknown)[:, None] * scores
         by_words = (scores + crops.objectness).masked_fill(~crops.exists, -torch.inf).softmax(dim=1)
         by_words = torch.lerp(by_words, uniform(crops.exists), settings.p_misdescribed)
