@@ -180,9 +180,8 @@ class MatchingSettings:
         grasp_size: Part of that distance that grows with the objects, in their diameters.
         template_weight: Weight of a proposal's correlation with the demonstrated grasp, for new objects: the
             learned descriptors tell less of them.
-        few_episodes: Number of training episodes up to which a demonstration without an instruction is taken
-            to show a new object, whose grasp looks like the demonstrated one, and demonstrations may say
-            where to place.
+        few_episodes: Number of training episodes up to which demonstrations are better guides than what was
+            learned: grasps look like theirs, they may say where to place, and words do not outweigh them.
         template_reach: How far from a proposal the demonstrated grasp is looked for, in diameters.
         refinement_steps: Steps of the fit of where on an object the gripper closes.
         min_matching_steps: Smallest number of steps of the fit of the matching head.

@@ -222,8 +222,9 @@ class FeatureMatching(nn.Module):
             matches, similarity = self.compare.match(
                 crops, described, settings.sharpness, settings.p_other_object * p_described
             )
-            # Of an object that known words describe, the demonstration may show another.
-            p_other = settings.p_misdemonstrated * p_described[:, None]
+            # Of an object that known words describe, the demonstration may show another. After few episodes,
+            # words are known by heart, and the demonstration is the better guide.
+            p_other = settings.p_misdemonstrated * p_described[:, None] * ~self.has_few_episodes
             matches = (
                 torch.lerp(matches.exp(), uniform(crops.exists), p_other).clamp_min(_MIN_PROBABILITY).log()
             )
@@ -281,10 +282,14 @@ class FeatureMatching(nn.Module):
         """
         sizes = self.object_sizes(proposals)
         expected = self.refine(full_resolution, proposals, sizes)
-        if templates is None or novelty is None or not bool((novelty > _NOVEL).any()):
+        if templates is None or novelty is None:
+            return expected
+        # The network knows trained objects where they stood in training; after few episodes, not elsewhere.
+        is_alike = (novelty > _NOVEL) | self.has_few_episodes
+        if not bool(is_alike.any()):
             return expected
         alike = self.refine(full_resolution, proposals, sizes, templates)
-        return torch.where((novelty > _NOVEL)[:, None], alike, expected)
+        return torch.where(is_alike[:, None], alike, expected)
 
     def find_places(
         self, scenes: Tensor, first_images: Tensor, grasps: Tensor, releases: Tensor, reach: float
@@ -329,9 +334,14 @@ class FeatureMatching(nn.Module):
         episodes.
         """
         words = encode_words(instructions, self.vocabulary).to(self.fitted.device)
-        of_few = (self.n_episodes <= self.settings.few_episodes).to(self.sharpness)
+        of_few = self.has_few_episodes.to(self.sharpness)
         is_empty = torch.tensor([not text for text in instructions], device=self.fitted.device)
         return torch.where(is_empty, of_few, self._p_unknown(words))
+
+    @property
+    def has_few_episodes(self) -> Tensor:
+        """Whether demonstrations are better guides than what was learned from so few episodes, () bool."""
+        return self.n_episodes <= self.settings.few_episodes
 
     @property
     def report(self) -> str:

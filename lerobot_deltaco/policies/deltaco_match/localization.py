@@ -264,7 +264,7 @@ class Localizer(nn.Module):
         others = other_episodes(tasks)
         rows = (others != torch.arange(len(others))).nonzero().flatten()
         rows = rows[:: max(1, -(-len(rows) // _MAX_MEASURED))]
-        if int(matching.n_episodes) > matching.settings.few_episodes or not len(rows):
+        if not bool(matching.has_few_episodes) or not len(rows):
             return
         shown = others[rows]
         grasps, releases = locations[shown].unbind(dim=1)
