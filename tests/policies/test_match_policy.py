@@ -337,6 +337,12 @@ def test_after_few_episodes_demonstrations_say_where_to_place(make, table):
     assert another.is_same_place.all()
     assert not torch.equal(shown.maps[:, 1], another.maps[:, 1])
     assert not unseen.is_same_place.any()
+    # The sentence of another task says where.
+    other = found_in(policy, batch_of(table, [0]), [BLUE], [[0]])
+    assert not other.is_same_place.any()
+    torch.testing.assert_close(
+        other.maps[:, 1], found_in(policy, batch_of(table, [0]), [BLUE], [[]]).maps[:, 1]
+    )
 
 
 def test_several_demonstrations_are_combined(make, table):

@@ -56,6 +56,7 @@ from lerobot_deltaco.policies.deltaco_match.prompts import prompts_of
 from lerobot_deltaco.policies.deltaco_match.words import (
     encode_words,
     vocabulary_of,
+    words_of,
 )
 from lerobot_deltaco.policies.geometry.calibration import MIN_EPISODES
 from lerobot_deltaco.policies.geometry.replay import Reference, Trajectory, TrajectoryReplay
@@ -380,6 +381,14 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         scenes = self._camera_image(batch, camera)
         prompts = prompts_of(instructions, demonstrations)
         given = None if prompts else self.batch_demonstrations(demonstrations, scenes.device)
+        if given is not None:  # with the sentence of another task, that says where to place
+            first = [own[0] for own in demonstrations]
+            is_its_task = [
+                not text or (isinstance(shown, Demonstration) and words_of(text) == words_of(shown.task))
+                for text, shown in zip(instructions, first, strict=True)
+            ]
+            is_shown = torch.tensor(is_its_task, device=scenes.device)[:, None, None]
+            given = given._replace(places=torch.where(is_shown, given.places, torch.nan))
         found = self.localizer(scenes, batch[camera], instructions, given, prompts)
         return found._replace(heights=found.heights + self.config.grasp_height_bias)
 
