@@ -301,13 +301,16 @@ def test_objects_are_new_by_an_unknown_noun_or_without_words_after_few_episodes(
     assert matching.novelty([""]).tolist() == [0]
 
 
-def test_only_new_objects_are_grasped_as_in_the_demonstration(matching, shapes):
+def test_after_many_episodes_only_new_objects_are_grasped_as_in_the_demonstration(matching, shapes):
     scenes, proposals = shapes[0][24:28].float() / 255, shapes[1][24:28]
     templates = torch.rand(4, 1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
-    found = matching.grasps(scenes, proposals, templates, torch.tensor([0.0, 0.3, 0.7, 1.0]))
-    as_usual = matching.grasps(scenes, proposals)
+    given, as_usual = (scenes, proposals, templates), matching.grasps(scenes, proposals)
+    novelty, many = torch.tensor([0.0, 0.3, 0.7, 1.0]), copy.deepcopy(matching)
+    many.n_episodes.fill_(10_000)
+    found = many.grasps(*given, novelty)
     assert torch.equal(found[:2], as_usual[:2])
     assert (found[2:] != as_usual[2:]).any(dim=1).all()
+    assert (matching.grasps(*given, novelty) != as_usual).any(dim=1).all()  # after few, all are
 
 
 def test_what_disappeared_is_the_demonstrated_object_also_beside_others(matching, shapes):
