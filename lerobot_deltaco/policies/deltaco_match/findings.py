@@ -53,7 +53,8 @@ def describe_findings(
         sources.append("the point" if shown.image is None else "the photo")
     words = _quoted(dict(matching.understood(instruction))) if instruction else ""
     sources += [f"the words {words}"] if words else []
-    place_source = "the sentence" if instruction else "the demonstration"
+    is_shown = not instruction or bool(localization.is_same_place[0])
+    place_source = "the demonstration" if is_shown else "the sentence"
     lines = [
         f"Found in the first image by {camera}, {size[1]} x {size[0]} px:",
         f"  object: at {pick}, {localization.confidence[0].item():.0%} sure, by "
