@@ -95,7 +95,7 @@ def measure(case: finding.Case, n_scenes: int, seed: int) -> dict[str, list[Came
     reference = static_reference(torch.stack([seen(image, 0, 0) for image in drawn[:N_REMEMBERED]]))
     aspect = case.size[0] / case.size[1]
     return {
-        name: [estimate_motion(*reference, seen(image, *motion), aspect) for image in drawn[N_REMEMBERED:]]
+        name: [estimate_motion(reference, seen(image, *motion), aspect) for image in drawn[N_REMEMBERED:]]
         for name, motion in MOTIONS.items()
     }
 
@@ -123,7 +123,7 @@ def main() -> None:
                 [math.hypot(each.shift[0], each.shift[1] * height / width) for each in found]
             )
             turns, gains = (np.array([getattr(each, key) for each in found]) for key in ("turn", "gain"))
-            distances = 256 * np.array([each.motion for each in found])
+            distances = 256 * np.array([each.distance for each in found])
             sys.stdout.write(
                 f"{name:10} {motion:38} told in {told:5.1f} %; shift {np.median(shifts):5.1f} px, "
                 f"turn {np.median(abs(turns)):4.1f} degrees; motion {np.quantile(distances, 0.05):5.2f} to "

@@ -116,6 +116,7 @@ def use_short_fit(monkeypatch, steps=2, **settings):
         "grasp_error": 9.0,  # any proposal will do
         "min_matching_steps": steps,
         "max_matching_steps": steps,
+        "place_reaches": (0.0,),
         **settings,
     }
     monkeypatch.setattr(modeling_deltaco_match, "fit_feature_matching", fit_once)

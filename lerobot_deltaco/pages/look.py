@@ -177,16 +177,15 @@ def _dataset_episodes(
         ends = None
         if bank is not None:
             ends = np.stack([_image(dataset, row, camera) for row in data.spans[partner]])
-        scene = _image(dataset, data.spans[episode][0], camera)
+        images = {camera: observation[camera][None].to(config.device)}
+        image = policy.undo_camera_motion(images, localization.camera_motion)[camera][0]
+        scene = as_uint8(image).permute(1, 2, 0).cpu().numpy()
         picture = picture_uri(draw_localization(scene, ends, localization, recorded))
         matching = policy.localizer.matching
         words = describe_words(matching, task)
         sure = f"{100 * localization.confidence.item():.0f} % sure of the object. {words}"
         is_right = all(rights) if rights else None
-        crops = [
-            picture_uri(crop)
-            for crop in compared_crops(matching, localization, observation[camera].to(config.device), *given)
-        ]
+        crops = [picture_uri(crop) for crop in compared_crops(matching, localization, image, *given)]
         lines = [f"{where}.", sure]
         yield EpisodeView(task, "", [], is_right, headline, lines, picture, None, crops), rights
 

@@ -15,7 +15,7 @@ from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.video import load_conditioned
 from lerobot_deltaco.pages.arguments import PlayArguments
 from lerobot_deltaco.pages.html import TEMPLATES, picture_uri, render
-from lerobot_deltaco.pages.player import MAX_SEED, Choice, Player
+from lerobot_deltaco.pages.player import MAX_SEED, POINT, Choice, Player
 from lerobot_deltaco.pages.verdict import object_name
 from lerobot_deltaco.policies.deltaco_match.findings import demonstration_ends
 
@@ -30,6 +30,14 @@ except ModuleNotFoundError as error:
 
 TITLE = "DeL-TaCo: show it and say it"
 _REPLACE_ADDRESS = "(query) => { if (query) history.replaceState(null, '', query); }"
+# A click on the scene tells its place in thousandths of the image's sides.
+_POINT_AT = """element.addEventListener('click', (event) => {
+    if (event.target.id !== 'scene_image') return;
+    const box = event.target.getBoundingClientRect();
+    const at = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+    const point = at.map((each) => Math.round(1000 * Math.min(Math.max(each, 0), 1))).join(',');
+    trigger('click', { point });
+})"""
 # On a phone, the result is below the button.
 _SHOW_RESULT = "() => { if (innerWidth < 700) document.querySelector('#run').scrollIntoView(); }"
 
@@ -75,6 +83,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
         demo_number = gr.State(0)
         seen = gr.State((-1, -1, []))  # task and seed of the scene, and the sentences suggested in it
         address = gr.Textbox(visible="hidden")
+        point = gr.State("")
         with gr.Row(equal_height=False):
             with gr.Column(scale=4, min_width=340):
                 with gr.Row():
@@ -94,7 +103,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
                         names, label="Demonstration of task", scale=7, min_width=150, elem_id="demo_task"
                     )
                     record = gr.Button("Record one", scale=2, min_width=100, elem_id="record")
-                scene = gr.HTML(elem_id="scene")
+                scene = gr.HTML(elem_id="scene", js_on_load=_POINT_AT)
                 received = gr.Radio(
                     player.inputs,
                     label="The policy receives",
@@ -114,7 +123,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
                     compare = gr.Button("Compare 2 × 2", min_width=100, interactive=False, elem_id="compare")
                 result = gr.HTML("Press Run, or Enter in the instruction.", elem_id="result")
 
-        inputs = [task, seed, demo_task, demo_number, sentence, received]
+        inputs = [task, seed, demo_task, demo_number, sentence, received, point]
         outputs = [*inputs, scene, chips, seen, address]
 
         def show(choice: Choice) -> dict[Any, Any]:
@@ -124,6 +133,8 @@ def build_page(player: Player, name: str) -> gr.Blocks:
             shown = render(
                 "scene.html",
                 scene=picture_uri(image),
+                point=choice.prompt.box[:2] if choice.inputs == POINT and choice.prompt else None,
+                can_point=POINT in player.inputs,
                 objects=[object_name(item.label) for item in layout.objects],
                 ends=[picture_uri(end) for end in demonstration_ends(player.demonstration(choice))],
             )
@@ -163,6 +174,11 @@ def build_page(player: Player, name: str) -> gr.Blocks:
         def record_another(*values: Any) -> dict[Any, Any]:
             return show(Choice(*values)._replace(demo_number=random.randint(1, MAX_SEED)))
 
+        def point_at(event: gr.EventData, *values: Any) -> dict[Any, Any]:
+            if POINT not in player.inputs:
+                return gr.skip()
+            return show(Choice(*values)._replace(inputs=POINT, point=event.point))
+
         def run_episodes(choose: Callable[[Choice], list[Choice]]) -> Callable[..., dict[Any, Any]]:
             """Returns the handler that runs what `choose` makes of the user's choice."""
 
@@ -186,6 +202,7 @@ def build_page(player: Player, name: str) -> gr.Blocks:
         on([task.input, seed.submit, seed.blur], change_scene, [seen, *inputs], outputs, **quiet)
         on([new_scene.click], draw_scene, [seen, *inputs], outputs, **quiet)
         on([demo_task.input], change_demonstration, inputs, outputs, **quiet)
+        on([scene.click], point_at, inputs, outputs, **quiet)
         on([record.click], record_another, inputs, outputs, show_progress_on=[scene])
         run_one, run_four = run_episodes(lambda choice: [choice]), run_episodes(player.comparison)
         for triggers, handler in (([run.click, sentence.submit], run_one), ([compare.click], run_four)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 from urllib.parse import urlencode
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from gym_deltaco.layout import Layout
 from gym_deltaco.tasks import TASKS, get_task, select_tasks
 from lerobot_deltaco.data.demonstrations import Demonstration
+from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.evaluation.checkpoints import LoadedPolicy
 from lerobot_deltaco.evaluation.records import EvaluationPlan
@@ -27,8 +29,10 @@ from lerobot_deltaco.policies.deltaco_match.findings import (
 )
 
 BOTH, DEMONSTRATION, INSTRUCTION = "Both", "Demonstration only", "Instruction only"
+POINT = "Point and instruction"
 MAX_SEED = 9999
 _RENDER_SIZE = 384  # px
+_POINT = re.compile(r"\d{1,4},\d{1,4}")
 
 
 class Choice(NamedTuple):
@@ -40,7 +44,8 @@ class Choice(NamedTuple):
         demo_task: Task of the demonstration.
         demo_number: Number of a demonstration that the expert records; 0 for the checkpoint's.
         instruction: Instruction.
-        inputs: What the policy receives: `BOTH`, `DEMONSTRATION` or `INSTRUCTION`.
+        inputs: What the policy receives: `BOTH`, `DEMONSTRATION`, `INSTRUCTION` or `POINT`.
+        point: Point on an object in the image of the scene, "X,Y" in thousandths of its sides; "" for none.
     """
 
     task_id: int
@@ -49,6 +54,15 @@ class Choice(NamedTuple):
     demo_number: int
     instruction: str
     inputs: str = BOTH
+    point: str = ""
+
+    @property
+    def prompt(self) -> ObjectPrompt | None:
+        """The point, as a policy takes it."""
+        if not _POINT.fullmatch(self.point):
+            return None
+        x, y = (min(int(number), 1000) / 1000 for number in self.point.split(","))
+        return ObjectPrompt((x, y, x, y))
 
     @property
     def query(self) -> str:
@@ -81,7 +95,7 @@ class Player:
         loaded: The policy and its processors.
 
     Attributes:
-        inputs: What the policy may receive, of `BOTH`, `DEMONSTRATION` and `INSTRUCTION`.
+        inputs: What the policy may receive, of `BOTH`, `DEMONSTRATION`, `INSTRUCTION` and `POINT`.
 
     Raises:
         ValueError: The policy is not one for the benchmark.
@@ -112,6 +126,7 @@ class Player:
             demo_number=number("demo_number", MAX_SEED + 1, 0),
             instruction=query.get("instruction", choice.instruction),
             inputs=inputs if inputs in self.inputs else choice.inputs,
+            point=query.get("point", ""),
         )
 
     def show_scene(self, choice: Choice) -> tuple[NDArray[np.uint8], Layout]:
@@ -139,19 +154,27 @@ class Player:
         sentence = "" if choice.inputs == DEMONSTRATION else " ".join(choice.instruction.split())
         if not sentence and choice.inputs != DEMONSTRATION:
             raise UserError("Type an instruction first, or use the demonstration only.")
-        demonstrations = [] if choice.inputs == INSTRUCTION else [self.demonstration(choice)]
+        demonstrations: list[Demonstration | ObjectPrompt] = []
+        if choice.inputs == POINT:
+            if choice.prompt is None:
+                raise UserError("Click on an object in the scene first.")
+            demonstrations = [choice.prompt]
+        elif choice.inputs != INSTRUCTION:
+            demonstrations = [self.demonstration(choice)]
         recording = record_episode(
             self._loaded, self._env, choice.task_id, choice.scene_seed, sentence, demonstrations
         )
-        ends = demonstration_ends(demonstrations[0]) if demonstrations else None
+        is_demonstrated = choice.inputs in (BOTH, DEMONSTRATION)
+        ends = demonstration_ends(self.demonstration(choice)) if is_demonstrated else None
         picture, words = None, ""
         if recording.localization is not None:
             picture = picture_uri(draw_localization(recording.frames[0], ends, recording.localization))
             words = describe_words(self._loaded.policy.localizer.matching, sentence)
-        verdict = judge(recording, sentence, get_task(choice.demo_task) if demonstrations else None, words)
+        shown = get_task(choice.demo_task) if is_demonstrated else None
+        verdict = judge(recording, sentence, shown, words, choice.prompt if choice.inputs == POINT else None)
         return EpisodeView(
             instruction=sentence,
-            demonstration=self._describe_demonstration(choice, recording.layout) if demonstrations else "",
+            demonstration=self._describe_demonstration(choice, recording.layout) if is_demonstrated else "",
             ends=[] if ends is None else [picture_uri(end) for end in ends],
             is_right=verdict.is_success,
             headline=verdict.headline,
@@ -198,4 +221,6 @@ def _possible_inputs(config: Any) -> tuple[str, ...]:
         can_drop = config.method == "mcil"
     if not (takes_sentence and config.uses_demonstrations):
         return (INSTRUCTION,) if takes_sentence else (DEMONSTRATION,)
-    return (BOTH, DEMONSTRATION, INSTRUCTION) if can_drop else (BOTH,)
+    if config.type == "deltaco":
+        return (BOTH, DEMONSTRATION, INSTRUCTION) if can_drop else (BOTH,)
+    return (BOTH, DEMONSTRATION, INSTRUCTION, POINT)

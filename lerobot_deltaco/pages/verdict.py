@@ -18,6 +18,7 @@ from gym_deltaco.layout import Layout
 from gym_deltaco.objects.labels import ObjectLabel
 from gym_deltaco.sim.workspace import CONTAINER_FLOOR, TABLE_TOP, TRAY_CENTER, TRAY_HALF_EXTENTS
 from gym_deltaco.tasks import TASKS, Task
+from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.evaluation.photos import image_locations
 from lerobot_deltaco.evaluation.video import Recording
 from lerobot_deltaco.policies.deltaco_match.words import words_of
@@ -57,7 +58,13 @@ class Understanding(NamedTuple):
     confidence: float
 
 
-def judge(recording: Recording, sentence: str, demonstrated: Task | None, words: str = "") -> Verdict:
+def judge(
+    recording: Recording,
+    sentence: str,
+    demonstrated: Task | None,
+    words: str = "",
+    pointed: ObjectPrompt | None = None,
+) -> Verdict:
     """Judges an episode.
 
     Args:
@@ -65,12 +72,15 @@ def judge(recording: Recording, sentence: str, demonstrated: Task | None, words:
         sentence: Instruction that the policy received; empty for none.
         demonstrated: Task whose demonstration the policy received; None for none.
         words: How the policy read the sentence, as of `findings.describe_words`.
+        pointed: Point on the object to pick, whatever the sentence calls it; None for none.
     """
     understanding, placements = understand_locations(recording), recording.placements
     lines = [describe_outcome(recording)]
     if understanding is not None:
         lines.append(f"{_describe_understanding(recording.layout, understanding)} {words}".strip())
     asked = asked_for(recording.layout, sentence, demonstrated)
+    if pointed is not None:
+        asked = _asked_by_point(recording, sentence, pointed)
     if isinstance(asked, str):
         headline = "Not judged"
         if understanding is not None:
@@ -110,6 +120,20 @@ def asked_for(layout: Layout, sentence: str, demonstrated: Task | None) -> tuple
         both = "both the demonstration and the sentence" if len(tasks) == 2 else "that"
         return f"Not judged: no object in this scene fits {both}."
     return (objects, containers) if containers else "Not judged: no bin in this scene fits that."
+
+
+def _asked_by_point(
+    recording: Recording, sentence: str, pointed: ObjectPrompt
+) -> tuple[set[int], set[int]] | str:
+    """Returns the object at a point and the containers that a sentence names, or why these are unknown."""
+    _, word = _sentences().get(_key(sentence), (None, None))
+    if word is None:
+        return "Only the benchmark's own sentences are judged: is this what you meant?"
+    item = _nearest(np.array(pointed.location), image_locations(recording.positions[0]))
+    containers = {n for n, each in enumerate(recording.layout.containers) if each.satisfies(word)}
+    if item < 0:
+        return "Not judged: no object is at the point."
+    return ({item}, containers) if containers else "Not judged: no bin in this scene fits that."
 
 
 @cache

@@ -16,8 +16,8 @@ from gym_deltaco.sim.workspace import CONTAINER_FLOOR, Quadrant
 from gym_deltaco.tasks import OBJECTS, TASKS, get_task
 from lerobot_deltaco.evaluation.photos import image_locations
 from lerobot_deltaco.evaluation.video import Recording
-from lerobot_deltaco.pages.player import BOTH, DEMONSTRATION, INSTRUCTION, Choice, Player
-from lerobot_deltaco.pages.verdict import describe_outcome, judge
+from lerobot_deltaco.pages.player import BOTH, DEMONSTRATION, INSTRUCTION, POINT, Choice, Player
+from lerobot_deltaco.pages.verdict import describe_outcome, judge, object_name
 from lerobot_deltaco.policies.deltaco_match.findings import describe_words
 from lerobot_deltaco.policies.deltaco_match.localization import PickPlace
 
@@ -177,7 +177,7 @@ def test_every_task_has_a_demonstration(player):
 
 
 def test_either_input_can_be_left_out_if_the_policy_has_learned_it(player):
-    assert player.inputs == (BOTH, DEMONSTRATION, INSTRUCTION)
+    assert player.inputs == (BOTH, DEMONSTRATION, INSTRUCTION, POINT)
     choice = player.default_choice(26, 3)._replace(instruction="Put it in the red bin.")
     alone = player.run(choice._replace(inputs=DEMONSTRATION))
     assert (alone.instruction, len(alone.ends)) == ("", 2)
@@ -186,6 +186,23 @@ def test_either_input_can_be_left_out_if_the_policy_has_learned_it(player):
     assert alone.lines[-1] == "Not judged: the sentence names no object, and there is no demonstration."
     with pytest.raises(ValueError, match="Type an instruction first"):
         player.run(choice._replace(instruction=" "))
+
+
+def test_what_is_pointed_at_is_to_be_picked(player):
+    choice = player.default_choice(26, 3)._replace(instruction="Put it in the red bin.", inputs=POINT)
+    for point in ("", "here", "1,2,3", "0.5,0.5"):
+        with pytest.raises(ValueError, match="Click on an object"):
+            player.run(choice._replace(point=point))
+    player.show_scene(choice)
+    scene = player._env.scene
+    positions = [scene.object_pose(n).position for n in range(3)]
+    for item, (x, y) in zip(scene.layout.objects, image_locations(np.array(positions)), strict=True):
+        view = player.run(choice._replace(point=f"{500 * (x + 1):.0f},{500 * (y + 1):.0f}"))
+        assert f"Understood as: the {object_name(item.label)} (100 % sure)" in view.lines[1]
+        assert view.is_right is not None
+        assert (view.demonstration, view.ends) == ("", [])
+    view = player.run(choice._replace(point="0,0"))
+    assert view.lines[-1] == "Not judged: no object is at the point."
 
 
 def test_the_comparison_crosses_two_demonstrations_with_two_sentences(player):
@@ -204,7 +221,7 @@ def test_the_comparison_crosses_two_demonstrations_with_two_sentences(player):
 
 
 def test_the_address_holds_the_choice(player):
-    choice = Choice(26, 7, 4, 12, "Put it & wave.", INSTRUCTION)
+    choice = Choice(26, 7, 4, 12, "Put it & wave.", POINT, "120,950")
     assert player.parse_choice(dict(parse_qsl(choice.query.removeprefix("?")))) == choice
     for query in (
         {},

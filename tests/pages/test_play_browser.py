@@ -150,6 +150,17 @@ def test_a_new_scene_brings_what_fits_it_and_chips_fill_in_the_sentence(page):
     page.wait_for_function("/^Put it in/.test(document.querySelector('#sentence textarea').value)")
 
 
+def test_a_click_points_at_an_object(page):
+    page.click("#scene_image", position={"x": 60, "y": 70})
+    page.wait_for_selector("#scene .pointed span")
+    assert re.search(r"inputs=Point\+and\+instruction&point=\d+%2C\d+", page.url)
+    ring, image = (page.locator(f"#scene .pointed {name}").bounding_box() for name in ("span", "img"))
+    for side, extent, at in (("x", "width", 60), ("y", "height", 70)):
+        assert abs(ring[side] + ring[extent] / 2 - image[side] - at) < 2
+    page.click("#run")
+    await_text(page, NOTE, VERDICT)
+
+
 def test_the_comparison_is_one_click_and_four_videos(page):
     page.click("#compare")
     await_text(page, NOTE, r"\d of 4 as asked")

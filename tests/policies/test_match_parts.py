@@ -255,14 +255,14 @@ def test_places_are_found_where_they_stand_now_and_where_nothing_moves(matching,
     images, locations, _ = (part[24:] for part in shapes)
     shown = [(n + 2) % 12 for n in range(12)]
     unknown, beside = torch.full_like(locations, torch.nan), torch.tensor([0.05, -0.08])
-    found = matching.find_places(images, images[shown], unknown, locations[shown] + beside, 1.0)
+    (found,) = matching.find_places(images, images[shown], unknown, locations[shown] + beside, [1.0])
     assert ((found - locations - beside).norm(dim=1) < 0.15).float().mean() >= 0.9
     # The object that is grasped is not the place, however near it stands.
-    found = matching.find_places(images, images[shown], locations[shown], locations[shown] + beside, 1.0)
+    (found,) = matching.find_places(images, images[shown], locations[shown], locations[shown] + beside, [1.0])
     assert not ((found - locations - beside).norm(dim=1) < 0.15).float().mean() >= 0.5
     # The edges of the table are empty in all episodes.
     corner = torch.full_like(locations, 0.95)
-    assert torch.equal(matching.find_places(images, images[shown], unknown, corner, 1.0), corner)
+    assert torch.equal(matching.find_places(images, images[shown], unknown, corner, [1.0])[0], corner)
 
 
 @pytest.mark.parametrize(

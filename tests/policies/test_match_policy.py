@@ -24,16 +24,21 @@ from small_policies import (
     write_table,
 )
 
+from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.base.normalization import StateLimits
+from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import MatchingSettings
 from lerobot_deltaco.policies.deltaco_match.localization import PickPlace
 from lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match import DeltacoMatchPolicy
+from lerobot_deltaco.policies.scene.camera_motion import CameraMotion
+from lerobot_deltaco.policies.scene.proposals import Background
 
 pytestmark = pytest.mark.usefixtures("short_fit")
 
 N_EPISODES, N_TRAINED = 48, 36
 MOVES = random_moves(N_EPISODES)  # of `table`
+REACHES = MatchingSettings().place_reaches  # of which the short fit tries one
 RED, BLUE = TABLE_TASKS  # the tasks of the even and the odd episodes
 
 
@@ -67,7 +72,7 @@ def found_in(policy, scenes, instructions, demonstrations):
 def trained(table):
     """A policy that has learned, on 36 of the 48 episodes, to find the locations."""
     with pytest.MonkeyPatch.context() as patch:
-        use_short_fit(patch, 40, matching_batch=32)
+        use_short_fit(patch, 40, matching_batch=32, place_reaches=REACHES)
         patch.setattr("lerobot_deltaco.policies.deltaco_match.modeling_deltaco_match._PLACE_FRACTION", 1.0)
         patch.setattr("lerobot_deltaco.policies.deltaco_match.localization._SHIFT_PADDING", 1)
         torch.manual_seed(0)
@@ -325,7 +330,8 @@ def test_what_is_left_out_does_not_matter(make, table):
         found_in(policy, batch_of(table, [0, 0]), ["", ""], [[0], []])
 
 
-def test_after_few_episodes_demonstrations_say_where_to_place(make, table):
+def test_after_few_episodes_demonstrations_say_where_to_place(make, table, monkeypatch):
+    use_short_fit(monkeypatch, place_reaches=REACHES)
     policy = make().eval()
     assert policy.localizer.demonstrates_places
     shown, another, unseen = (
@@ -343,6 +349,30 @@ def test_after_few_episodes_demonstrations_say_where_to_place(make, table):
     torch.testing.assert_close(
         other.maps[:, 1], found_in(policy, batch_of(table, [0]), [BLUE], [[]]).maps[:, 1]
     )
+
+
+def test_a_camera_that_has_moved_since_the_training_does_not_matter(make, table, monkeypatch):
+    policy = make().eval()
+    scene, right, down = batch_of(table, [0]), 3, -2
+    expected = found_in(policy, scene, [RED], [[0]])
+    homography = torch.tensor([[1.0, 0, 2 * right / TABLE_SIZE], [0, 1, 2 * down / TABLE_SIZE], [0, 0, 1]])
+    moved = scene | {OBS_IMAGE: scene[OBS_IMAGE].roll((down, right), (-2, -1))}
+
+    def motion(_, image):
+        is_moved = torch.equal(image, moved[OBS_IMAGE][0])
+        return CameraMotion(homography, 1.0, 0.5, is_significant=is_moved)
+
+    monkeypatch.setattr(Background, "camera_motion", motion)
+    found = found_in(policy, moved, [RED], [[0]])
+    torch.testing.assert_close(found.locations, expected.locations, atol=0.02, rtol=0)
+    torch.testing.assert_close(found.confidence, expected.confidence, atol=0.02, rtol=0)
+    # What is pointed at is where the moved camera sees it.
+    x, y = (expected.proposal[0] + 1) / 2 + torch.tensor([right, down]) / TABLE_SIZE
+    prompt = ObjectPrompt((x.item(), y.item(), x.item(), y.item()))
+    policy.reset()
+    policy.set_tasks([RED], [[prompt]])
+    policy.select_action(moved)
+    torch.testing.assert_close(policy.localization.proposal, expected.proposal, atol=0.02, rtol=0)
 
 
 def test_several_demonstrations_are_combined(make, table):

@@ -48,7 +48,7 @@ from lerobot_deltaco.policies.deltaco_match.words import (
     understand,
     words_of,
 )
-from lerobot_deltaco.policies.scene.camera_motion import CameraMotion
+from lerobot_deltaco.policies.scene.camera_motion import CameraMotion, is_moved
 from lerobot_deltaco.policies.scene.crops import EfficientNetCropEncoder
 from lerobot_deltaco.policies.scene.proposals import (
     Background,
@@ -255,11 +255,12 @@ class FeatureMatching(nn.Module):
             The motion; None if it is not known.
         """
         motion = self.background.camera_motion(scene)
-        if motion is not None and motion.is_significant:
+        if is_moved(motion):
             height, width = scene.shape[-2:]
             logger.warning(
-                "The camera seems to have moved since the training: the picture is off by %s. Locations are "
-                "those of the training's camera. Move it back, or train on episodes of where it is now.",
+                "The camera seems to have moved since the training: the picture is off by %s. The policy "
+                "corrects its pictures, which is exact only for a camera that was turned on the spot. Better "
+                "move it back, or train on episodes of where it is now.",
                 motion.describe(width, height),
             )
         return motion
@@ -292,9 +293,14 @@ class FeatureMatching(nn.Module):
         return torch.where(is_alike[:, None], alike, expected)
 
     def find_places(
-        self, scenes: Tensor, first_images: Tensor, grasps: Tensor, releases: Tensor, reach: float
-    ) -> Tensor:
-        """Finds where demonstrated places are now, (batch, 2) in -1..1.
+        self,
+        scenes: Tensor,
+        first_images: Tensor,
+        grasps: Tensor,
+        releases: Tensor,
+        reaches: Sequence[float],
+    ) -> list[Tensor]:
+        """Finds where demonstrated places are now, (batch, 2) in -1..1 for each reach.
 
         What stands where a demonstration released its object, in its first image, is looked for among the
         proposals in the scene, and where it stood then: it may not stand out, as whatever never moves.
@@ -304,28 +310,34 @@ class FeatureMatching(nn.Module):
             first_images: Those of the demonstrations, (batch, 3, H', W').
             grasps: Where they grasped, (batch, 2) in -1..1; NaN where that is not known.
             releases: Where they released, (batch, 2).
-            reach: How far from a release what stands at the place may be, in `grasp_radius`.
+            reaches: How far from a release what stands at the place may be, in `grasp_radius`. With 0, places
+                never move.
         """
-        if not reach:
-            return releases
+        if not any(reaches):
+            return [releases] * len(reaches)
         rows = torch.arange(len(scenes), device=scenes.device)
-        proposed = self.background(first_images)
-        is_grasped = (proposed - grasps[:, None]).norm(dim=2) < self.grasp_radius
-        proposed = proposed.masked_fill(is_grasped[..., None], torch.nan)
-        nearest, is_near = nearest_proposals(proposed, releases, reach * self.grasp_radius)
-        at = torch.where(is_near[:, None], proposed[rows, nearest], releases)
-        candidates = torch.cat([self.background(scenes), at[:, None]], dim=1)
-        features = self.compare.inputs(self.features(scenes, candidates))
-        demonstrated = self.compare.inputs(self.features(first_images, at[:, None]))
-        cosines = F.cosine_similarity(features, demonstrated, dim=2)
-        cosines = cosines.masked_fill(candidates[..., 0].isnan(), -1)
-        # Where nothing stands out, or where it looks as it did, the place has not moved.
-        best, chosen = cosines.max(dim=1)
-        has_moved = is_near & (cosines[:, -1] < best - self.settings.moved_place)
-        chosen = torch.where(has_moved, chosen, candidates.shape[1] - 1)
-        found = candidates[rows, chosen]
-        scale = self.object_sizes(found) / self.object_sizes(at)
-        return (found + scale[:, None] * (releases - at)).clamp(-1, 1)
+        shown, proposed = self.background(first_images), self.background(scenes)
+        is_grasped = (shown - grasps[:, None]).norm(dim=2) < self.grasp_radius
+        shown = shown.masked_fill(is_grasped[..., None], torch.nan)
+        features = self.compare.inputs(self.features(scenes, proposed))
+
+        def find(reach: float) -> Tensor:
+            nearest, is_near = nearest_proposals(shown, releases, reach * self.grasp_radius)
+            at = torch.where(is_near[:, None], shown[rows, nearest], releases)
+            stays = self.compare.inputs(self.features(scenes, at[:, None]))
+            demonstrated = self.compare.inputs(self.features(first_images, at[:, None]))
+            cosines = F.cosine_similarity(torch.cat([features, stays], dim=1), demonstrated, dim=2)
+            candidates = torch.cat([proposed, at[:, None]], dim=1)
+            cosines = cosines.masked_fill(candidates[..., 0].isnan(), -1)
+            # Where nothing stands out, or where it looks as it did, the place has not moved.
+            best, chosen = cosines.max(dim=1)
+            has_moved = is_near & (cosines[:, -1] < best - self.settings.moved_place)
+            chosen = torch.where(has_moved, chosen, candidates.shape[1] - 1)
+            found = candidates[rows, chosen]
+            scale = self.object_sizes(found) / self.object_sizes(at)
+            return (found + scale[:, None] * (releases - at)).clamp(-1, 1)
+
+        return [find(reach) if reach else releases for reach in reaches]
 
     def novelty(self, instructions: Sequence[str]) -> Tensor:
         """Returns how likely demonstrated objects are new to the training, (batch,) in 0..1.

@@ -19,6 +19,7 @@ from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.policies.deltaco_match.feature_matching import FeatureMatching
 from lerobot_deltaco.policies.deltaco_match.localization import PickPlace
 from lerobot_deltaco.policies.deltaco_match.words import understand, words_of
+from lerobot_deltaco.policies.scene.camera_motion import CameraMotion, is_moved
 
 # No object and no container of the benchmark has these colors. They differ in lightness, so that they can be
 # told apart without color vision.
@@ -47,7 +48,9 @@ def describe_findings(
         instruction: Instruction of the episode; empty for none.
         shown: Its first demonstration, or an object prompt; None for none.
     """
-    pick, place = (_describe_pixel(location, size) for location in localization.locations[0])
+    motion = localization.camera_motion
+    locations = _in_picture(localization.locations[0], motion)
+    pick, place = (_describe_pixel(location, size) for location in locations)
     sources = ["the demonstration"] if isinstance(shown, Demonstration) else []
     if isinstance(shown, ObjectPrompt):
         sources.append("the point" if shown.image is None else "the photo")
@@ -70,11 +73,18 @@ def describe_findings(
             else f"which grasped at {_describe_pixel(localization.demonstrated_grasp[0], size)}"
         )
         lines.append(f"  {name}, {does}")
-    motion, moved = localization.camera_motion, "not compared with the training's"
+    moved = "not compared with the training's"
     if motion is not None:
         moved = motion.describe(size[1], size[0])
-        moved = f"moved by {moved}" if motion.is_significant else f"as in training ({moved} off)"
+        moved = f"moved by {moved}" if is_moved(motion) else f"as in training ({moved} off)"
     return [*lines, f"  camera: {moved}"]
+
+
+def _in_picture(locations: Tensor, motion: CameraMotion | None) -> Tensor:
+    """Returns locations (..., 2) in the pictures of the camera as it stands now."""
+    if not is_moved(motion):
+        return locations
+    return motion.to_picture(locations)
 
 
 def _describe_pixel(location: Tensor, size: tuple[int, ...]) -> str:
@@ -88,7 +98,7 @@ def predicted_boxes(matching: FeatureMatching, localization: PickPlace, camera: 
     Each has a box as large as a typical object there: `bbox` is [left, top, right, bottom], as fractions of
     the picture's sides.
     """
-    locations = localization.locations
+    locations = _in_picture(localization.locations, localization.camera_motion)
     half = matching.object_sizes(locations)[..., None] / 2  # (batch, 2, 1)
     centers = (locations + 1) / 2
     boxes = torch.cat([centers - half, centers + half], dim=-1).clamp(0, 1).tolist()

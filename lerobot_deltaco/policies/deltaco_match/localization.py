@@ -72,7 +72,7 @@ class PickPlace(NamedTuple):
             without demonstrations.
         demonstrated_grasp: Where it grasped, (batch, 2); NaN where that is not known.
         camera_motion: How far the camera has moved since the training, by the first scene; None if it is not
-            known.
+            known. All locations are in the pictures of the training's camera.
     """
 
     locations: Tensor
@@ -156,7 +156,6 @@ class Localizer(nn.Module):
             ValueError: A sample has neither an instruction nor a demonstration.
         """
         matching = self.matching
-        camera_motion = matching.camera_motion(full_resolution[0])  # warns
         by_instruction = torch.tensor([bool(text) for text in instructions], device=scenes.device)
         attention = last = centers = descriptors = heights = templates = None
         if prompts:
@@ -210,7 +209,6 @@ class Localizer(nn.Module):
             proposal=proposal,
             demonstrated=centers,
             demonstrated_grasp=None if given is None else given.picks[:, 0],
-            camera_motion=camera_motion,
         )
 
     def _place_maps(
@@ -242,7 +240,8 @@ class Localizer(nn.Module):
         """Returns maps that peak beside where demonstrated places are now, as logits like other maps."""
         first_images, picks, places = (part[:, 0] for part in (given.first_images, given.picks, given.places))
         given_places = (scenes, first_images, picks, places.nan_to_num())
-        found = self.matching.find_places(*given_places, float(self.place_reach)) + offsets
+        (found,) = self.matching.find_places(*given_places, [float(self.place_reach)])
+        found = found + offsets
         height, width = like.shape[1:]
         std = 2 * self.matching.settings.map_std / torch.tensor([width, height], device=like.device)
         return gaussian_maps(found[:, None], height, width, std)[:, 0].clamp_min(_MIN_ATTENTION).log()
@@ -268,10 +267,12 @@ class Localizer(nn.Module):
             return
         shown = others[rows]
         grasps, releases = locations[shown].unbind(dim=1)
-        errors = {}
-        for reach in matching.settings.place_reaches:
-            found = matching.find_places(images[rows], images[shown], grasps, releases, reach)
-            errors[reach] = (found - locations[rows, 1]).norm(dim=1).clamp(max=1.0)
+        reaches = matching.settings.place_reaches
+        found = matching.find_places(images[rows], images[shown], grasps, releases, reaches)
+        errors = {
+            reach: (places - locations[rows, 1]).norm(dim=1).clamp(max=1.0)
+            for reach, places in zip(reaches, found, strict=True)
+        }
         best = min(errors, key=lambda reach: float(errors[reach].mean()))
         self.place_reach.fill_(best)
         self.demonstrates_places.copy_(errors[best].median() < matching.grasp_radius)

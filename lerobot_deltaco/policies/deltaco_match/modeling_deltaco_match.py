@@ -37,6 +37,7 @@ from lerobot_deltaco.data.demonstrations import Demonstration, RobotData
 from lerobot_deltaco.data.grasps import Grasp, find_grasps, warn_of_missing
 from lerobot_deltaco.data.gripper_direction import warn_if_inverted
 from lerobot_deltaco.data.gripper_states import find_gripper_states, find_positions
+from lerobot_deltaco.data.images import as_uint8
 from lerobot_deltaco.data.object_prompts import ObjectPrompt, read_prompt
 from lerobot_deltaco.data.reading import open_dataset, warn_of_equal_instructions
 from lerobot_deltaco.data.training_data import DatasetEpisodes, TrainingData
@@ -52,7 +53,7 @@ from lerobot_deltaco.policies.deltaco_match.configuration_deltaco_match import D
 from lerobot_deltaco.policies.deltaco_match.findings import describe_findings, predicted_boxes, write_picture
 from lerobot_deltaco.policies.deltaco_match.fit import fit_feature_matching
 from lerobot_deltaco.policies.deltaco_match.localization import DemonstrationBatch, Localizer, PickPlace
-from lerobot_deltaco.policies.deltaco_match.prompts import prompts_of
+from lerobot_deltaco.policies.deltaco_match.prompts import prompts_of, registered_prompt
 from lerobot_deltaco.policies.deltaco_match.words import (
     encode_words,
     vocabulary_of,
@@ -61,6 +62,7 @@ from lerobot_deltaco.policies.deltaco_match.words import (
 from lerobot_deltaco.policies.geometry.calibration import MIN_EPISODES
 from lerobot_deltaco.policies.geometry.replay import Reference, Trajectory, TrajectoryReplay
 from lerobot_deltaco.policies.geometry.states import N_LOCATIONS, StateRegressor, TrainingLocations
+from lerobot_deltaco.policies.scene.camera_motion import CameraMotion, is_moved
 
 logger = logging.getLogger(__name__)
 
@@ -271,6 +273,7 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if self._begins_episode(batch):
             self._begin_episode(batch)
         episode: RunningEpisode = self._episode
+        batch = self.undo_camera_motion(batch, episode.localization.camera_motion)
         replay = None
         if episode.reference is not None:
             reference, replay = self.replay.follow(episode.reference, self._unlimited_state(batch))
@@ -310,8 +313,9 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
     ) -> None:
         """Logs what was found in the running episode, and draws it if `picture_folder` says where."""
         episode, config, matching = self._episode, self.config, self.localizer.matching
+        camera = config.cameras[0]
         if logger.isEnabledFor(logging.INFO):
-            given = (config.cameras[0], image.shape[-2:], instruction, shown)
+            given = (camera, image.shape[-2:], instruction, shown)
             lines = describe_findings(matching, episode.localization, *given)
             is_own = isinstance(shown, Demonstration) and shown.states is not None
             replay = f"replays {'the demonstration' if is_own else 'a training episode'}"
@@ -322,7 +326,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
                 lines.append(f"  states to image: off by {residual:.1%} of its side in training")
             logger.info("%s", "\n".join(lines))
         if config.picture_folder is not None:
-            path = write_picture(Path(config.picture_folder), image, shown, episode.localization)
+            seen = self.undo_camera_motion({camera: image[None]}, episode.localization.camera_motion)[camera]
+            path = write_picture(Path(config.picture_folder), seen[0], shown, episode.localization)
             logger.info("Where the policy looked: %s.", path)
 
     def reset(self) -> None:
@@ -377,9 +382,13 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         Raises:
             ValueError: Neither is given, or samples have different numbers of demonstrations.
         """
-        camera = self.config.cameras[0]
+        camera, matching = self.config.cameras[0], self.localizer.matching
+        motion = matching.camera_motion(batch[camera][0])  # warns
+        batch = self.undo_camera_motion(batch, motion)
         scenes = self._camera_image(batch, camera)
         prompts = prompts_of(instructions, demonstrations)
+        if is_moved(motion):
+            prompts = [registered_prompt(prompt, motion) for prompt in prompts]
         given = None if prompts else self.batch_demonstrations(demonstrations, scenes.device)
         if given is not None:  # with the sentence of another task, that says where to place
             first = [own[0] for own in demonstrations]
@@ -390,7 +399,20 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
             is_shown = torch.tensor(is_its_task, device=scenes.device)[:, None, None]
             given = given._replace(places=torch.where(is_shown, given.places, torch.nan))
         found = self.localizer(scenes, batch[camera], instructions, given, prompts)
-        return found._replace(heights=found.heights + self.config.grasp_height_bias)
+        heights = found.heights + self.config.grasp_height_bias
+        return found._replace(heights=heights, camera_motion=motion)
+
+    def undo_camera_motion(self, batch: dict[str, Any], motion: CameraMotion | None) -> dict[str, Any]:
+        """Returns a batch with the pictures that the training's camera would show.
+
+        Args:
+            batch: As in `select_action`; it is not changed.
+            motion: The camera's motion, such as `localization.camera_motion`.
+        """
+        if not is_moved(motion):
+            return batch
+        camera = self.config.cameras[0]
+        return batch | {camera: self.localizer.matching.background.undo_motion(batch[camera], motion)}
 
     def batch_demonstrations(
         self, demonstrations: DemonstrationsOfTasks, device: torch.device
@@ -405,17 +427,31 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if not n_each:
             return None
         flat = [each for given in demonstrations for each in given if isinstance(each, Demonstration)]
+        ends, first_images = zip(*map(self._seen_by_training_camera, flat), strict=True)
         unknown = torch.full((self.config.state_dim,), torch.nan)
         states = torch.stack([unknown if s.pick_state is None else s.pick_state.cpu() for s in flat])
         states = states.to(device)
         parts = (
-            torch.stack([shown.frames[[0, -1]] for shown in flat]).to(device).float() / 255,
-            torch.stack([s.frames[0] if s.first_image is None else s.first_image for s in flat]).to(device),
+            torch.stack(ends).to(device).float() / 255,
+            torch.stack(first_images).to(device),
             self.state_regressor.pick_locations(states),
             self._release_locations(flat).to(device),
             self.state_regressor.heights(states),
         )
         return DemonstrationBatch(*(part.unflatten(0, (-1, n_each)) for part in parts))
+
+    def _seen_by_training_camera(self, demonstration: Demonstration) -> tuple[Tensor, Tensor]:
+        """Returns first and last image of a demonstration (2, 3, H, W), and the first at full resolution."""
+        ends, first = demonstration.frames[[0, -1]], demonstration.first_image
+        first = ends[0] if first is None else first
+        background = self.localizer.matching.background
+        motion = background.camera_motion(first)
+        if not is_moved(motion):
+            return ends, first
+        ends, first = (
+            as_uint8(background.undo_motion(images.float() / 255, motion)) for images in (ends, first[None])
+        )
+        return ends, first[0]
 
     def _release_locations(self, demonstrations: Sequence[Demonstration]) -> Tensor:
         """Returns where demonstrations released what they moved, (demonstrations, 2); NaN if unknown."""

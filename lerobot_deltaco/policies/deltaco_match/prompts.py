@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -12,6 +13,7 @@ from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.data.object_prompts import ObjectPrompt
 from lerobot_deltaco.errors import UserError
 from lerobot_deltaco.policies.deltaco_match.feature_matching import Candidates, FeatureMatching
+from lerobot_deltaco.policies.scene.camera_motion import CameraMotion
 from lerobot_deltaco.policies.scene.proposals import nearest_proposals
 
 _MIN_CROP = 8  # px
@@ -36,6 +38,21 @@ def prompts_of(
             "as with --task."
         )
     return prompts
+
+
+def registered_prompt(prompt: ObjectPrompt, motion: CameraMotion) -> ObjectPrompt:
+    """Returns a prompt whose point in the first image is where the training's camera would see it.
+
+    Args:
+        prompt: A prompt; one with a picture of its own stays as it is.
+        motion: How far the camera has moved.
+    """
+    if prompt.image is not None:
+        return prompt
+    location = torch.tensor(prompt.location)
+    right, down = ((motion.from_picture(location) - location) / 2).tolist()
+    left, top, right_edge, bottom = prompt.box
+    return replace(prompt, box=(left + right, top + down, right_edge + right, bottom + down))
 
 
 @torch.no_grad()

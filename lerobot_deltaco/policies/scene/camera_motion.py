@@ -1,15 +1,15 @@
-r"""Tells from a picture whether the camera has moved since the training, and by how much.
+r"""Tells from a picture whether the camera has moved since the training, by how much, and moves it back.
 
 What never moves in the first images of the training episodes is registered to the picture: first by trying
-shifts and turns on small images, then by Gauss-Newton steps on larger ones. Objects and the arm stand
-anywhere, so large differences count no more than moderate ones. The camera has moved if the motion is more
-than noise, and explains the picture better than none.
+shifts and turns on small images, then by Gauss-Newton steps on larger ones, and at last by a homography.
+Objects and the arm stand anywhere, so large differences count no more than moderate ones. The camera has
+moved if the motion is more than noise, and explains the picture better than none.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -26,24 +26,45 @@ _STATIC = 0.03  # spread of a pixel's color over episodes, at which it counts ha
 # The camera has moved if it did by this fraction of the image's width, on average over the picture, and the
 # differences become smaller by this factor.
 _MIN_MOTION, _MIN_GAIN = 0.009, 0.93
+_USUAL = 0.95  # of the training's pictures, which differ less from what is static than one that is searched
+_STIFFNESS = 1e-3  # of homographies, relative to what pictures tell
+_MIN_STRUCTURE = 0.01  # mean detail of what is static, below which nothing tells
 
 
 class CameraMotion(NamedTuple):
     """How far the static parts of a picture are from where they were in the training.
 
     Attributes:
-        shift: To the right and downwards, as fractions of the image's width and height.
-        turn: Clockwise in the image, degrees.
-        motion: Mean distance by which pixels moved, as a fraction of the image's width.
+        homography: Maps points of the training's pictures to points of the moved camera's, homogeneous
+            coordinates, (3, 3), where the image's height is 2 and its middle 0. It holds for a camera that
+            was turned on the spot and, on the table, for any motion.
+        aspect: Width of a picture divided by its height.
         gain: Mean difference after registration, as a fraction of that before.
         is_significant: Whether the camera has moved.
     """
 
-    shift: tuple[float, float]
-    turn: float
-    motion: float
+    homography: Tensor
+    aspect: float
     gain: float
     is_significant: bool
+
+    @property
+    def shift(self) -> tuple[float, float]:
+        """How far the middle moved to the right and downwards, in widths and heights of the image."""
+        right, down = (self.homography[:2, 2] / self.homography[2, 2]).tolist()
+        return right / (2 * self.aspect), down / 2
+
+    @property
+    def turn(self) -> float:
+        """How far the picture turned about its middle, clockwise, degrees."""
+        (xx, xy, x), (yx, yy, y), (wx, wy, w) = self.homography.tolist()
+        return math.degrees(math.atan2(yx - wx * y / w - xy + wy * x / w, xx - wx * x / w + yy - wy * y / w))
+
+    @property
+    def distance(self) -> float:
+        """Mean distance by which pixels moved, as a fraction of the image's width."""
+        grid = _grid(_SMALL, self.aspect, self.homography.device)
+        return float((_mapped(self.homography, grid) - grid).norm(dim=-1).mean()) / (2 * self.aspect)
 
     def describe(self, width: int, height: int) -> str:
         """Returns what a person reads, for images of a size in px."""
@@ -60,56 +81,139 @@ class CameraMotion(NamedTuple):
             )
         return " and ".join(filter(None, [", ".join(parts[:-1]), *parts[-1:]])) or "less than a pixel"
 
+    def to_picture(self, locations: Tensor) -> Tensor:
+        """Returns where the moved camera sees what the training's camera saw at locations.
 
-def static_reference(images: Tensor) -> tuple[Tensor, Tensor]:
+        Args:
+            locations: (..., 2) in -1..1.
+        """
+        sides = locations.new_tensor([self.aspect, 1.0])
+        return _mapped(self.homography.to(locations), locations * sides) / sides
+
+    def from_picture(self, locations: Tensor) -> Tensor:
+        """Returns where the training's camera saw what the moved camera sees at locations.
+
+        Args:
+            locations: (..., 2) in -1..1.
+        """
+        sides = locations.new_tensor([self.aspect, 1.0])
+        return _mapped(torch.linalg.inv(self.homography).to(locations), locations * sides) / sides
+
+
+def is_moved(motion: CameraMotion | None) -> TypeGuard[CameraMotion]:
+    """Returns whether a camera is known to have moved."""
+    return motion is not None and motion.is_significant
+
+
+class StaticReference(NamedTuple):
+    """What never moves in the first images of the training episodes.
+
+    Attributes:
+        median: Median image, (3, H, W) in 0..1.
+        levels: Its details, and how static each pixel is in 0..1, (1, size, size) and (size, size), for each
+            size at which pictures are registered.
+        structure: Where static details are, (size, size) in 0..1, at the largest of these sizes.
+        usual: Difference from the details up to which pictures are not searched for a motion.
+    """
+
+    median: Tensor
+    levels: dict[int, tuple[Tensor, Tensor]]
+    structure: Tensor
+    usual: float
+
+
+def static_reference(images: Tensor) -> StaticReference:
     """Returns what stays in the first images of episodes.
 
     Args:
         images: (episodes, 3, H, W), uint8 or in 0..1.
-
-    Returns:
-        The median image, (3, H, W) in 0..1, and how static each of its pixels is, (H, W) in 0..1.
     """
     images = images.float() / 255 if images.dtype == torch.uint8 else images
     median = images.median(dim=0).values
     spread = (images - median).abs().amax(dim=1).median(dim=0).values
-    return median, 1 / (1 + (spread / _STATIC) ** 2)
+    reference = weighted_reference(median, 1 / (1 + (spread / _STATIC) ** 2))
+    grays = images.mean(dim=1, keepdim=True)
+    usual = [_difference(reference, _details(_resized(gray, _LARGE))) for gray in grays]
+    return reference._replace(usual=float(torch.tensor(usual).quantile(_USUAL)))
 
 
-def estimate_motion(reference: Tensor, weight: Tensor, image: Tensor, aspect: float = 1.0) -> CameraMotion:
+def weighted_reference(median: Tensor, weight: Tensor) -> StaticReference:
+    """Returns a reference.
+
+    Args:
+        median: Image, (3, H, W) in 0..1.
+        weight: How static each of its pixels is, (H, W) in 0..1.
+    """
+    gray = median.mean(dim=0, keepdim=True)
+    sizes = (_SMALL, _MEDIUM, _LARGE)
+    levels = {size: (_details(_resized(gray, size)), _resized(weight[None], size)[0]) for size in sizes}
+    details, static = levels[_LARGE]
+    structure = static * (details[0].abs() / _TOLERATED).clamp_max(1)
+    return StaticReference(median, levels, structure, usual=0.0)
+
+
+def _difference(reference: StaticReference, details: Tensor) -> float:
+    """Returns how much the details of a picture, (1, size, size), differ where static ones are."""
+    static, _ = reference.levels[_LARGE]
+    differences = (details - static)[0].abs().clamp_max(_TOLERATED)
+    return float((differences * reference.structure).sum() / reference.structure.sum().clamp_min(1e-6))
+
+
+def estimate_motion(reference: StaticReference, image: Tensor, aspect: float = 1.0) -> CameraMotion:
     """Registers a picture to what was static in the training.
 
     Args:
-        reference: What was static, (3, H, W) in 0..1.
-        weight: How static each pixel was, (H, W) in 0..1.
-        image: The picture, (3, H', W') in 0..1.
+        reference: What was static.
+        image: The picture, (3, H, W) in 0..1.
         aspect: Width of a picture divided by its height, if it was scaled to another shape.
     """
-    grays = [each.mean(dim=0, keepdim=True) for each in (reference, image)]
-    levels = {}
-    for size in (_SMALL, _MEDIUM, _LARGE):
-        details = [_details(_resized(each, size)) for each in grays]
-        levels[size] = (details[0], details[1], _resized(weight[None], size)[0], aspect)
+    gray = image.mean(dim=0, keepdim=True)
+    details = {_LARGE: _details(_resized(gray, _LARGE))}
+    unmoved = torch.eye(3, device=image.device)
+    is_usual = _difference(reference, details[_LARGE]) <= reference.usual
+    if is_usual or float(reference.structure.mean()) < _MIN_STRUCTURE:
+        return CameraMotion(unmoved, aspect, 1.0, is_significant=False)
+    details |= {size: _details(_resized(gray, size)) for size in (_SMALL, _MEDIUM)}
+    levels = {
+        size: (static, details[size], weight, aspect) for size, (static, weight) in reference.levels.items()
+    }
     none = torch.zeros(1, 3, device=image.device)
     motions = torch.cat([_best_starts(*levels[_SMALL]), none])
     for _ in range(_STEPS):
         motions = _gauss_newton_step(motions, *levels[_MEDIUM])
-    best = motions[_cost(motions, *levels[_MEDIUM]).argmin()][None]
-    for _ in range(_STEPS):
-        best = _gauss_newton_step(best, *levels[_LARGE])
-    after, before = _cost(torch.cat([best, none]), *levels[_LARGE]).tolist()
-    gain = after / max(before, 1e-9)
-    grid = _grid(_SMALL, aspect, image.device)
-    moved = (_moved(best, grid)[0] - grid) / (2 * aspect)
-    motion = float(moved.norm(dim=1).mean())
-    turn, right, down = best[0].tolist()
-    return CameraMotion(
-        (right / (2 * aspect), down / 2),
-        math.degrees(turn),
-        motion,
-        gain,
-        motion > _MIN_MOTION and gain < _MIN_GAIN,
+    best = _homographies(motions[_cost(_homographies(motions), *levels[_MEDIUM]).argmin()][None])[0]
+    for size in (_MEDIUM, _LARGE):
+        best = _refine_homography(best, *levels[size])
+    # Only static details tell: objects that leave the picture would make any motion better.
+    static, seen, _, _ = levels[_LARGE]
+    both = torch.stack([best, unmoved])
+    after, before = _cost(both, static, seen, reference.structure, aspect).tolist()
+    motion = CameraMotion(best, aspect, after / max(before, 1e-9), is_significant=False)
+    return motion._replace(is_significant=motion.gain < _MIN_GAIN and motion.distance > _MIN_MOTION)
+
+
+def undo_motion(images: Tensor, motion: CameraMotion, reference: StaticReference) -> Tensor:
+    """Returns pictures of a moved camera as the training's camera would show them.
+
+    That is exact for a camera that was turned on the spot. If it was displaced, it is exact for the table
+    alone: what stands high is off.
+
+    Args:
+        images: (batch, 3, H, W) in 0..1.
+        motion: The camera's motion.
+        reference: What was static in the training. It fills what the moved camera does not see.
+    """
+    height, width = images.shape[-2:]
+    y, x = torch.meshgrid(
+        *((torch.arange(side, device=images.device) + 0.5) / side * 2 - 1 for side in (height, width)),
+        indexing="ij",
     )
+    at = motion.to_picture(torch.stack([x, y], dim=-1)).expand(len(images), -1, -1, -1)
+    moved = F.grid_sample(
+        images.float(), at, mode="bicubic", padding_mode="border", align_corners=False
+    ).clamp(0, 1)
+    is_seen = (at[0].abs() <= 1).all(dim=-1)
+    return torch.where(is_seen, moved, F.interpolate(reference.median[None].to(moved), (height, width)))
 
 
 # A motion is (turn in radians, shift to the right, shift downwards), where the image's height is 2.
@@ -167,10 +271,23 @@ def _best_starts(reference: Tensor, image: Tensor, weight: Tensor, aspect: float
     return torch.stack(found)
 
 
-def _cost(motions: Tensor, reference: Tensor, image: Tensor, weight: Tensor, aspect: float) -> Tensor:
-    """Returns the mean difference after each motion (m, 3), (m,)."""
+def _homographies(motions: Tensor) -> Tensor:
+    """Returns motions (m, 3) as homographies, (m, 3, 3)."""
+    turn, right, down = motions.unbind(dim=1)
+    cos, sin, one, zero = turn.cos(), turn.sin(), torch.ones_like(turn), torch.zeros_like(turn)
+    return torch.stack([cos, -sin, right, sin, cos, down, zero, zero, one], dim=1).view(-1, 3, 3)
+
+
+def _mapped(homographies: Tensor, points: Tensor) -> Tensor:
+    """Maps points (..., 2) by a homography (3, 3), or points (n, 2) by several (m, 3, 3), (m, n, 2)."""
+    homogeneous = F.pad(points, (0, 1), value=1.0) @ homographies.mT
+    return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+def _cost(homographies: Tensor, reference: Tensor, image: Tensor, weight: Tensor, aspect: float) -> Tensor:
+    """Returns the mean difference after each motion, given as a homography (m, 3, 3), (m,)."""
     grid = _grid(image.shape[-1], aspect, image.device)
-    colors, inside = _sampled(image, _moved(motions, grid), aspect)
+    colors, inside = _sampled(image, _mapped(homographies, grid), aspect)
     differences = (colors[:, 0] - reference.flatten()).abs().clamp_max(_TOLERATED)
     weights = weight.flatten() * inside
     return (differences * weights).sum(dim=1) / weights.sum(dim=1).clamp_min(1e-6)
@@ -180,26 +297,54 @@ def _gauss_newton_step(
     motions: Tensor, reference: Tensor, image: Tensor, weight: Tensor, aspect: float
 ) -> Tensor:
     """Improves motions, (m, 3)."""
-    size = image.shape[-1]
-    points = _moved(motions, _grid(size, aspect, image.device))  # (m, n, 2)
-    slopes = torch.stack(
-        [
-            F.pad((image[..., 2:] - image[..., :-2]) * size / 4 / aspect, (1, 1)),
-            F.pad((image[..., 2:, :] - image[..., :-2, :]) * size / 4, (0, 0, 1, 1)),
-        ]
-    )
-    sampled, inside = _sampled(torch.cat([image, *slopes]), points, aspect)
-    colors, along_x, along_y = sampled.unbind(dim=1)  # (m, n)
-    offsets = points - motions[:, None, 1:]  # turned about the middle
-    by_turn = along_y * offsets[..., 0] - along_x * offsets[..., 1]
-    jacobian = torch.stack([by_turn, along_x, along_y], dim=-1)  # (m, n, 3)
-    residuals = reference.flatten() - colors
-    trust = 1 / (1 + (residuals / _TOLERATED) ** 2) ** 2
-    weighted = jacobian * (trust * weight.flatten() * inside)[..., None]
+    points = _moved(motions, _grid(image.shape[-1], aspect, image.device))  # (m, n, 2)
+    slopes, residuals, weights = _linearize(points, reference, image, weight, aspect)
+    x, y = (points - motions[:, None, 1:]).unbind(dim=-1)  # turned about the middle
+    by_turn = slopes[..., 1] * x - slopes[..., 0] * y
+    jacobian = torch.cat([by_turn[..., None], slopes], dim=-1)  # (m, n, 3)
+    weighted = jacobian * weights[..., None]
     hessian = weighted.mT @ jacobian + 1e-6 * torch.eye(3, device=image.device)
-    gradient = weighted.mT @ residuals[..., None]
-    change = torch.linalg.solve(hessian, gradient)[..., 0]
+    change = torch.linalg.solve(hessian, weighted.mT @ residuals[..., None])[..., 0]
     return motions + change.clamp(-0.1, 0.1)
+
+
+def _refine_homography(
+    start: Tensor, reference: Tensor, image: Tensor, weight: Tensor, aspect: float
+) -> Tensor:
+    """Improves a homography (3, 3) by Gauss-Newton steps, or returns it unchanged if that does not help."""
+    grid, found = _grid(image.shape[-1], aspect, image.device), start
+    x, y = grid.unbind(dim=-1)
+    ones = torch.ones_like(x)
+    for _ in range(_STEPS):
+        scale = grid @ found[2, :2] + found[2, 2]
+        points = _mapped(found, grid)
+        slopes, residuals, weights = _linearize(points[None], reference, image, weight, aspect)
+        right, down = slopes[0].unbind(dim=-1)
+        along = -(slopes[0] * points).sum(dim=-1)
+        columns = [*(right * each for each in (x, y, ones)), *(down * each for each in (x, y, ones))]
+        jacobian = torch.stack([*columns, along * x, along * y], dim=-1) / scale[:, None]  # (n, 8)
+        weighted = jacobian * weights[0][:, None]
+        hessian = weighted.mT @ jacobian
+        # Where little detail tells, the motion stays what it was.
+        prior = _STIFFNESS * hessian.trace() / 8 + 1e-9
+        gradient = weighted.mT @ residuals[0] - prior * (found - start).flatten()[:8]
+        change = torch.linalg.solve(hessian + prior * torch.eye(8, device=image.device), gradient)
+        found = found + F.pad(change.clamp(-0.1, 0.1), (0, 1)).view(3, 3)
+    after, before = _cost(torch.stack([found, start]), reference, image, weight, aspect).tolist()
+    return found if after < before else start
+
+
+def _linearize(
+    points: Tensor, reference: Tensor, image: Tensor, weight: Tensor, aspect: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns slopes (m, n, 2) of an image at points (m, n, 2), and residuals and their weights, (m, n)."""
+    size = image.shape[-1]
+    along_x = F.pad((image[..., 2:] - image[..., :-2]) * size / 4 / aspect, (1, 1))
+    along_y = F.pad((image[..., 2:, :] - image[..., :-2, :]) * size / 4, (0, 0, 1, 1))
+    sampled, inside = _sampled(torch.cat([image, along_x, along_y]), points, aspect)
+    residuals = reference.flatten() - sampled[:, 0]
+    trust = 1 / (1 + (residuals / _TOLERATED) ** 2) ** 2
+    return sampled[:, 1:].mT, residuals, trust * weight.flatten() * inside
 
 
 def _resized(image: Tensor, size: int) -> Tensor:

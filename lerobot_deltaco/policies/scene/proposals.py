@@ -12,8 +12,10 @@ from lerobot_deltaco.policies.base.image_coordinates import grid_of_centers
 from lerobot_deltaco.policies.geometry.regression import robust_regression
 from lerobot_deltaco.policies.scene.camera_motion import (
     CameraMotion,
+    StaticReference,
     estimate_motion,
     static_reference,
+    undo_motion,
 )
 from lerobot_deltaco.policies.scene.segmentation import segment
 
@@ -66,7 +68,7 @@ class Background(nn.Module):
         self.register_buffer("object_size", torch.tensor(_DEFAULT_SIZE))
         self.register_buffer("perspective", torch.zeros(2))
         self._bounds: tuple[Tensor, Tensor] | None = None  # of the remembered colors around each pixel
-        self._static: tuple[Tensor, Tensor] | None = None  # what never moved, and how clearly
+        self._static: StaticReference | None = None
         self.register_load_state_dict_post_hook(self._forget_bounds)
 
     @staticmethod
@@ -121,10 +123,18 @@ class Background(nn.Module):
         """
         if self.n_images < _MIN_IMAGES:
             return None
-        if self._static is None or self._static[0].device != self.images.device:
-            self._static = static_reference(self.images[: int(self.n_images)])
         height, width = scene.shape[-2:]
-        return estimate_motion(*self._static, _scaled(scene[None].to(self.images.device))[0], width / height)
+        scaled = _scaled(scene[None].to(self.images.device))[0]
+        return estimate_motion(self._static_reference(), scaled, width / height)
+
+    def undo_motion(self, images: Tensor, motion: CameraMotion) -> Tensor:
+        """Returns pictures of a moved camera as the training's camera would show them. See `undo_motion`."""
+        return undo_motion(images, motion, self._static_reference())
+
+    def _static_reference(self) -> StaticReference:
+        if self._static is None or self._static.median.device != self.images.device:
+            self._static = static_reference(self.images[: int(self.n_images)])
+        return self._static
 
     def fit(self, images: Tensor, locations: Tensor) -> None:
         """Remembers images, and measures objects in all of them.
