@@ -300,7 +300,7 @@ def measure(matching: Any, pairs: Sequence[tuple[StillEpisode, StillEpisode]]) -
     picks = picks + LOCATION_NOISE * torch.randn(picks.shape, generator=generator)
     ends = torch.stack([small(each).float() / 255 for each in (shown, last)], dim=1)
     described = matching.describe(ends, shown.float() / 255, picks, picks)
-    templates = described.templates[:, None]
+    templates = None if described.templates is None else described.templates[:, None]
     rng = np.random.default_rng(0)
     texts = [str(rng.choice(scene.sentences)) for scene, _ in pairs]
     nothing = [""] * len(pairs)

@@ -104,13 +104,13 @@ class Described(NamedTuple):
     Attributes:
         centers: Centers of the objects, (batch, 2) in -1..1.
         descriptors: Descriptors of the objects, (batch, descriptor).
-        templates: Surroundings of the grasps, (batch, 3, h, w); NaN where the grasp is not known, or where
+        templates: Surroundings of the grasps, (batch, 3, h, w); NaN where the grasp is not known. None where
             templates are not used.
     """
 
     centers: Tensor
     descriptors: Tensor
-    templates: Tensor
+    templates: Tensor | None
 
 
 class FeatureMatching(nn.Module):
@@ -389,9 +389,9 @@ class FeatureMatching(nn.Module):
             centers, is_near = self.demonstrated(ends, full_resolution, grasps, attended)
             features = self.features(full_resolution, centers[:, None])
             shown = torch.where(is_near[:, None], grasps, torch.nan)
-            templates = cut_templates(full_resolution, shown, self.object_sizes(grasps))
-            if not bool(self.refine.uses_templates):
-                templates = torch.full_like(templates, torch.nan)
+            templates = None
+            if bool(self.refine.uses_templates):
+                templates = cut_templates(full_resolution, shown, self.object_sizes(grasps))
             return Described(centers, self.compare(features).descriptors[:, 0], templates)
 
     def demonstrated(

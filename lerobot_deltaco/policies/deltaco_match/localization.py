@@ -171,7 +171,8 @@ class Localizer(nn.Module):
                 ends, given.first_images.flatten(0, 1), given.picks.flatten(0, 1), attended
             )
             descriptors = described.descriptors.unflatten(0, (-1, n_each)).mean(dim=1)
-            templates = described.templates.unflatten(0, (-1, n_each))
+            if described.templates is not None:
+                templates = described.templates.unflatten(0, (-1, n_each))
             heights = given.heights.nanmean(dim=1)
             # Of several demonstrations, the first says where.
             centers, attention, last = described.centers[::n_each], attentions[::n_each], ends[::n_each, 1]

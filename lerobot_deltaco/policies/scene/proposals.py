@@ -188,19 +188,33 @@ class Background(nn.Module):
             # median image: an object that stood there once must not widen the range.
             least, most = (_over_neighbors(images, extreme) for extreme in (torch.minimum, torch.maximum))
             usual = (most.short() - least).median(dim=0).values  # (3, 128, 128)
-            self._bounds = (
+            bounds = (
                 torch.maximum(least.short(), images.short() - usual).float() / 255,
                 torch.minimum(most.short(), images.short() + usual).float() / 255,
             )
-        low, high = self._bounds
-        n_common = min(max(2, round(_COMMON * len(low))), len(low))
+            self._bounds = bounds[0].transpose(0, 1).contiguous(), bounds[1].transpose(0, 1).contiguous()
+        low, high = self._bounds  # (3, images, 128, 128)
+        n_images = low.shape[1]
+        n_common = min(max(2, round(_COMMON * n_images)), n_images)
         results = []
         for n, scene in enumerate(_scaled(scenes).to(low.device)):
-            away = torch.maximum(low - scene, scene - high).amax(dim=1)  # (images, 128, 128)
+            away = _distance(low, high, scene)
             if remembered is not None and remembered[n] >= 0:
                 away[remembered[n]] = 2.0
             results.append(_kth_smallest(away, n_common))
         return torch.stack(results).clamp_min(0)
+
+
+def _distance(low: Tensor, high: Tensor, scene: Tensor) -> Tensor:
+    """Returns how far a scene (3, h, w) is outside ranges of colors (3, n, h, w) each, (n, h, w)."""
+    away, other = torch.empty_like(low[0]), torch.empty_like(low[0])  # few passes over memory
+    for channel, (least, most, color) in enumerate(zip(low, high, scene, strict=True)):
+        if channel == 0:
+            torch.sub(least, color, out=away)
+        else:
+            torch.maximum(away, torch.sub(least, color, out=other), out=away)
+        torch.maximum(away, torch.sub(color, most, out=other), out=away)
+    return away
 
 
 def changed_areas(ends: Tensor) -> Tensor:
@@ -226,12 +240,14 @@ def _over_neighbors(images: Tensor, extreme: Callable[[Tensor, Tensor], Tensor])
 
 def _kth_smallest(maps: Tensor, k: int) -> Tensor:
     """Returns the k-th smallest value of each pixel of maps (n, h, w), (h, w); faster than `kthvalue`."""
-    smallest = maps.new_full((k, *maps.shape[1:]), torch.inf)  # ascending
-    for values in maps:
-        for n in range(k):
-            lower = torch.minimum(smallest[n], values)
-            values = torch.maximum(smallest[n], values)  # noqa: PLW2901
-            smallest[n] = lower
+    smallest = list(maps.new_full((k, *maps.shape[1:]), torch.inf))  # ascending
+    spare = torch.empty_like(smallest[0]), torch.empty_like(smallest[0])
+    for n, values in enumerate(maps):
+        for rank in range(min(n + 1, k)):
+            greater = spare[rank % 2]
+            torch.maximum(smallest[rank], values, out=greater)
+            torch.minimum(smallest[rank], values, out=smallest[rank])
+            values = greater  # noqa: PLW2901
     return smallest[-1]
 
 
