@@ -168,6 +168,31 @@ def collect(root: Path, plan: CollectionPlan, workers: int = 1) -> str:
     )
 
 
+def collect_part(root: Path, plan: CollectionPlan, part: int, n_parts: int) -> None:
+    """Collects a part of a dataset's shards, beside the other parts on other machines.
+
+    `collect` then writes the rest: the metadata, and the shards of parts that failed.
+
+    Args:
+        root: Folder of the dataset, on a file system that all machines share.
+        plan: Tasks, episodes and settings.
+        part: Number of the part, 0..n_parts - 1.
+        n_parts: Number of parts.
+
+    Raises:
+        CollectionError: The folder holds something else, or the expert cannot do a task.
+        ImportError: PyBullet is not installed.
+    """
+    check_simulator()
+    _check_folder(root, plan)
+    if is_finished(root):
+        return
+    write_json(root / DESCRIPTION_FILE, _description(plan))
+    for shard in range(part, len(plan.shards), n_parts):
+        if not dataset_writer.is_written(root, shard):
+            _collect_shard(root, plan, shard)
+
+
 # The folder
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from tqdm import tqdm
 from gym_deltaco.tasks import select_tasks
 from lerobot_deltaco.data.demonstrations import Demonstration
 from lerobot_deltaco.data.grasps import find_grasp_states
+from lerobot_deltaco.data.gripper_states import find_gripper_states
 from lerobot_deltaco.data.images import as_uint8
 from lerobot_deltaco.data.object_prompts import ObjectPrompt, read_prompt
 from lerobot_deltaco.data.reading import open_folder_or_hub
@@ -41,8 +42,23 @@ if TYPE_CHECKING:
 
 _BENCHMARK_TASKS, _BENCHMARK_SEED = "scenario_a_test", 1000  # the first trial of the evaluation protocol
 
-# An episode, and whether it is right in each respect that the page counts; empty if that is unknown
-Judged = tuple[EpisodeView, tuple[bool, ...]]
+POLICY, UNMOVED, STILL = "this policy", "the demonstration, not moved", "holding still"
+
+
+class Judged(NamedTuple):
+    """An episode that was looked at.
+
+    Attributes:
+        view: The episode.
+        rights: Whether it is right in each respect that the page counts; empty if that is unknown.
+        errors: Distances of the arm from where it grasped and released in the episode, in standard deviations
+            of the training's states, averaged over dimensions: by the policy, and by what knows nothing of
+            the scene.
+    """
+
+    view: EpisodeView
+    rights: tuple[bool, ...]
+    errors: dict[str, float]
 
 
 def look(arguments: LookArguments) -> str:
@@ -73,20 +89,29 @@ def look(arguments: LookArguments) -> str:
         held_out = [] if chosen else _held_out_episodes(loaded.policy.config, opened)
         episodes = _dataset_episodes(loaded, opened, arguments.episodes, prompt, held_out)
     judged = list(tqdm(episodes, desc="Looking", unit="episode", total=arguments.episodes))
-    known = np.array([rights for _, rights in judged if rights])
+    known = np.array([each.rights for each in judged if each.rights])
+    errors = {
+        name: float(np.median([each.errors[name] for each in judged if name in each.errors]))
+        for name in (POLICY, UNMOVED, STILL)
+        if any(name in each.errors for each in judged)
+    }
     rates = [(name, int(known[:, n].sum()), len(known)) for n, name in enumerate(names) if len(known)]
     page = write_page(
         arguments.out,
         "look.html",
         checkpoint=checkpoint,
         source=dataset or "scenes of the benchmark",
-        views=[view for view, _ in judged],
+        views=[each.view for each in judged],
         rates=rates,
+        errors=errors,
         tolerance=None if dataset is None else TOLERANCE,
         pick_color=f"rgb{PICK_COLOR}",
         place_color=f"rgb{PLACE_COLOR}",
     )
     lines = [f"{name}: {n_right} of {n}" for name, n_right, n in rates]
+    if errors:
+        compared = ", ".join(f"{name} {error:.2f}" for name, error in errors.items())
+        lines.append(f"Arm at grasp and release, median error in standard deviations: {compared}")
     if dataset is not None:
         lines.append(
             "These episodes were held out of the fit of what to pick; where to place was trained on them."
@@ -102,7 +127,7 @@ def _benchmark_episodes(loaded: LoadedPolicy, n_episodes: int) -> Iterator[Judge
     player, task_ids = Player(loaded), select_tasks(_BENCHMARK_TASKS)
     for index in _spread(len(task_ids), n_episodes):
         view = player.run(player.default_choice(task_ids[index], _BENCHMARK_SEED))
-        yield view, (view.is_right is True,)
+        yield Judged(view, (view.is_right is True,), {})
 
 
 def _prompt(options: PromptOptions, config: TaskConditionedConfig) -> ObjectPrompt | None:
@@ -139,6 +164,7 @@ def _dataset_episodes(
     assert form.gripper is not None
     opening = form.gripper.opening(data.actions)
     grasps = find_grasp_states(data.states, opening, data.spans, form.gripper.usual_range)
+    is_arm = ~find_gripper_states(data.states, opening, data.spans, data.state_names).is_gripper
     candidates = [n for n, index in enumerate(indices) if not held_out or index in held_out]
     numbers = [candidates[n] for n in _spread(len(candidates), n_episodes)]
     partners = {episode: _partner(tasks, episode) for episode in numbers}
@@ -166,7 +192,7 @@ def _dataset_episodes(
             )
         elif prompt is not None:
             where += ", where a point shows the object" if prompt.image is None else ", by a photo"
-        rights, headline, recorded = (), "No grasp found", None
+        rights, headline, recorded, errors = (), "No grasp found", None, {}
         if bool(grasps.has_grasp[episode]):
             states = grasps.states[episode].to(config.device)
             recorded = policy.state_regressor.to_image(states).clamp(-1, 1).cpu()
@@ -174,6 +200,15 @@ def _dataset_episodes(
             rights = tuple((distances < TOLERANCE).tolist())
             pick, place = (50 * distances).tolist()
             headline = f"Pick off by {pick:.1f} %, place by {place:.1f} % of the image's side"
+            guesses = {POLICY: policy.localized_states[0].cpu()}
+            if bank is not None and partner != episode and bool(grasps.has_grasp[partner]):
+                guesses[UNMOVED] = grasps.states[partner]
+            guesses[STILL] = data.states[data.spans[episode][0]].expand(2, -1)
+            scale = policy.state_regressor.state_scale.cpu()
+            errors = {
+                name: float(((guess - grasps.states[episode]) * scale)[:, is_arm].abs().mean())
+                for name, guess in guesses.items()
+            }
         ends = None
         if bank is not None:
             ends = np.stack([_image(dataset, row, camera) for row in data.spans[partner]])
@@ -187,7 +222,8 @@ def _dataset_episodes(
         is_right = all(rights) if rights else None
         crops = [picture_uri(crop) for crop in compared_crops(matching, localization, image, *given)]
         lines = [f"{where}.", sure]
-        yield EpisodeView(task, "", [], is_right, headline, lines, picture, None, crops), rights
+        view = EpisodeView(task, "", [], is_right, headline, lines, picture, None, crops)
+        yield Judged(view, rights, errors)
 
 
 def _held_out_episodes(config: DeltacoMatchConfig, dataset: LeRobotDataset) -> list[int]:

@@ -194,7 +194,7 @@ def test_a_point_takes_the_place_of_demonstrations(tmp_path):
 def test_an_episode_is_marked_as_right_wrong_or_unknown():
     views = [EpisodeView("", "", [], is_right, "", [], "", None) for is_right in (True, False, None)]
     page = dict.fromkeys(("checkpoint", "source", "pick_color", "place_color"), "")
-    text = render("look.html", views=views, rates=[], tolerance=0.2, **page)
+    text = render("look.html", views=views, rates=[], errors={}, tolerance=0.2, **page)
     assert re.findall('note (\\w*)"><p><b>(.?)', text) == [("good", "✓"), ("bad", "✗"), ("", " ")]
 
 
