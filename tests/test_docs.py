@@ -69,9 +69,9 @@ def parse_lerobot(command, arguments, monkeypatch):
     from lerobot.configs import PreTrainedConfig
 
     own = ("lerobot_policy_deltaco", "lerobot_policy_example", "metaworld_small", "other_environments")
-    for module in ("lerobot.policies", "lerobot.envs", *own):
+    for module in ("lerobot.policies", "lerobot.envs", *own, "simulated_robot"):
         importlib.import_module(module)
-    arguments = [word for word in arguments if not word.startswith("--env.discover_packages_path=")]
+    arguments = [word for word in arguments if ".discover_packages_path=" not in word]
     module, name = LEROBOT_CONFIGURATIONS[command]
     configuration = getattr(importlib.import_module(module), name)
     if any(word.startswith("--policy.path=") for word in arguments):
