@@ -50,7 +50,7 @@ def test_a_random_configuration_works_or_is_refused_by_name(dataset, table, poli
     values, rng = {**COMMON, **OPTIONS[policy_type]}, random.Random(0)
     batch = batch_of(data, [0, 7, 25])
     n_trained, refusals = 0, {}
-    for _ in range(40):
+    for _ in range(24):
         options = {name: rng.choice(values[name]) for name in rng.sample(sorted(values), 3)}
         try:
             policy, before, after = small_policy(data, policy_type, **options)

@@ -156,7 +156,7 @@ class MatchingSettings:
             and shapes in it.
         p_misdemonstrated: Probability that a demonstration shows another object than is meant, where known
             words describe it. With both floors, what words name unmistakably in the scene is picked, whatever
-        is demonstrated; where they name nothing or several, the demonstration decides. Only after more
+            is demonstrated; where they name nothing or several, the demonstration decides. Only after more
             than `few_episodes`.
         shown_word_weight: Pages mark words above this weight as describing the object.
         map_std: Standard deviation of a candidate in a map, in cells.
