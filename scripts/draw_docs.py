@@ -272,6 +272,38 @@ def draw_finding(path: Path, out: Path) -> None:
     figure.savefig(out / "finding.png")
 
 
+def draw_acting(path: Path, out: Path) -> None:
+    """Draws how often tasks succeed by the number of training episodes.
+
+    Args:
+        path: Folder of the records of `few_demonstrations`.
+        out: Folder to write to.
+    """
+    rates: dict[tuple[str, str], dict[int, list[float]]] = {}
+    for record in read_records(path):
+        policy, number, scenes = record.experiment.partition("/")[2].split("_")
+        by_episodes = rates.setdefault((scenes, policy), {})
+        by_episodes.setdefault(int(number), []).append(100 * record.success_rate)
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.2), layout="constrained", sharey=True)
+    titles = {"same": "Trained tasks in new scenes", "novel": "Novel tasks and objects"}
+    names = {"replay": "deltaco_match, replay", "network": "deltaco_match, network", "deltaco": "deltaco"}
+    colors = dict(zip(names, (ACCENT, "#1f6fb2", "gray"), strict=True))
+    for ax, (scenes, title) in zip(axes, titles.items(), strict=True):
+        for policy, name in names.items():
+            by_episodes = dict(sorted(rates.get((scenes, policy), {}).items()))
+            means = [np.mean(trainings) for trainings in by_episodes.values()]
+            ax.plot(list(by_episodes), means, "o-", color=colors[policy], label=name)
+            for n_episodes, trainings in by_episodes.items():
+                ax.plot([n_episodes] * len(trainings), trainings, ".", color=colors[policy], alpha=0.4)
+        ax.set(title=title, xscale="log", xlabel="training episodes", ylim=(0, 100))
+        ax.set_xticks([30, 100, 300, 1000], labels=["30", "100", "300", "1,000"])
+        ax.set_xticks([], minor=True)
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("success, %")
+    axes[0].legend(loc="lower right", fontsize=8)
+    figure.savefig(out / "acting.png")
+
+
 def main(out: Path = Path("docs/images")) -> None:
     """Draws all images.
 
@@ -288,6 +320,7 @@ def main(out: Path = Path("docs/images")) -> None:
         draw_ambiguity(out)
         draw_joint_control(out)
         draw_finding(Path("results/finding_few_objects.jsonl"), out)
+        draw_acting(Path("results/few_demonstrations"), out)
     draw_policy(out)
     draw_locations(out)
     shipped = collect_results(read_records(Path("results/shipped")))

@@ -32,6 +32,7 @@ _NOT_RECORDED = (
     "output_features",
     "one_hot_tasks",
     "known_words",
+    "trained_tasks",
     "held_out_episodes",
     "n_dataset_frames",
     "gripper_range",

@@ -330,25 +330,33 @@ def test_what_is_left_out_does_not_matter(make, table):
         found_in(policy, batch_of(table, [0, 0]), ["", ""], [[0], []])
 
 
-def test_after_few_episodes_demonstrations_say_where_to_place(make, table, monkeypatch):
+def test_after_few_episodes_demonstrations_of_new_tasks_say_where_to_place(make, table, monkeypatch):
     use_short_fit(monkeypatch, place_reaches=REACHES)
     policy = make().eval()
     assert policy.localizer.demonstrates_places
-    shown, another, unseen = (
-        found_in(policy, batch_of(table, [0]), [RED], [episodes]) for episodes in ([0], [4], [])
-    )
+    assert policy.config.trained_tasks == sorted(TABLE_TASKS)
+    task = "bring the red one there"
+    scene, bank = batch_of(table, [0]), policy.training_data.demonstrations
+
+    def found_by(sentence, demonstrated, episodes):
+        shown = [dataclasses.replace(bank[row], task=demonstrated) for row in episodes]
+        policy.reset()
+        policy.set_tasks([sentence], [shown])
+        policy.select_action(scene)
+        return policy.localization
+
+    shown, another, unseen = (found_by(task, task, episodes) for episodes in ([0], [4], []))
     recorded = policy.training_locations.locations[0, 1]
     assert (shown.locations[0, 1] - recorded).norm() < 0.1  # in its own scene, where it was
     assert shown.is_same_place.all()
     assert another.is_same_place.all()
     assert not torch.equal(shown.maps[:, 1], another.maps[:, 1])
     assert not unseen.is_same_place.any()
-    # The sentence of another task says where.
-    other = found_in(policy, batch_of(table, [0]), [BLUE], [[0]])
-    assert not other.is_same_place.any()
-    torch.testing.assert_close(
-        other.maps[:, 1], found_in(policy, batch_of(table, [0]), [BLUE], [[]]).maps[:, 1]
-    )
+    # The sentence of another task says where, as does that of a trained one.
+    for sentence, demonstrated in ((BLUE, RED), (task, RED), (RED, RED)):
+        other, alone = found_by(sentence, demonstrated, [0]), found_by(sentence, demonstrated, [])
+        assert not other.is_same_place.any()
+        torch.testing.assert_close(other.maps[:, 1], alone.maps[:, 1])
 
 
 def test_a_camera_that_has_moved_since_the_training_does_not_matter(make, table, monkeypatch):

@@ -36,6 +36,7 @@ _HIDDEN = {
     "output_features",
     "normalization_mapping",
     "known_words",
+    "trained_tasks",
     "held_out_episodes",
     "n_dataset_frames",
     "gripper_range",

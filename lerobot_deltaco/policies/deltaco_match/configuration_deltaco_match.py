@@ -67,9 +67,10 @@ class DeltacoMatchConfig(TaskConditionedConfig):
     optimizer_weight_decay: float = 0.2
     scheduler_warmup_steps: int = 200
     # Filled in by training: the vocabulary of feature matching (with "" for words of tasks that are not
-    # trained on), the episodes that were held out of its fit, the number of frames of their dataset, and the
-    # range of the gripper's commands.
+    # trained on), the tasks after few episodes, the episodes that were held out of its fit, the number of
+    # frames of their dataset, and the range of the gripper's commands.
     known_words: list[str] = field(default_factory=list)
+    trained_tasks: list[str] = field(default_factory=list)
     held_out_episodes: list[int] = field(default_factory=list)
     n_dataset_frames: int | None = None
     gripper_range: float | None = None
@@ -182,7 +183,8 @@ class MatchingSettings:
         template_weight: Weight of a proposal's correlation with the demonstrated grasp, for new objects: the
             learned descriptors tell less of them.
         few_episodes: Number of training episodes up to which demonstrations are better guides than what was
-            learned: grasps look like theirs, they may say where to place, and words do not outweigh them.
+            learned: words do not outweigh them; and for other tasks than those of the training, grasps look
+            like theirs, and they may say where to place.
         template_reach: How far from a proposal the demonstrated grasp is looked for, in diameters.
         refinement_steps: Steps of the fit of where on an object the gripper closes.
         min_matching_steps: Smallest number of steps of the fit of the matching head.

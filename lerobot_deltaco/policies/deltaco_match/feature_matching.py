@@ -271,6 +271,7 @@ class FeatureMatching(nn.Module):
         proposals: Tensor,
         templates: Tensor | None = None,
         novelty: Tensor | None = None,
+        is_new_task: Tensor | None = None,
     ) -> Tensor:
         """Returns where the gripper closes on proposed objects, (batch, 2) in -1..1.
 
@@ -280,13 +281,15 @@ class FeatureMatching(nn.Module):
             templates: Surroundings of demonstrated grasps, (batch, demonstrations, 3, h, w); None without
                 demonstrations. See `Described`.
             novelty: How likely each object is new, (batch,). See `novelty`.
+            is_new_task: Whether each task is none of the training's, (batch,) bool; None if all are.
         """
         sizes = self.object_sizes(proposals)
         expected = self.refine(full_resolution, proposals, sizes)
         if templates is None or novelty is None:
             return expected
-        # The network knows trained objects where they stood in training; after few episodes, not elsewhere.
-        is_alike = (novelty > _NOVEL) | self.has_few_episodes
+        # After few episodes, the network knows how trained objects are grasped in trained tasks alone.
+        is_new_task = torch.ones_like(novelty, dtype=torch.bool) if is_new_task is None else is_new_task
+        is_alike = (novelty > _NOVEL) | (self.has_few_episodes & is_new_task)
         if not bool(is_alike.any()):
             return expected
         alike = self.refine(full_resolution, proposals, sizes, templates)

@@ -142,6 +142,7 @@ class Localizer(nn.Module):
         instructions: Sequence[str],
         given: DemonstrationBatch | None,
         prompts: Sequence[ObjectPrompt] = (),
+        is_trained: Tensor | None = None,
     ) -> PickPlace:
         """Finds where to pick and place.
 
@@ -151,6 +152,7 @@ class Localizer(nn.Module):
             instructions: Instruction of each sample; an empty string leaves it out.
             given: Demonstrations; None without.
             prompts: What shows the object of each sample instead; empty for nothing.
+            is_trained: Whether each instruction is that of a training task, (batch,) bool; None for no one.
 
         Raises:
             ValueError: A sample has neither an instruction nor a demonstration.
@@ -181,7 +183,8 @@ class Localizer(nn.Module):
         if prompts:
             candidates = choose_prompted(candidates, prompts)
         proposal, confidence, height = candidates.best
-        pick = matching.grasps(full_resolution, proposal, templates, novelty)
+        is_new_task = None if is_trained is None else ~is_trained
+        pick = matching.grasps(full_resolution, proposal, templates, novelty, is_new_task)
         target = None if attention is None or last is None else self.place.target(last, attention[:, 1])
         place_maps = self._place_maps(scenes, by_instruction, instructions, target)
         is_same_place = torch.zeros_like(by_instruction)

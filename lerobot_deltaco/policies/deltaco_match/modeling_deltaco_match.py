@@ -390,15 +390,17 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         if is_moved(motion):
             prompts = [registered_prompt(prompt, motion) for prompt in prompts]
         given = None if prompts else self.batch_demonstrations(demonstrations, scenes.device)
-        if given is not None:  # with the sentence of another task, that says where to place
+        trained = list(map(words_of, self.config.trained_tasks))
+        is_trained = torch.tensor([words_of(text) in trained for text in instructions], device=scenes.device)
+        if given is not None:  # The sentence of another task says where to place, as that of a trained one.
             first = [own[0] for own in demonstrations]
             is_its_task = [
                 not text or (isinstance(shown, Demonstration) and words_of(text) == words_of(shown.task))
                 for text, shown in zip(instructions, first, strict=True)
             ]
-            is_shown = torch.tensor(is_its_task, device=scenes.device)[:, None, None]
-            given = given._replace(places=torch.where(is_shown, given.places, torch.nan))
-        found = self.localizer(scenes, batch[camera], instructions, given, prompts)
+            is_shown = torch.tensor(is_its_task, device=scenes.device) & ~is_trained
+            given = given._replace(places=torch.where(is_shown[:, None, None], given.places, torch.nan))
+        found = self.localizer(scenes, batch[camera], instructions, given, prompts, is_trained)
         heights = found.heights + self.config.grasp_height_bias
         return found._replace(heights=heights, camera_motion=motion)
 
@@ -659,6 +661,8 @@ class DeltacoMatchPolicy(TaskConditionedPolicy):
         rows = located.has_grasp.nonzero().flatten().cpu()
         tasks = [bank.tasks[row] for row in rows.tolist()]
         self.localizer.measure_places(first_images[rows], located.locations[rows], tasks)
+        has_few = bool(self.localizer.matching.has_few_episodes)
+        self.config.trained_tasks = sorted(set(tasks)) if has_few else []
         self.config.held_out_episodes = bank.episodes[held_out].tolist()
         self.config.n_dataset_frames = None if self._meta is None else self._meta.total_frames
 
