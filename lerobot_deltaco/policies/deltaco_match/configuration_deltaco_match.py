@@ -26,7 +26,7 @@ class DeltacoMatchConfig(TaskConditionedConfig):
         acting: How the policy acts. "replay": the demonstration's trajectory is replayed, moved to where the
             policy picks and places; without a demonstrated one, that of the training episode whose grasp and
             release were nearest. "network": the policy network acts. Training is the same: a checkpoint acts
-            either way. With None, training chooses "replay" for up to 200 episodes.
+            either way. With None, training chooses "replay" for up to 600 episodes.
         n_demonstrations: Number of demonstrations of each task that are combined in evaluation.
         demo_point: Point [x, y] or box [left, top, right, bottom] on the object to pick, px, in place of a
             demonstration: in the first image of the episode by the camera of demonstrations, or in

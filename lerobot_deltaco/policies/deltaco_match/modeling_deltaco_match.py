@@ -69,7 +69,7 @@ logger = logging.getLogger(__name__)
 _GRIPPER_LOSS = "cross_entropy"
 _PLACE_FRACTION = 0.25  # of a batch's samples, which train the place network and the attention
 # Training episodes up to which demonstrations are replayed, unless `acting` says otherwise.
-_MAX_REPLAYED = 200
+_MAX_REPLAYED = 600
 _HEIGHT_NOISE = 0.1  # of the policy network's heights, in standard deviations over the training episodes
 
 

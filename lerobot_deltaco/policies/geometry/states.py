@@ -23,7 +23,7 @@ from lerobot_deltaco.policies.geometry.calibration import ImageProjection
 from lerobot_deltaco.policies.geometry.regression import robust_regression
 
 N_LOCATIONS = 2  # pick and place
-_MAX_BY_POSITION = 600  # episodes, below which locations depend on the hand's position alone
+_MAX_BY_POSITION = 3000  # episodes, below which locations depend on the hand's position alone
 _N_LOCATION_FEATURES = 10
 _N_HEIGHT_FEATURES = 3  # of the first of those: 1, x, y
 _N_LEVEL_FEATURES = 6  # up to the squares
