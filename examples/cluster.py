@@ -3,12 +3,12 @@ r"""Collects a dataset, and evaluates a policy, on many machines, by LeRobot's e
     pip install datatrove
     python examples/cluster.py collect --root data/tasks --tasks scenario_a_train --episodes-per-task 50 \
         --jobs 32 --partition cpu
-    python examples/cluster.py evaluate --policy outputs/match --out results/match --seeds 1000 2000 3000 \
+    python examples/cluster.py evaluate --policy outputs/match --out outputs/seeds --seeds 1000 2000 3000 \
         --partition cpu
-    deltaco report results/match
+    deltaco report outputs/seeds
 
 Without `--partition`, the same jobs run on this machine. With it, Slurm runs them; all machines have to share
-the folders. A job that failed is run again by the same command; what is finished is kept.
+the folders. After a failure, run the same command again: what is finished is kept.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ def make_executor(
     Args:
         step: Function of (data, rank, world_size).
         jobs: Number of jobs.
-        logs: Folder of the logs, and of what says which jobs are finished.
+        logs: Folder of the logs.
         partition: Partition of Slurm; None for this machine.
         after: What has to be finished before.
     """
     if partition is None:
-        return LocalPipelineExecutor([step], jobs, logging_dir=str(logs), depends=after)
+        return LocalPipelineExecutor([step], jobs, logging_dir=str(logs), depends=after, skip_completed=False)
     return SlurmPipelineExecutor(
         [step],
         jobs,
@@ -53,6 +53,7 @@ def make_executor(
         venv_path=str(Path(sys.prefix) / "bin" / "activate"),
         logging_dir=str(logs),
         depends=after,
+        skip_completed=False,  # Steps skip what is finished themselves.
     )
 
 
@@ -72,7 +73,7 @@ def collect(
         jobs: Number of jobs.
         partition: Partition of Slurm; empty for this machine.
     """
-    plan, logs = CollectionPlan(tasks, episodes_per_task), Path("logs") / root.name
+    plan, logs = CollectionPlan(tasks, episodes_per_task), root.with_name(f"{root.name}_logs")
     parts = make_executor(
         functools.partial(_collect_part, root, plan), jobs, logs / "parts", partition or None
     )
@@ -93,7 +94,7 @@ def evaluate(
         partition: Partition of Slurm; empty for this machine.
     """
     step = functools.partial(_evaluate, policy, out, seeds, trials)
-    make_executor(step, len(seeds), Path("logs") / out.name, partition or None).run()
+    make_executor(step, len(seeds), out.with_name(f"{out.name}_logs"), partition or None).run()
 
 
 def _collect_part(root: Path, plan: CollectionPlan, _: object, rank: int = 0, world_size: int = 1) -> None:

@@ -1,7 +1,7 @@
 r"""Tells from a picture whether the camera has moved since the training, by how much, and moves it back.
 
-What never moves in the first images of the training episodes is registered to the picture: first by trying
-shifts and turns on small images, then by Gauss-Newton steps on larger ones, and at last by a homography.
+The static parts of the training's first images are registered to the current image: first by trying shifts
+and rotations at a low resolution, then by Gauss-Newton steps on larger images, and at last by a homography.
 Objects and the arm stand anywhere, so large differences count no more than moderate ones. The camera has
 moved if the motion is more than noise, and explains the picture better than none.
 """
@@ -36,8 +36,8 @@ class CameraMotion(NamedTuple):
 
     Attributes:
         homography: Maps points of the training's pictures to points of the moved camera's, homogeneous
-            coordinates, (3, 3), where the image's height is 2 and its middle 0. It holds for a camera that
-            was turned on the spot and, on the table, for any motion.
+            coordinates, (3, 3), where the image's height is 2 and its middle 0. It is exact for a camera that
+            rotated about its own center and, in the plane of the table, for any motion.
         aspect: Width of a picture divided by its height.
         gain: Mean difference after registration, as a fraction of that before.
         is_significant: Whether the camera has moved.
