@@ -286,8 +286,10 @@ def draw_acting(path: Path, out: Path) -> None:
         by_episodes.setdefault(int(number), []).append(100 * record.success_rate)
     figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.2), layout="constrained", sharey=True)
     titles = {"same": "Trained tasks in new scenes", "novel": "Novel tasks and objects"}
-    names = {"replay": "deltaco_match, replay", "network": "deltaco_match, network", "deltaco": "deltaco"}
-    colors = dict(zip(names, (ACCENT, "#1f6fb2", "gray"), strict=True))
+    names, colors = (
+        {"replay": "replay", "network": "policy network"},
+        {"replay": ACCENT, "network": "#1f6fb2"},
+    )
     for ax, (scenes, title) in zip(axes, titles.items(), strict=True):
         for policy, name in names.items():
             by_episodes = dict(sorted(rates.get((scenes, policy), {}).items()))

@@ -71,7 +71,7 @@ def test_the_help_of_training_describes_the_options_of_both_policies(helps):
 
     text, _ = helps["train"]
     hidden = {"push_to_hub", "normalization_mapping", "one_hot_tasks", "known_words", "gripper_range"}
-    hidden |= {"held_out_episodes", "n_dataset_frames"}
+    hidden |= {"trained_tasks", "held_out_episodes", "n_dataset_frames"}
     inherited = {field.name for field in fields(DeltacoConfig.__mro__[2])}
     for config in (DeltacoConfig, DeltacoMatchConfig):
         for option in {field.name for field in fields(config)} - inherited - hidden:

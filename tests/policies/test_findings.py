@@ -52,7 +52,7 @@ def test_the_log_says_what_was_found(trained, caplog):
     for part in (
         f"{TABLE_SIZE} x {TABLE_SIZE} px",
         r"object: at \(\d+, \d+\) px, \d+% sure, by the demonstration",
-        r"place: at \(\d+, \d+\) px, \d+% sure, by the demonstration",
+        r"place: at \(\d+, \d+\) px, \d+% sure, by the sentence",  # of a trained task
         "acting: replays the demonstration",
         r"camera: (as in training|moved by)",
         r"states to image: off by \d+\.\d% of its side",
