@@ -159,19 +159,23 @@ def _difference(reference: StaticReference, details: Tensor) -> float:
     return float((differences * reference.structure).sum() / reference.structure.sum().clamp_min(1e-6))
 
 
-def estimate_motion(reference: StaticReference, image: Tensor, aspect: float = 1.0) -> CameraMotion:
+def estimate_motion(reference: StaticReference, image: Tensor, aspect: float = 1.0) -> CameraMotion | None:
     """Registers a picture to what was static in the training.
 
     Args:
         reference: What was static.
         image: The picture, (3, H, W) in 0..1.
         aspect: Width of a picture divided by its height, if it was scaled to another shape.
+
+    Returns:
+        The motion; None if too little is static, as on a plain table, to tell.
     """
     gray = image.mean(dim=0, keepdim=True)
     details = {_LARGE: _details(_resized(gray, _LARGE))}
     unmoved = torch.eye(3, device=image.device)
-    is_usual = _difference(reference, details[_LARGE]) <= reference.usual
-    if is_usual or float(reference.structure.mean()) < _MIN_STRUCTURE:
+    if float(reference.structure.mean()) < _MIN_STRUCTURE:
+        return None
+    if _difference(reference, details[_LARGE]) <= reference.usual:
         return CameraMotion(unmoved, aspect, 1.0, is_significant=False)
     details |= {size: _details(_resized(gray, size)) for size in (_SMALL, _MEDIUM)}
     levels = {

@@ -116,7 +116,7 @@ class Background(nn.Module):
         return torch.cat(parts)
 
     def camera_motion(self, scene: Tensor) -> CameraMotion | None:
-        """Compares a scene with what never moved; None with too few remembered images to know that.
+        """Compares a scene with what never moved; None if that is not known, or too little of it to tell.
 
         Args:
             scene: First image, (3, H, W), uint8 or in 0..1, at full resolution.
